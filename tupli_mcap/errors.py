@@ -1,0 +1,62 @@
+"""The errors this package raises: one root, a few children, each for one kind of cause.
+
+Every message is one sentence: what was expected, what was found, where, and what to do.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "FilterError",
+    "FormatError",
+    "MissingExtraError",
+    "NotFoundError",
+    "RecordingError",
+    "SpaceError",
+    "StepError",
+    "StorageError",
+    "TupliError",
+    "UntrustedError",
+]
+
+
+class TupliError(Exception):
+    """Root of every error this package raises on purpose."""
+
+
+class SpaceError(TupliError):
+    """A Gymnasium space that cannot be represented, or does not equal the recorded one."""
+
+
+class StepError(TupliError):
+    """A step that cannot be stored exactly; everything recorded before it is safe."""
+
+
+class FormatError(TupliError):
+    """A defect in a file: what was expected, what was found, the path and the offset."""
+
+
+class RecordingError(TupliError):
+    """A recording cannot be written: it exists, is in use, is closed, or the disk refuses."""
+
+
+class StorageError(TupliError):
+    """A storage operation failed."""
+
+
+class NotFoundError(StorageError, KeyError):
+    """A storage has no benchmark, artifact or episode of that id."""
+
+    def __str__(self) -> str:  # KeyError would show the repr
+        return str(self.args[0]) if self.args else ""
+
+
+class FilterError(TupliError, ValueError):
+    """A filter that has no meaning: an unknown key, a value that cannot be compared, bad syntax."""
+
+
+class UntrustedError(TupliError):
+    """Code from a file would run, and nobody on this machine has trusted it."""
+
+
+class MissingExtraError(TupliError, ImportError):
+    """An optional dependency is not installed; the message names the extra to install."""
