@@ -1,0 +1,59 @@
+"""The sugar for filters: `F("metadata.score") > 3`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+
+from tupli_mcap.schema.filters import (
+    FilterEQ,
+    FilterGEQ,
+    FilterGT,
+    FilterIN,
+    FilterLEQ,
+    FilterLT,
+    FilterNE,
+)
+from tupli_mcap.schema.keys import join_key, split_key
+
+
+class F:
+    """A key to compare: `F("metadata.score") > 3` is `FilterGT(key="metadata.score", value=3)`.
+
+    Given several arguments, each is one segment as it stands: `F("metadata", "v1.0")`.
+    """
+
+    __slots__ = ("key",)
+
+    key: str
+
+    def __init__(self, *segments: str) -> None:
+        self.key = segments[0] if len(segments) == 1 else join_key(segments)
+        split_key(self.key)
+
+    def __eq__(self, value: object) -> FilterEQ:  # type: ignore[override]
+        return FilterEQ(key=self.key, value=value)
+
+    def __ne__(self, value: object) -> FilterNE:  # type: ignore[override]
+        return FilterNE(key=self.key, value=value)
+
+    def __gt__(self, value: object) -> FilterGT:
+        return FilterGT(key=self.key, value=value)
+
+    def __ge__(self, value: object) -> FilterGEQ:
+        return FilterGEQ(key=self.key, value=value)
+
+    def __lt__(self, value: object) -> FilterLT:
+        return FilterLT(key=self.key, value=value)
+
+    def __le__(self, value: object) -> FilterLEQ:
+        return FilterLEQ(key=self.key, value=value)
+
+    def isin(self, values: Iterable[object]) -> FilterIN:
+        """True where the key's value equals one of `values`."""
+        return FilterIN(key=self.key, value=list(values))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"F({json.dumps(self.key, ensure_ascii=False)})"

@@ -1,0 +1,256 @@
+"""Filters evaluated in memory: on one item at a time, or on whole NumPy columns of steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel
+
+from tupli_mcap.errors import FilterError
+from tupli_mcap.schema.filters import BaseFilter, FilterType, path_of
+from tupli_mcap.schema.keys import join_key
+from tupli_mcap.schema.values import Scalar, classify, compare, untag_float
+
+Item: TypeAlias = Mapping[str, Any] | BaseModel
+Predicate: TypeAlias = Callable[[Item], bool]
+Mask: TypeAlias = npt.NDArray[np.bool_]
+
+_MISSING: Final = object()
+
+
+def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
+    """The top-level keys that a filter over items of a model (or with these fields) may name, sorted."""
+    return sorted(fields.model_fields if isinstance(fields, type) else fields)
+
+
+def check_keys(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> None:
+    """Raises FilterError if the filter names a top-level key that is not among `fields`."""
+    known = filter_keys(fields)
+    for comparison in comparisons(filter):
+        if path_of(comparison)[0] not in known:
+            raise FilterError(f"unknown filter key {comparison.key!r}; the keys are {', '.join(known)}")
+
+
+def comparisons(filter: BaseFilter) -> Iterable[BaseFilter]:
+    """The comparisons in a filter, from left to right."""
+    if filter.key is not None:
+        yield filter
+    for item in filter.filters:
+        yield from comparisons(item)
+
+
+def compile_predicate(
+    filter: BaseFilter | None, fields: type[BaseModel] | Iterable[str] | None = None
+) -> Predicate:
+    """A function that tells whether a filter is true of an item: nested mappings, or a pydantic model.
+
+    No filter is true of everything. With `fields` (a model class, or names), only those top-level keys exist.
+
+    Raises:
+        FilterError: The filter names an unknown top-level key.
+    """
+    if filter is None:
+        return lambda item: True
+    if fields is not None:
+        check_keys(filter, fields)
+    return _predicate(filter)
+
+
+def _predicate(filter: BaseFilter) -> Predicate:
+    match filter.type:
+        case FilterType.AND:
+            parts = [_predicate(part) for part in filter.filters]
+            return lambda item: all(part(item) for part in parts)
+        case FilterType.OR:
+            parts = [_predicate(part) for part in filter.filters]
+            return lambda item: any(part(item) for part in parts)
+        case FilterType.NOT:
+            inner = _predicate(filter.filters[0])
+            return lambda item: not inner(item)
+    path, test = path_of(filter), scalar_test(filter)
+
+    def comparison(item: Item) -> bool:
+        found = _look_up(item, path)
+        return found is not _MISSING and test(classify(found))
+
+    return comparison
+
+
+def scalar_test(filter: BaseFilter) -> Callable[[Scalar], bool]:
+    """What a comparison says of a value that is there."""
+    if filter.type is FilterType.IN:
+        choices = [classify(value) for value in filter.value]
+        return lambda found: any(compare("EQ", found, choice) for choice in choices)
+    operation, wanted = filter.type.value, classify(filter.value)
+    return lambda found: compare(operation, found, wanted)
+
+
+def _look_up(item: object, path: tuple[str, ...]) -> object:
+    for segment in path:
+        if isinstance(item, BaseModel):
+            if segment not in type(item).model_fields:
+                return _MISSING
+            item = getattr(item, segment)
+        elif isinstance(item, Mapping) and segment in item and untag_float(item) is None:
+            item = item[segment]
+        else:
+            return _MISSING
+    return item
+
+
+def evaluate_columns(filter: BaseFilter, columns: Mapping[str, Any]) -> Mask:
+    """Which steps a filter is true of.
+
+    Args:
+        filter: Comparisons of step fields: `F("reward") > 0`, `F("state.0") < 1`, `F("state.pos.1") >= 2`.
+        columns: Field name to its column: an array of shape `(n, ...)`, a list of n values (leaves of
+            variable size), or dicts and tuples of those, nested as the space is. Path segments after the
+            field name go into dicts by key, into tuples by position, and then into the axes of an array.
+
+    Returns:
+        A bool array of shape `(n,)`.
+
+    Raises:
+        FilterError: There is no such column, key or position, or the path names no single value per step.
+    """
+    if not columns:
+        raise FilterError("a filter over steps needs at least one column")
+    return _mask(filter, columns, _length(next(iter(columns.values()))))
+
+
+def _mask(filter: BaseFilter, columns: Mapping[str, Any], length: int) -> Mask:
+    match filter.type:
+        case FilterType.AND | FilterType.OR:
+            join = np.logical_and if filter.type is FilterType.AND else np.logical_or
+            total = np.full(length, filter.type is FilterType.AND)
+            for part in filter.filters:
+                join(total, _mask(part, columns, length), out=total)
+            return total
+        case FilterType.NOT:
+            return ~_mask(filter.filters[0], columns, length)
+    leaf = _leaf(filter.key or "", path_of(filter), columns)
+    if isinstance(leaf, np.ndarray) and leaf.dtype.kind in "biufU":
+        if filter.type is FilterType.IN:
+            parts = [_compare_array("EQ", leaf, classify(value)) for value in filter.value]
+            return np.logical_or.reduce(parts) if parts else np.zeros(length, np.bool_)
+        return _compare_array(filter.type.value, leaf, classify(filter.value))
+    test = scalar_test(filter)
+    matches = (value is not _MISSING and test(classify(value)) for value in leaf)
+    return np.fromiter(matches, np.bool_, count=len(leaf))
+
+
+def _length(column: Any) -> int:
+    while isinstance(column, Mapping | tuple):
+        nested = list(column.values()) if isinstance(column, Mapping) else list(column)
+        if not nested:
+            raise FilterError("a filter over steps needs columns with values, found an empty dict or tuple")
+        column = nested[0]
+    return len(column)
+
+
+def _leaf(key: str, path: tuple[str, ...], columns: Mapping[str, Any]) -> npt.NDArray[Any] | Sequence[Any]:
+    """The column of one scalar per step that a path names."""
+    column: Any = columns
+    for position, segment in enumerate(path):
+        if isinstance(column, Mapping):
+            choices = {str(name): value for name, value in column.items()}
+        elif isinstance(column, tuple):
+            choices = {str(index): value for index, value in enumerate(column)}
+        else:
+            return _inside(key, column, path[position:])
+        if segment not in choices:
+            where = join_key(path[:position]) if position else "a step"
+            raise FilterError(f"unknown filter key {key!r}: {where} has {', '.join(choices) or 'nothing'}")
+        column = choices[segment]
+    if isinstance(column, Mapping | tuple):
+        raise FilterError(
+            f"filter key {key!r} names several values a step; add one of their names or positions"
+        )
+    return _inside(key, column, ())
+
+
+def _inside(key: str, column: Any, path: tuple[str, ...]) -> npt.NDArray[Any] | Sequence[Any]:
+    if not isinstance(column, np.ndarray):
+        return [_step_value(value, path) for value in column] if path else list(column)
+    shape = column.shape[1:]
+    if len(path) != len(shape):
+        raise FilterError(
+            f"filter key {key!r} needs {len(shape)} positions for values of shape {shape}, found {len(path)}"
+        )
+    for segment, size in zip(path, shape, strict=True):
+        if not (segment.isascii() and segment.isdigit() and int(segment) < size):
+            raise FilterError(f"filter key {key!r} needs a position from 0 to {size - 1}, found {segment!r}")
+    index: tuple[Any, ...] = (slice(None), *(int(segment) for segment in path))
+    leaf: npt.NDArray[Any] = column[index]
+    return leaf
+
+
+def _step_value(value: Any, path: tuple[str, ...]) -> Any:
+    """A value inside one step of a column of variable size; what is not there compares as nothing does."""
+    for segment in path:
+        try:
+            value = value[segment] if isinstance(value, Mapping) else value[int(segment)]
+        except (LookupError, ValueError, TypeError):
+            return _MISSING
+    return value
+
+
+_EVERY_KIND: Final = {"b": "bool", "i": "number", "u": "number", "f": "number", "U": "text"}
+
+
+def _compare_array(operation: str, array: npt.NDArray[Any], wanted: Scalar) -> Mask:
+    """One comparison of an array of shape (n,), with the meaning that `compare` has for scalars."""
+    if operation == "NE":
+        return ~_compare_array("EQ", array, wanted)
+    if _EVERY_KIND[array.dtype.kind] != wanted.kind or (wanted.kind == "bool" and operation != "EQ"):
+        return np.zeros(len(array), np.bool_)
+    if array.dtype.kind == "f":
+        return _compare_floats(operation, array, wanted.value)
+    if array.dtype.kind in "iu":
+        return _compare_ints(operation, array, wanted.value)
+    return _apply(operation, array, wanted.value)
+
+
+def _compare_ints(operation: str, array: npt.NDArray[Any], number: float) -> Mask:
+    # NumPy would compare int64 with a float in float64, where neighbours beyond 2**53 are one.
+    limits = np.iinfo(array.dtype)
+    if number > limits.max or number < limits.min:
+        return np.full(len(array), operation in (("LT", "LEQ") if number > 0 else ("GT", "GEQ")))
+    whole = math.floor(number)
+    if whole != number:
+        if operation == "EQ":
+            return np.zeros(len(array), np.bool_)
+        operation = "LEQ" if operation in ("LT", "LEQ") else "GT"
+    return _apply(operation, array, array.dtype.type(whole))
+
+
+def _compare_floats(operation: str, array: npt.NDArray[Any], number: float) -> Mask:
+    # NumPy would round the number to float32 or float16 before it compares.
+    array = array.astype(np.float64) if array.dtype.itemsize < 8 else array
+    try:
+        nearest = float(number)
+    except OverflowError:
+        nearest = math.inf if number > 0 else -math.inf
+    if nearest != number:  # an int that is no float: no float lies between it and the nearest one
+        if operation == "EQ":
+            return np.zeros(len(array), np.bool_)
+        if operation in ("GT", "GEQ"):
+            operation = "GT" if nearest < number else "GEQ"
+        else:
+            operation = "LEQ" if nearest < number else "LT"
+    return _apply(operation, array, np.float64(nearest))
+
+
+def _apply(operation: str, array: npt.NDArray[Any], value: Any) -> Mask:
+    functions: dict[str, Callable[[Any, Any], Any]] = {
+        "EQ": np.equal,
+        "GT": np.greater,
+        "GEQ": np.greater_equal,
+        "LT": np.less,
+        "LEQ": np.less_equal,
+    }
+    return np.asarray(functions[operation](array, value), np.bool_)

@@ -1,0 +1,87 @@
+"""Scalars as filters see them: their kind, and how two of them compare."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+
+Kind = Literal["null", "bool", "number", "nan", "text", "other"]
+
+FLOAT_TAG: Final = "$float"
+_TAGGED: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+_TAGS: Final = {math.inf: "inf", -math.inf: "-inf"}
+
+_ORDER: Final[Mapping[str, Callable[[Any, Any], bool]]] = {
+    "GT": operator.gt,
+    "GEQ": operator.ge,
+    "LT": operator.lt,
+    "LEQ": operator.le,
+}
+
+
+class Scalar(NamedTuple):
+    """A value and its kind; `value` is plain Python (None, bool, int, float, str; None for `other`)."""
+
+    kind: Kind
+    value: Any
+
+
+_OTHER: Final = Scalar("other", None)
+
+
+def classify(value: object) -> Scalar:
+    """What a filter sees in a value.
+
+    NumPy scalars and 0-d arrays are the Python numbers they hold, `{"$float": "nan"}` is the float it stands
+    for (that is how strict JSON carries it), and everything that is no scalar is `other`.
+    """
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, np.timedelta64):
+        return _OTHER  # NumPy counts it among its integers
+    if value is None:
+        return Scalar("null", None)
+    if isinstance(value, bool | np.bool_):
+        return Scalar("bool", bool(value))
+    if isinstance(value, int | np.integer):
+        return Scalar("number", int(value))
+    if isinstance(value, float | np.float16 | np.float32):
+        number = float(value)
+        return Scalar("nan" if math.isnan(number) else "number", number)
+    if isinstance(value, str):
+        return Scalar("text", str.__str__(value))  # an enum member is the text it holds, not its name
+    if isinstance(value, Mapping):
+        tagged = untag_float(value)
+        return _OTHER if tagged is None else classify(tagged)
+    return _OTHER
+
+
+def compare(operation: str, found: Scalar, wanted: Scalar) -> bool:
+    """The result of one comparison of two scalars; the meaning is in `tupli_mcap.schema.filters`.
+
+    `operation` is EQ, NE, GT, GEQ, LT or LEQ.
+    """
+    same_kind = found.kind == wanted.kind
+    if operation in ("EQ", "NE"):
+        equal = same_kind and found.kind not in ("nan", "other") and bool(found.value == wanted.value)
+        return equal == (operation == "EQ")
+    return same_kind and found.kind in ("number", "text") and _ORDER[operation](found.value, wanted.value)
+
+
+def tag_float(value: float) -> float | dict[str, str]:
+    """A float as strict JSON can hold it: NaN and the infinities become `{"$float": ...}`."""
+    if math.isfinite(value):
+        return value
+    return {FLOAT_TAG: _TAGS.get(value, "nan")}
+
+
+def untag_float(value: Mapping[Any, Any]) -> float | None:
+    """The float that `{"$float": ...}` stands for, or None if the mapping is not one."""
+    if len(value) != 1:
+        return None
+    tag = value.get(FLOAT_TAG)
+    return _TAGGED.get(tag) if isinstance(tag, str) else None
