@@ -1,0 +1,384 @@
+"""Environments as data: when a spec is enough, what a pickle keeps, and what never runs unasked."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+import random
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils import EzPickle
+
+from tupli_mcap import trust
+from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture
+from tupli_mcap.errors import FormatError, TupliError, UntrustedError
+
+
+@pytest.fixture(autouse=True)
+def _config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "config"))
+
+
+class Counter(gym.Env[Any, Any]):
+    """Counts its steps from `start`."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, start: float = 0.0) -> None:
+        self.start = start
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.value = self.start
+        return np.array([self.value]), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.value += 1
+        return np.array([self.value]), 1.0, False, False, {}
+
+
+class Engine(gym.Env[Any, Any], EzPickle):
+    """Pickles as its constructor's arguments, as environments around C libraries do."""
+
+    observation_space = gym.spaces.Box(0, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, size: int = 1) -> None:
+        EzPickle.__init__(self, size)
+        self.size = size
+        self.friction = 0.5
+        self.world = open(__file__)  # noqa: PTH123, SIM115 - stands for something that cannot be pickled
+
+    def close(self) -> None:
+        self.world.close()
+
+
+# --- a spec where it is enough ---
+
+
+@pytest.mark.parametrize(
+    "env_id", ["CartPole-v1", "MountainCar-v0", "Pendulum-v1", "FrozenLake-v1", "Blackjack-v1"]
+)
+def test_registered_environments_need_no_pickle(env_id: str) -> None:
+    env = gym.make(env_id)
+    record = capture(env)
+    assert record.spec is not None
+    assert record.pickle is None
+    assert record.name == env_id
+    assert record.versions["gymnasium"] == gym.__version__
+
+
+def test_spec_rebuilds_arguments_limits_and_wrappers() -> None:
+    env = gym.wrappers.TimeAwareObservation(
+        gym.make("MountainCar-v0", max_episode_steps=999, goal_velocity=0.03)
+    )
+    record = capture(env)
+    assert record.spec is not None
+    built = build(record)
+    assert [type(layer) for layer in _layers(built)] == [type(layer) for layer in _layers(env)]
+    assert built.unwrapped.goal_velocity == 0.03  # type: ignore[attr-defined]
+    assert built.spec is not None
+    assert built.spec.max_episode_steps == 999
+    assert built.observation_space == env.observation_space
+
+
+def _layers(env: gym.Env[Any, Any]) -> list[gym.Env[Any, Any]]:
+    return [env, *_layers(env.env)] if isinstance(env, gym.Wrapper) else [env]
+
+
+def test_looking_at_an_environment_does_not_change_its_digest() -> None:
+    env = gym.make("CartPole-v1")
+    digest = capture(env).digest
+    assert env.spec is not None
+    env.action_space.seed(3)
+    env.action_space.sample()
+    env.observation_space.sample()
+    assert capture(env).digest == digest
+    assert capture(gym.make("CartPole-v1")).digest == digest
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda env: setattr(env.unwrapped, "gravity", 3.7),
+        lambda env: setattr(env, "_max_episode_steps", 7),  # inner state of the TimeLimit
+        lambda env: setattr(env.unwrapped, "extra", [1, 2]),
+        lambda env: env.reset(seed=0),
+    ],
+)
+def test_what_a_spec_does_not_say_is_pickled(change: Any) -> None:
+    env = gym.make("CartPole-v1")
+    plain = capture(env).digest
+    change(env)
+    record = capture(env)
+    assert record.spec is None
+    assert record.pickle is not None
+    assert record.digest != plain
+    built = build(record, trust=True)
+    assert vars(built.unwrapped).get("extra") == vars(env.unwrapped).get("extra")
+    assert built.unwrapped.gravity == env.unwrapped.gravity  # type: ignore[attr-defined]
+    assert built._max_episode_steps == env._max_episode_steps  # type: ignore[attr-defined]
+
+
+def test_wrappers_that_a_spec_cannot_hold_are_pickled() -> None:
+    env = gym.wrappers.TransformReward(gym.make("CartPole-v1"), lambda reward: reward * 2)
+    record = capture(env)
+    assert record.spec is None
+    built = build(record, trust=True)
+    built.reset(seed=0)
+    assert built.step(0)[1] == 2.0
+
+
+def test_local_registrations_are_pickled_unless_by_reference() -> None:
+    gym.register("TupliCounter-v0", entry_point=f"{__name__}:Counter")
+    try:
+        env = gym.make("TupliCounter-v0", start=2.0)
+        assert capture(env).spec is None
+        assert capture(env, by_reference=True).spec is not None
+    finally:
+        del gym.registry["TupliCounter-v0"]
+
+
+def test_digest_of_a_spec_ignores_fields_at_their_default() -> None:
+    spec = capture(gym.make("CartPole-v1")).spec
+    assert spec is not None
+    told = {key: value for key, value in spec.items() if key != "nondeterministic"}
+    assert EnvironmentRecord("a", spec=spec).digest == EnvironmentRecord("b", spec=told).digest
+    assert (
+        EnvironmentRecord("a", spec={**spec, "nondeterministic": True}).digest
+        != EnvironmentRecord("a", spec=spec).digest
+    )
+
+
+# --- the caller's environment is left alone ---
+
+
+def test_capturing_changes_nothing_in_the_environment() -> None:
+    env = gym.make("CartPole-v1")
+    env.reset(seed=5)
+    before = pickle.dumps(env)
+    random.seed(1)
+    np.random.seed(1)
+    expected = random.random(), np.random.random()
+    random.seed(1)
+    np.random.seed(1)
+    capture(env)
+    assert (random.random(), np.random.random()) == expected
+    assert pickle.dumps(env) == before
+
+
+def test_snapshot_keeps_the_state_it_was_taken_in() -> None:
+    env = Counter(start=4.0)
+    snapshot = Snapshot(env)
+    env.start = 9.0
+    copy = snapshot.restore()
+    assert isinstance(copy, Counter)
+    assert copy.start == 4.0
+    assert build(snapshot.record(), trust=True).unwrapped.start == 4.0  # type: ignore[attr-defined]
+
+
+def test_an_environment_that_cannot_be_pickled_fails_only_when_needed() -> None:
+    env = Counter()
+    env.handle = open(__file__)  # type: ignore[attr-defined]  # noqa: PTH123, SIM115
+    env.lock = __import__("threading").Lock()  # type: ignore[attr-defined]
+    snapshot = Snapshot(env)
+    env.handle.close()  # type: ignore[attr-defined]
+    with pytest.raises(
+        TupliError, match="the environment Counter cannot be captured, since it cannot be pickled"
+    ):
+        snapshot.record()
+
+
+def test_changes_to_an_environment_that_pickles_as_its_arguments_are_kept() -> None:
+    env = Engine(size=3)
+    env.friction = 0.1
+    built = build(capture(env), trust=True)
+    assert built.unwrapped.size == 3  # type: ignore[attr-defined]
+    assert built.unwrapped.friction == 0.1  # type: ignore[attr-defined]
+    other = Engine(size=3)
+    assert capture(env).digest != capture(other).digest
+    for one in (env, other, built):
+        one.close()
+
+
+# --- classes that only this process has ---
+
+
+def test_a_locally_defined_class_is_pickled_by_value() -> None:
+    class Local(Counter):
+        bonus = 2.0
+
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            observation, reward, *rest = super().step(action)
+            return (observation, reward + self.bonus, *rest)
+
+    record = capture(Local())
+    assert record.digest == capture(Local()).digest
+    built = build(record, trust=True)
+    built.reset()
+    assert built.step(0)[1] == 3.0
+    with pytest.raises(TupliError, match="cannot be pickled"):
+        capture(Local(), by_reference=True)
+
+
+def test_loading_does_not_redefine_the_live_class() -> None:
+    class Local(Counter):
+        bonus = 2.0
+
+    record = capture(Local())
+    Local.bonus = 5.0
+    step = Local.step
+    built = build(record, trust=True)
+    assert built.unwrapped.bonus == 2.0  # type: ignore[attr-defined]
+    assert Local.bonus == 5.0
+    assert Local.step is step
+
+
+def test_by_value_works_in_another_process(tmp_path: Path) -> None:
+    script = tmp_path / "define.py"
+    helper = tmp_path / "windy_helper.py"
+    helper.write_text("def push(x):\n    return x + 10.0\n")
+    script.write_text(
+        textwrap.dedent("""
+        import sys, pathlib
+        import gymnasium as gym, numpy as np
+        import windy_helper
+        from tupli_mcap.environment import capture
+
+        SCALE = 3.0
+
+        class Mine(gym.Env):
+            observation_space = gym.spaces.Box(-1, 1, (1,))
+            action_space = gym.spaces.Discrete(2)
+            def reset(self, *, seed=None, options=None):
+                return np.zeros(1, np.float32), {}
+            def step(self, action):
+                return np.zeros(1, np.float32), windy_helper.push(SCALE), False, False, {}
+
+        record = capture(gym.wrappers.TimeLimit(Mine(), 5))
+        pathlib.Path(sys.argv[1]).write_bytes(record.pickle)
+        pathlib.Path(sys.argv[2]).write_bytes(record.to_json())
+        """)
+    )
+    paths = [str(tmp_path / "env.cloudpickle"), str(tmp_path / "benchmark.json")]
+    subprocess.run([sys.executable, str(script), *paths], check=True, cwd=tmp_path)
+    script.unlink()
+    record = EnvironmentRecord.from_json(Path(paths[1]).read_bytes(), Path(paths[0]).read_bytes())
+    assert record.classes == ("gymnasium.wrappers.common:TimeLimit", "__main__:Mine")
+    # A module used through its name needs the module; the class itself came along.
+    sys.path.insert(0, str(tmp_path))
+    try:
+        built = build(record, trust=True)
+    finally:
+        sys.path.remove(str(tmp_path))
+        sys.modules.pop("windy_helper", None)
+    built.reset()
+    assert built.step(0)[1] == 13.0
+
+
+# --- trust ---
+
+
+def test_a_pickle_runs_only_if_trusted() -> None:
+    record = capture(Counter())
+    with pytest.raises(
+        UntrustedError,
+        match=rf"bytes of pickled Python code .*Counter.*tupli-mcap trust FILE.*{record.digest}",
+    ):
+        build(record)
+    build(record, trust=True)
+    trust.trust(record.digest)
+    assert build(record).unwrapped.start == 0.0  # type: ignore[attr-defined]
+    changed = dataclasses.replace(record, pickle=(record.pickle or b"") + b".")
+    with pytest.raises(UntrustedError, match="pickled Python code"):
+        build(changed)
+
+
+def test_a_foreign_spec_builds_nothing() -> None:
+    spec = dict(capture(gym.make("CartPole-v1")).spec or {})
+    cases = {
+        r"registered here as": {**spec, "entry_point": "os:system"},
+        r"vector_entry_point 'os:system'": {**spec, "vector_entry_point": "os:system"},
+        r"not registered here": {**spec, "id": "Unheard-v0"},
+        r"'module:Unheard-v0', which is not": {**spec, "id": "module:Unheard-v0"},
+        r"the wrapper 'os:system'": {
+            **spec,
+            "additional_wrappers": [{"name": "x", "entry_point": "os:system", "kwargs": {}}],
+        },
+        r"the wrapper 'gymnasium.wrappers.rendering:RecordVideo'": {
+            **spec,
+            "additional_wrappers": [
+                {
+                    "name": "x",
+                    "entry_point": "gymnasium.wrappers.rendering:RecordVideo",
+                    "kwargs": {"video_folder": "/x"},
+                }
+            ],
+        },
+        r"the wrapper 'None'": {**spec, "additional_wrappers": [3]},
+        r"additional wrappers of type str": {**spec, "additional_wrappers": "os:system"},
+    }
+    for message, foreign in cases.items():
+        with pytest.raises(UntrustedError, match=message):
+            build(EnvironmentRecord("CartPole-v1", spec=foreign))
+
+
+def test_a_spec_that_does_not_build_is_one_error() -> None:
+    spec = dict(capture(gym.make("CartPole-v1")).spec or {})
+    with pytest.raises(TupliError, match=r"cannot be rebuilt here with Python .*nonsense"):
+        build(EnvironmentRecord("CartPole-v1", spec={**spec, "kwargs": {"nonsense": 1}}))
+
+
+def test_a_pickle_of_something_else_is_refused() -> None:
+    with pytest.raises(TupliError, match=r"expected a gymnasium\.Env .* found int"):
+        build(EnvironmentRecord("x", pickle=pickle.dumps(3)), trust=True)
+    with pytest.raises(TupliError, match="cannot be rebuilt here"):
+        build(EnvironmentRecord("x", pickle=b"nonsense"), trust=True)
+
+
+# --- benchmark.json ---
+
+
+def test_json_round_trip() -> None:
+    for record in (capture(gym.make("CartPole-v1")), capture(Counter())):
+        again = EnvironmentRecord.from_json(
+            record.to_json({"id": "x", "metadata": {"größe": 1}}), record.pickle
+        )
+        assert again == dataclasses.replace(record, benchmark={"id": "x", "metadata": {"größe": 1}})
+        assert again.digest == record.digest
+
+
+def test_defects_in_benchmark_json_are_format_errors() -> None:
+    record = capture(Counter())
+    good = json.loads(record.to_json())
+
+    def changed(**environment: Any) -> bytes:
+        return json.dumps({**good, "environment": {**good["environment"], **environment}}).encode()
+
+    cases: list[tuple[bytes, bytes | None, str]] = [
+        (b"", None, "no benchmark document"),
+        (b"\xff\xfe", None, "no benchmark document"),
+        (b"[" * 100_000, None, "no benchmark document"),
+        (b"3", None, "no benchmark document"),
+        (json.dumps({**good, "version": 2}).encode(), record.pickle, "version"),
+        (record.to_json(), None, "is missing beside it"),
+        (record.to_json(), (record.pickle or b"")[:-1], "expected a pickled environment of"),
+        (changed(digest="0" * 64), record.pickle, "expected an environment with digest 0000"),
+        (changed(pickle=None), None, "found neither"),
+        (changed(spec={"id": "CartPole-v1"}), record.pickle, "found both"),
+        (changed(spec=3), record.pickle, "environment.spec"),
+    ]
+    for data, beside, message in cases:
+        with pytest.raises(FormatError, match=message):
+            EnvironmentRecord.from_json(data, beside)

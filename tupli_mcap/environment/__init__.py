@@ -1,0 +1,16 @@
+"""An environment as data: captured from a live one, rebuilt from a record, executed only where trusted."""
+
+from tupli_mcap.environment._build import build
+from tupli_mcap.environment._capture import Snapshot, capture, record_environment
+from tupli_mcap.environment._pickling import rebuild_ezpickled
+from tupli_mcap.environment._record import EnvironmentRecord, canonical_json
+
+__all__ = [
+    "EnvironmentRecord",
+    "Snapshot",
+    "build",
+    "canonical_json",
+    "capture",
+    "rebuild_ezpickled",
+    "record_environment",
+]

@@ -1,0 +1,127 @@
+"""From an `EnvironmentRecord` back to a live environment, without running anybody's code unasked."""
+
+from __future__ import annotations
+
+import copy
+import platform
+import sys
+from collections.abc import Mapping
+from typing import Any, cast
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec, WrapperSpec
+
+from tupli_mcap import trust as _trust
+from tupli_mcap.environment._pickling import load
+from tupli_mcap.environment._record import EnvironmentRecord, sha256
+from tupli_mcap.errors import TupliError, UntrustedError
+
+__all__ = ["build", "foreign_code", "make_from_spec"]
+
+
+def build(record: EnvironmentRecord, *, trust: bool = False) -> gym.Env[Any, Any]:
+    """Rebuild an environment.
+
+    A spec is built when its id is registered on this machine (with the entry points the file names) and its
+    wrappers are gymnasium's own or come from the environment's own package, already imported. Everything else,
+    the pickled environment above all, is code from a file: it runs only if this user made or trusted it
+    (`tupli_mcap.trust`) or `trust=True` is given. Arguments in a spec are data for code that is installed here.
+
+    Raises:
+        UntrustedError: Code would run that nobody here has trusted; nothing has been executed.
+        TupliError: The environment does not build: a package is missing, another Python version made it.
+    """
+    reasons = _reasons_for_distrust(record)
+    if reasons and not trust and not _trust.is_trusted(record.digest):
+        raise UntrustedError(
+            f"rebuilding the environment {record.name[:200]!r} would run {'; '.join(reasons)}. If you trust "
+            "where it comes from, pass trust=True or run `tupli-mcap trust FILE` (digest "
+            f"{record.digest}); reading its episodes needs no trust"
+        )
+    try:
+        env = _unpickle(record) if record.spec is None else make_from_spec(record.spec)
+    except Exception as err:
+        made_with = ", ".join(f"{name} {version}" for name, version in list(record.versions.items())[:20])
+        raise TupliError(
+            f"the environment {record.name[:200]!r} cannot be rebuilt here with Python "
+            f"{platform.python_version()} ({type(err).__name__}: {' '.join(str(err).split())[:300]}); "
+            f"it was stored with {made_with or 'unknown versions'}"
+        ) from err
+    if not isinstance(env, gym.Env):
+        raise TupliError(
+            f"expected a gymnasium.Env in the record {record.name[:200]!r}, found {type(env).__name__}"
+        )
+    return env
+
+
+def make_from_spec(spec: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    """`gymnasium.make` of a spec given as JSON-able object; runs its entry points."""
+    told = copy.deepcopy(dict(spec))
+    wrappers = tuple(WrapperSpec(**wrapper) for wrapper in told.pop("additional_wrappers", ()))
+    return gym.make(EnvSpec(**told, additional_wrappers=wrappers))
+
+
+def foreign_code(spec: Mapping[str, Any]) -> list[str]:
+    """What building a spec would run that this machine does not know; empty if it may be built without trust.
+
+    Wrappers are resolved without importing anything: a file must not choose what is imported.
+    """
+    name = spec.get("id")
+    known = gym.registry.get(name) if isinstance(name, str) else None
+    if known is None:
+        reason = (
+            f"the environment id {str(name)[:100]!r}, which is not registered here (import its package first)"
+        )
+        return [reason]
+    reasons = [
+        f"the {key} {str(spec.get(key))[:200]!r} of {name!r}, registered here as {str(here)[:200]!r}"
+        for key, here in (
+            ("entry_point", known.entry_point),
+            ("vector_entry_point", known.vector_entry_point),
+        )
+        if spec.get(key) != here
+    ]
+    wrappers = spec.get("additional_wrappers", [])
+    if not isinstance(wrappers, list):
+        return [*reasons, f"additional wrappers of type {type(wrappers).__name__}"]
+    package = _top_level(known.entry_point)
+    for wrapper in wrappers:
+        entry_point = wrapper.get("entry_point") if isinstance(wrapper, dict) else None
+        if not _is_known_wrapper(entry_point, package):
+            reasons.append(
+                f"the wrapper {str(entry_point)[:200]!r}, neither gymnasium's nor {package or name}'s"
+            )
+    return reasons
+
+
+def _is_known_wrapper(entry_point: object, package: str) -> bool:
+    """Not every imported wrapper will do: some write to files that their arguments name."""
+    if not isinstance(entry_point, str):
+        return False
+    module_name, _, class_name = entry_point.partition(":")
+    if not module_name.startswith("gymnasium.wrappers.") and (
+        not package or _top_level(entry_point) != package
+    ):
+        return False
+    found = getattr(sys.modules.get(module_name), class_name, None) if class_name.isidentifier() else None
+    return (
+        isinstance(found, type)
+        and issubclass(found, gym.Wrapper)
+        and not issubclass(found, gym.wrappers.RecordVideo)  # writes to the folder it is told
+    )
+
+
+def _top_level(entry_point: object) -> str:
+    return entry_point.partition(":")[0].partition(".")[0] if isinstance(entry_point, str) else ""
+
+
+def _reasons_for_distrust(record: EnvironmentRecord) -> list[str]:
+    if record.spec is not None:
+        return foreign_code(record.spec)
+    size = len(record.pickle or b"")
+    said = f" (it says: {', '.join(record.classes)[:300]})" if record.classes else ""
+    return [f"{size} bytes of pickled Python code with SHA-256 {sha256(record.pickle or b'')}{said}"]
+
+
+def _unpickle(record: EnvironmentRecord) -> gym.Env[Any, Any]:
+    return cast("gym.Env[Any, Any]", load(record.pickle or b""))

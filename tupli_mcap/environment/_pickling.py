@@ -1,0 +1,175 @@
+"""Pickling environments: copies within this process, comparable states, and bytes for another process."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Callable
+from typing import Any, cast
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import EzPickle
+
+from tupli_mcap.environment._local_code import by_value
+
+__all__ = ["InProcessCopy", "dump", "load", "rebuild_ezpickled", "state"]
+
+_PROTOCOL = 5
+_PLAIN_ATOMS = (type(None), bool, int, float, complex, str, bytes)
+_MAX_PLAIN_DEPTH = 20
+
+
+class InProcessCopy:
+    """An environment pickled for this process only: classes are kept as they are, by reference, so that any
+    class can be copied (locally defined ones too) and copies are instances of the very same classes."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        buffer = io.BytesIO()
+        pickler = _InProcessPickler(buffer)
+        pickler.dump(env)
+        self._data = buffer.getvalue()
+        self._classes = pickler.classes
+
+    def restore(self) -> gym.Env[Any, Any]:
+        """A new environment in the state that was captured."""
+        return cast("gym.Env[Any, Any]", _InProcessUnpickler(io.BytesIO(self._data), self._classes).load())
+
+
+def dump(env: gym.Env[Any, Any], *, by_reference: bool) -> bytes:
+    """Pickle an environment for other processes; local classes by value unless `by_reference`."""
+    buffer = io.BytesIO()
+    if by_reference:
+        _ByReferencePickler(buffer, _PROTOCOL).dump(env)
+    else:
+        with by_value():
+            _EnvPickler(buffer, _PROTOCOL).dump(env)
+    return buffer.getvalue()
+
+
+def load(data: bytes) -> Any:
+    """Unpickle what `dump` made. This runs code from the bytes: call it on trusted ones only."""
+    return _Unpickler(io.BytesIO(data)).load()
+
+
+def state(env: gym.Env[Any, Any]) -> tuple[bytes, list[type]]:
+    """The state of an environment, equal for equal environments within this process.
+
+    Left out are what the comparison of specs covers (EnvSpec objects), what does not belong to the
+    environment's dynamics (the random state of spaces) and which of two equal strings is the same object.
+    """
+    buffer = io.BytesIO()
+    pickler = _StatePickler(buffer)
+    pickler.dump(env)
+    return buffer.getvalue(), pickler.classes
+
+
+def rebuild_ezpickled(
+    cls: type, args: tuple[Any, ...], kwargs: dict[str, Any], attributes: dict[str, Any]
+) -> Any:
+    """Construct an object from its constructor's arguments, then set the attributes that were changed since.
+
+    Named in pickles as `tupli_mcap.environment.rebuild_ezpickled`, which must go on to exist.
+    """
+    made = cls(*args, **kwargs)
+    made.__dict__.update(attributes)
+    return made
+
+
+rebuild_ezpickled.__module__ = "tupli_mcap.environment"
+
+
+class _EnvPickler(cloudpickle.Pickler):  # type: ignore[misc]
+    """cloudpickle, but objects that pickle as their constructor's arguments keep their plain attributes as
+    well: `env.unwrapped.gravity = 5` is part of the environment."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, EzPickle) and type(obj).__getstate__ is EzPickle.__getstate__:
+            attributes = dict(vars(obj))
+            if "_ezpickle_args" in attributes:
+                args, kwargs = attributes.pop("_ezpickle_args"), attributes.pop("_ezpickle_kwargs")
+                plain = {name: value for name, value in attributes.items() if _is_plain(value)}
+                return rebuild_ezpickled, (type(obj), args, kwargs, plain)
+        return super().reducer_override(obj)
+
+
+class _ByReferencePickler(_EnvPickler):
+    """Classes and functions as `module` and `name` only, even those of `__main__`."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, type) or (callable(obj) and hasattr(obj, "__code__")):
+            return NotImplemented
+        return super().reducer_override(obj)
+
+
+class _InProcessPickler(_EnvPickler):
+    def __init__(self, buffer: io.BytesIO) -> None:
+        super().__init__(buffer, _PROTOCOL)
+        self.classes: list[type] = []
+        self._numbers: dict[type, int] = {}
+
+    def persistent_id(self, obj: Any) -> Any:
+        if isinstance(obj, type):
+            if obj not in self._numbers:
+                self._numbers[obj] = len(self.classes)
+                self.classes.append(obj)
+            return self._numbers[obj]
+        return None
+
+
+class _StatePickler(_InProcessPickler):
+    def persistent_id(self, obj: Any) -> Any:
+        if isinstance(obj, str):
+            return "".join(("s", obj))  # a new object each time, which the pickler cannot refer back to
+        if isinstance(obj, np.dtype):
+            return f"d{obj!r}"
+        return super().persistent_id(obj)
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, EnvSpec):
+            return EnvSpec, ("ignored-v0",)
+        if isinstance(obj, gym.Space):
+            attributes = {name: value for name, value in vars(obj).items() if name != "_np_random"}
+            return _StatePickler, (type(obj), attributes)
+        return super().reducer_override(obj)
+
+
+class _InProcessUnpickler(pickle.Unpickler):
+    def __init__(self, buffer: io.BytesIO, classes: list[type]) -> None:
+        super().__init__(buffer)
+        self._classes = classes
+
+    def persistent_load(self, pid: Any) -> Any:
+        return self._classes[pid]
+
+
+class _Unpickler(pickle.Unpickler):
+    """cloudpickle would redefine a live class of this process when it loads a pickled version of it;
+    instead, each load makes classes of its own, as it does in any other process."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        found = super().find_class(module, name)
+        if module == "cloudpickle.cloudpickle" and name in ("_make_skeleton_class", "_make_skeleton_enum"):
+            return _untracked(found)
+        return found
+
+
+def _untracked(make: Callable[..., Any]) -> Callable[..., Any]:
+    # The last two arguments of both functions are the class's tracker id and `extra`.
+    return lambda *args: make(*args[:-2], None, args[-1])
+
+
+def _is_plain(value: Any, depth: int = 0) -> bool:
+    if type(value) in _PLAIN_ATOMS or isinstance(value, np.generic):
+        return True
+    if type(value) is np.ndarray:
+        return not value.dtype.hasobject
+    if depth >= _MAX_PLAIN_DEPTH:
+        return False
+    if type(value) in (list, tuple, set, frozenset):
+        return all(_is_plain(item, depth + 1) for item in value)
+    if type(value) is dict:
+        return all(_is_plain(key, depth + 1) and _is_plain(item, depth + 1) for key, item in value.items())
+    return False

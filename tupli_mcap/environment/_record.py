@@ -1,0 +1,180 @@
+"""`EnvironmentRecord`: what is kept of an environment, and its form in `benchmark.json`."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+
+from tupli_mcap.errors import FormatError, TupliError
+
+__all__ = ["EnvironmentRecord", "canonical_json", "sha256"]
+
+_MAX_JSON_BYTES = 64 << 20
+_HEX_DIGEST = r"^[0-9a-f]{64}$"
+# Fields of an EnvSpec at these values say nothing, so that a field which a later gymnasium adds changes no
+# digest.
+_SPEC_DEFAULTS: dict[str, Any] = {
+    "entry_point": None,
+    "reward_threshold": None,
+    "nondeterministic": False,
+    "max_episode_steps": None,
+    "order_enforce": True,
+    "disable_env_checker": False,
+    "kwargs": {},
+    "additional_wrappers": [],
+    "vector_entry_point": None,
+}
+
+
+def canonical_json(value: object) -> bytes:
+    """The one UTF-8 JSON text of a value: sorted keys, no spaces, no NaN.
+
+    Raises:
+        ValueError: The value holds NaN, an infinity, or something JSON has no form for (TypeError).
+    """
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return text.encode("ascii")
+
+
+def sha256(data: bytes) -> str:
+    """SHA-256 as 64 hex digits."""
+    return hashlib.sha256(data).hexdigest()
+
+
+class _Pickle(BaseModel):
+    sha256: str = Field(pattern=_HEX_DIGEST)
+    size: int = Field(ge=0)
+
+
+class _Environment(BaseModel):
+    name: str = Field(max_length=1000)
+    spec: dict[str, JsonValue] | None = None
+    pickle: _Pickle | None = None
+    classes: list[str] = []
+    versions: dict[str, str] = {}
+    digest: str = Field(pattern=_HEX_DIGEST)
+
+
+class _Document(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    format: Literal["tupli_mcap.benchmark"]
+    version: Literal[1]
+    environment: _Environment
+    benchmark: dict[str, JsonValue] | None = None
+
+
+@dataclass(frozen=True)
+class EnvironmentRecord:
+    """An environment as data. Exactly one of `spec` and `pickle` is set.
+
+    name: the registered id, or the class as `module:Class`; for people.
+    spec: the gymnasium EnvSpec as JSON-able object, where it rebuilds the environment exactly.
+    pickle: the environment as cloudpickle bytes, which run code when loaded.
+    classes: the environment's classes as `module:Class`, outermost wrapper first; a claim, for messages only.
+    versions: of Python and of the packages that were at work; for messages only.
+    benchmark: the benchmark's own entry in `benchmark.json` (id, metadata, artifacts), None without a
+    benchmark.
+    """
+
+    name: str
+    spec: Mapping[str, Any] | None = None
+    pickle: bytes | None = field(default=None, repr=False)
+    classes: tuple[str, ...] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+    benchmark: Mapping[str, Any] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if (self.spec is None) == (self.pickle is None):
+            raise ValueError("an environment record has either a spec or a pickle")
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 (64 hex digits) over what rebuilding executes: the spec, or the pickle. Computed, never
+        believed."""
+        if self.spec is not None:
+            told = {k: v for k, v in self.spec.items() if k not in _SPEC_DEFAULTS or v != _SPEC_DEFAULTS[k]}
+            return sha256(canonical_json({"spec": told}))
+        return sha256(canonical_json({"pickle": sha256(self.pickle or b"")}))
+
+    def to_json(self, benchmark: Mapping[str, Any] | None = None) -> bytes:
+        """The content of `benchmark.json`; the pickle is kept beside it, as `env.cloudpickle`.
+
+        benchmark: replaces the record's own `benchmark` entry.
+
+        Raises:
+            TupliError: The entry cannot be written as JSON.
+        """
+        pickle = None if self.pickle is None else {"sha256": sha256(self.pickle), "size": len(self.pickle)}
+        document = {
+            "format": "tupli_mcap.benchmark",
+            "version": 1,
+            "environment": {
+                "name": self.name,
+                "spec": self.spec,
+                "pickle": pickle,
+                "classes": list(self.classes),
+                "versions": dict(self.versions),
+                "digest": self.digest,
+            },
+            "benchmark": self.benchmark if benchmark is None else benchmark,
+        }
+        try:
+            return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False).encode("utf-8")
+        except (TypeError, ValueError) as err:
+            raise TupliError(f"the metadata of a benchmark must be JSON without NaN: {err}") from err
+
+    @classmethod
+    def from_json(
+        cls, data: bytes, pickle: bytes | None = None, *, where: str = "benchmark.json"
+    ) -> EnvironmentRecord:
+        """Read `benchmark.json` and the pickle beside it, executing nothing.
+
+        Raises:
+            FormatError: The JSON is no such document, or says another digest than its contents have.
+        """
+        if len(data) > _MAX_JSON_BYTES:
+            raise FormatError(f"{where}: expected at most {_MAX_JSON_BYTES} bytes, found {len(data)}")
+        try:
+            document = _Document.model_validate_json(data)
+        except ValidationError as err:
+            first = err.errors(include_url=False, include_input=False)[0]
+            place = ".".join(str(part) for part in first["loc"]) or "the document"
+            raise FormatError(f"{where}: no benchmark document: {place}: {first['msg']}") from err
+        environment = document.environment
+        _check_pickle(environment.pickle, pickle, environment.spec is not None, where)
+        record = cls(
+            name=environment.name,
+            spec=environment.spec,
+            pickle=None if environment.spec is not None else pickle,
+            classes=tuple(environment.classes),
+            versions=environment.versions,
+            benchmark=document.benchmark,
+        )
+        if record.digest != environment.digest:
+            raise FormatError(
+                f"{where}: expected an environment with digest {environment.digest}, found {record.digest}"
+            )
+        return record
+
+
+def _check_pickle(said: _Pickle | None, found: bytes | None, has_spec: bool, where: str) -> None:
+    if has_spec:
+        if said is not None:
+            raise FormatError(f"{where}: an environment has either a spec or a pickle, found both")
+        return
+    if said is None:
+        raise FormatError(f"{where}: an environment has a spec or a pickle, found neither")
+    if found is None:
+        raise FormatError(f"{where}: the pickled environment (SHA-256 {said.sha256}) is missing beside it")
+    if len(found) != said.size or sha256(found) != said.sha256:
+        raise FormatError(
+            f"{where}: expected a pickled environment of {said.size} bytes, SHA-256 {said.sha256}, "
+            f"found {len(found)} bytes, SHA-256 {sha256(found)}"
+        )
