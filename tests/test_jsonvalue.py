@@ -1,0 +1,268 @@
+"""Values as JSON text: exact, strict, and harmless to read."""
+
+from __future__ import annotations
+
+import enum
+import json
+import math
+from collections import OrderedDict, namedtuple
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.jsonvalue import MAX_DEPTH, dumps, dumps_plain, loads
+
+
+def same(one: Any, other: Any) -> bool:
+    """Equal in type, dtype, shape and bytes, all the way down."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.longdouble):  # its bytes include padding
+        return bool(one == other)
+    if type(one) is complex:
+        return same([one.real, one.imag], [other.real, other.imag])
+    if isinstance(one, np.str_):
+        return list(one) == list(other)
+    if isinstance(one, np.ndarray | np.generic):
+        return (one.dtype, one.shape, one.tobytes()) == (other.dtype, other.shape, other.tobytes())
+    if isinstance(one, dict):
+        return len(one) == len(other) and all(
+            same(a, b) and same(one[a], other[b]) for a, b in zip(one, other, strict=True)
+        )
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, float):
+        return math.copysign(1, one) == math.copysign(1, other) and (
+            one == other or (one != one and other != other)
+        )
+    return bool(one == other)
+
+
+def strict(text: str) -> Any:
+    """Parse as other languages do: UTF-8, no NaN."""
+
+    def refuse(name: str) -> Any:
+        raise ValueError(name)
+
+    return json.loads(text.encode(), parse_constant=refuse)
+
+
+EXACT: list[Any] = [
+    None, True, 0, -(2**63), 2**64 - 1, 2**64, -(2**20000), 0.1, -0.0, 5e-324, math.inf, -math.inf,
+    math.nan, "", "é😀\n\x00", "\ud800", "\ud83d\ude00", b"\x00\xff", bytearray(b"ab"), 1 + 2j,
+    complex(math.nan, -0.0), [], (), [1, (2, [3, ()])], {1, 2}, frozenset({"a", (1,)}), {},
+    {"a": {"b": None}}, {"$float": "nan"}, {"$dict": []}, {"a": 1, "$b": 2},
+    {1: "a", "1": "b", None: 0, (1, 2): []}, {"\ud800": 1}, np.float32(0.1), np.float64("nan"),
+    np.bool_(True), np.int8(-3), np.uint64(2**64 - 1), np.float16(-0.0), np.longdouble("0.1"),
+    np.complex64(1j), np.str_("a\x00"), np.str_("\ud800"), np.bytes_(b"a\x00"), np.str_(""),
+    np.datetime64("2024-05-01T00:00:00.123456789"), np.datetime64("NaT"), np.timedelta64(5, "25s"),
+    np.array(1.5), np.zeros((2, 0, 3), np.float16), np.arange(6).reshape(2, 3).T,
+    np.array([1, 2], ">i4"), np.array(["ab", "é"]), np.array([b"a", b"bcd"]),
+    np.array(["2024"], "M8[D]"), np.array([True, False]),
+    np.array([0x7FF8DEADBEEF0001], np.uint64).view(np.float64),
+    {"info": [np.arange(3), (np.float32(1),)]}, {np.int64(3): 1}, {b"k": 1, frozenset({1}): 2},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("value", EXACT, ids=lambda value: dumps(value)[:40])
+def test_round_trip(value):
+    text = dumps(value)
+    strict(text)
+    assert same(loads(text), value)
+    assert same(loads(text.encode()), value)
+
+
+json_values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(st.characters(exclude_categories=[]))
+    | st.binary(),
+    lambda inner: (
+        st.lists(inner)
+        | st.tuples(inner, inner)
+        | st.dictionaries(st.text() | st.integers() | st.sampled_from(["$tuple", "$x"]), inner)
+    ),
+    max_leaves=20,
+)
+arrays = hnp.arrays(
+    hnp.scalar_dtypes().filter(lambda dtype: dtype.itemsize), hnp.array_shapes(min_dims=0, min_side=0)
+)
+
+
+@given(json_values)
+def test_any_value_round_trips(value):
+    text = dumps(value)
+    strict(text)
+    assert same(loads(text), value)
+
+
+@given(arrays)
+def test_any_array_round_trips(array):
+    assert same(loads(dumps(array)), array)
+
+
+def test_arrays_read_are_ones_own():
+    array = loads(dumps(np.zeros(3)))
+    array[0] = 1
+    assert array.flags.owndata
+
+
+def test_subclasses_come_back_as_the_built_in_type():
+    class Colour(enum.IntEnum):
+        RED = 1
+
+    class Name(str):
+        __slots__ = ()
+
+    point = namedtuple("point", "x y")
+    value = {"colour": Colour.RED, "name": Name("n"), "point": point(1, 2), "map": OrderedDict(a=1)}
+    assert same(loads(dumps(value)), {"colour": 1, "name": "n", "point": (1, 2), "map": {"a": 1}})
+
+
+class Unknown:
+    def __repr__(self) -> str:
+        return "<unknown>"
+
+
+@pytest.mark.parametrize(
+    "value",
+    [Unknown(), np.array([Unknown()], object), np.zeros(2, [("a", "i4")]), np.ma.masked_array([1], [True])],
+)
+def test_other_objects_are_named_or_fall_back(value):
+    with pytest.raises(TypeError, match=r"value\['a'\]\[1\] is a .*; convert it or pass fallback="):
+        dumps({"a": [0, value]})
+    assert loads(dumps({"a": (0, value)}, fallback=repr)) == {"a": (0, repr(value))}
+
+
+def test_nesting_is_bounded_both_ways():
+    within: list[Any] = []
+    within.append(within)
+    with pytest.raises(ValueError, match="levels of nesting"):
+        dumps(within)
+    with pytest.raises(ValueError, match="levels of nesting"):
+        dumps(Unknown(), fallback=lambda value: [value])
+    for text in ("[" * 100_000, '{"a":' * 100_000, "[" * 500 + '"]"' + "]" * 500):
+        with pytest.raises(FormatError, match="levels of nesting"):
+            loads(text)
+    assert loads("[" + ",".join(["[]"] * 1000) + "]") == [[]] * 1000
+    assert loads(json.dumps(["[" * 1000, '\\"' + "{" * 1000])) == ["[" * 1000, '\\"' + "{" * 1000]
+
+
+def test_deepest_values_round_trip():
+    for wrap in (lambda v: [v], lambda v: (v,), lambda v: {1: v}, lambda v: {"a": v}):
+        deep: Any = np.zeros((1, 1))
+        for _ in range(MAX_DEPTH - 1):
+            deep = wrap(deep)
+        assert loads(dumps(deep)) is not None
+
+
+def test_plain_text_can_be_filtered_on():
+    value = {
+        "score": np.float32(0.5), "done": np.bool_(True), "n": np.int64(3), "row": np.arange(2),
+        "pair": (1, 2.5), "nan": np.float64("nan"), "grid": np.array([[1.0, np.inf]]), "name": np.str_("x"), 7: "seven",
+        "raw": b"\x00", "wide": np.longdouble(2), "when": np.datetime64("2024-01-01"),
+    }  # fmt: skip
+    parsed = strict(dumps_plain(value))
+    assert same(
+        {key: parsed[key] for key in parsed if key not in ("raw", "when")},
+        {
+            "score": 0.5, "done": True, "n": 3, "row": [0, 1], "pair": [1, 2.5], "nan": {"$float": "nan"},
+            "grid": [[1.0, {"$float": "inf"}]], "name": "x", "7": "seven", "wide": 2.0,
+        },
+    )  # fmt: skip
+    again = loads(dumps_plain(value))
+    assert again["raw"] == b"\x00"
+    assert again["when"] == np.datetime64("2024-01-01")
+    assert math.isnan(again["nan"])
+
+
+@pytest.mark.parametrize("value", [{1: "a", "1": "b"}, {"$float": 1}, {(1, 2): 3}, {math.nan: 1}, 10**400])
+def test_plain_text_stays_reversible_where_names_would_meet(value):
+    text = dumps_plain(value)
+    strict(text)
+    assert repr(loads(text)) == repr(value)
+
+
+@given(json_values)
+def test_plain_text_is_strict_and_stable(value):
+    text = dumps_plain(value)
+    strict(text)
+    assert dumps_plain(loads(text)) == text
+
+
+BAD = [
+    "", "{", "[1,]", "nul", "NaN", "[Infinity]", '{"a":1}x', "1" * 5000, '{"$foo": 1}', '{"$float": 1}',
+    '{"$float": "nan", "a": 1}', '{"$float": []}', '{"$int": "12_3"}', '{"$int": ""}', '{"$int": 3}',
+    '{"$complex": [1.0]}', '{"$complex": "ab"}', '{"$str": [-1]}', '{"$str": ["a"]}',
+    '{"$str": [1114112]}', '{"$bytes": "a"}', '{"$bytes": "é"}', '{"$bytes": 3}', '{"$tuple": "ab"}',
+    '{"$tuple": {}}', '{"$set": [[]]}', '{"$dict": [[1]]}', '{"$dict": [[[], 1]]}',
+    '{"$dict": [[1, 2], [1, 3]]}', '{"$dict": 3}', '{"$numpy": 3}', '{"$numpy": {}}',
+    '{"$numpy_str": 3}', '{"$numpy_bytes": []}',
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", BAD, ids=lambda text: text[:30])
+def test_defects_are_format_errors(text):
+    with pytest.raises(FormatError, match="expected"):
+        loads(text)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"dtype": "O"},
+        {"dtype": "|O8"},
+        {"dtype": "|V4"},
+        {"dtype": "<f4,<i4"},
+        {"dtype": "<f5"},
+        {"dtype": "<i16"},
+        {"dtype": "|S0"},
+        {"dtype": "<U999999999999"},
+        {"dtype": "<M8[parsec]"},
+        {"dtype": ["<f4"]},
+        {"dtype": [["a", "<f4"]]},
+        {"shape": [2]},
+        {"shape": [10**12]},
+        {"shape": [-1, -1]},
+        {"shape": [True]},
+        {"shape": [1.0]},
+        {"shape": "1"},
+        {"shape": [1] * 100},
+        {"shape": [0, 10**40], "data": ""},
+        {"data": "AAAA"},
+        {"data": 3},
+        {"order": "F"},
+        {"dtype": "|b1", "data": "Ag=="},
+        {"dtype": "<U1", "data": "AAARAQ=="},
+    ],
+    ids=str,
+)
+def test_false_claims_of_arrays_are_format_errors(fields):
+    good = {"dtype": "<f4", "shape": [1], "data": "AAAAAA=="}
+    assert same(loads(json.dumps({"$numpy": good})), np.zeros(1, np.float32))
+    with pytest.raises(FormatError, match=r"expected a value of '\$numpy'"):
+        loads(json.dumps({"$numpy": good | fields}))
+
+
+@pytest.mark.parametrize("data", [b"\xff\xfe", b'"\xed\xa0\x80"', b'"\x80"'])
+def test_bad_utf8_is_a_format_error(data):
+    with pytest.raises(FormatError, match="UTF-8"):
+        loads(data)
+
+
+@given(st.sampled_from([dumps(value) for value in EXACT]), st.data())
+def test_a_damaged_text_is_a_value_or_a_format_error(text, data):
+    at = data.draw(st.integers(0, len(text) - 1))
+    damaged = text[:at] + data.draw(st.characters()) + text[at + data.draw(st.integers(0, 2)) :]
+    try:
+        value = loads(damaged)
+    except FormatError:
+        return
+    dumps(value)

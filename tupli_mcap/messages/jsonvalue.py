@@ -1,0 +1,374 @@
+"""Python and NumPy values as JSON text, exactly and both ways.
+
+What JSON has stays plain: strings, finite floats, integers, booleans, None, lists, dicts with string keys.
+Everything else is an object with one key that starts with `$`:
+
+`$float`: "nan", "inf" or "-inf"
+`$int`: hexadecimal digits of an integer that does not fit 64 bits
+`$complex`: `[real, imaginary]`
+`$str`: code points of a string with lone surrogates, which UTF-8 cannot carry
+`$bytes`, `$bytearray`: base64
+`$tuple`, `$set`, `$frozenset`: a list of values
+`$dict`: `[key, value]` pairs, where a key is no string or starts with `$`
+`$numpy`: `{"dtype", "shape", "data"}`, the bytes in C order as base64; a scalar has no shape
+`$numpy_str`, `$numpy_bytes`: a scalar of these types, whose trailing NULs an array would drop
+
+As such a dict of the user is written as `$dict`, a `$` key is always a tag. The text is strict JSON.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+import re
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+
+__all__ = ["MAX_DEPTH", "dumps", "dumps_plain", "loads"]
+
+MAX_DEPTH = 64
+"""Deepest nesting of values."""
+
+Fallback = Callable[[Any], Any]
+
+_SURROGATE = re.compile("[\ud800-\udfff]")
+_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*+"|[\[{]|[\]}]')
+_DTYPE = re.compile(
+    r"[<>|](?:b1|[iu][1248]|f(?:2|4|8|12|16)|c(?:8|16|24|32)|[SU][1-9]\d{0,8}|[Mm]8(?:\[\d*[A-Za-z]+\])?)"
+)
+_KINDS = "biufcSUMm"
+_BRACKETS_A_LEVEL = 3  # {"$dict": [[key, ...
+_MAX_CODE_POINT = 0x10FFFF
+# Python refuses to convert very long decimal integers, and few other JSON readers take more than 64 bits.
+_EXACT_INT_BITS = 64
+_PLAIN_INT_BITS = 1024
+
+
+def dumps(value: Any, *, fallback: Fallback | None = None) -> str:
+    """Return JSON text from which `loads` rebuilds `value`: type, dtype, shape and bytes.
+
+    Subclasses of the built-in types (a namedtuple, an `IntEnum`, an `OrderedDict`) come back as the built-in
+    type. The payload of a NaN survives in NumPy values only. `fallback` is called for an object of any other
+    type and returns what to store in its place.
+
+    Raises:
+        TypeError: an object of another type and no `fallback`; the message says where it is.
+        ValueError: nesting beyond `MAX_DEPTH`.
+    """
+    return _text(_Encoder(fallback, plain=False), value)
+
+
+def dumps_plain(value: Any, *, fallback: Fallback | None = None) -> str:
+    """Return JSON text that a filter can look into: NumPy scalars are numbers, arrays and tuples are lists.
+
+    What JSON has no form for (NaN, infinities, bytes, sets, complex numbers, dates) is tagged as by `dumps`.
+    Keys that are numbers, booleans or None become strings as the standard library's `json` makes them, unless
+    two keys then meet. Raises as `dumps` does.
+    """
+    return _text(_Encoder(fallback, plain=True), value)
+
+
+def loads(text: str | bytes) -> Any:
+    """Return the value of a text that `dumps` or `dumps_plain` wrote; nothing in the text is executed.
+
+    Raises:
+        FormatError: anything that is not such a text.
+    """
+    try:
+        if isinstance(text, bytes):
+            text = text.decode()
+        _check_depth(text)
+        return json.loads(text, object_hook=_restore, parse_constant=_refuse_constant)
+    except UnicodeDecodeError as err:
+        raise FormatError(f"expected JSON in UTF-8, found a bad byte at offset {err.start}") from err
+    except json.JSONDecodeError as err:
+        raise FormatError(f"expected JSON, found a defect at character {err.pos}: {err.msg}") from err
+    except (ValueError, RecursionError, OverflowError) as err:
+        raise FormatError(f"expected JSON of values: {err}") from err
+
+
+class _UnstorableError(TypeError):
+    """Carries the path up to the top; a path made on the way down would cost every value."""
+
+    def __init__(self, value: Any) -> None:
+        super().__init__(value)
+        self.found = type(value)
+        self.path: list[str] = []
+
+
+def _text(encoder: _Encoder, value: Any) -> str:
+    try:
+        tree = encoder.encode(value, 0)
+    except _UnstorableError as err:
+        where = "value" + "".join(reversed(err.path))
+        kind = f"{err.found.__module__}.{err.found.__qualname__}"
+        raise TypeError(
+            f"{where} is a {kind}, which has no exact JSON form; convert it or pass fallback="
+        ) from None
+    return json.dumps(tree, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+
+
+class _Encoder:
+    """Turns a value into what `json.dumps` takes as it is."""
+
+    def __init__(self, fallback: Fallback | None, *, plain: bool) -> None:
+        self.fallback = fallback
+        self.plain = plain
+        self.int_bits = _PLAIN_INT_BITS if plain else _EXACT_INT_BITS
+
+    def encode(self, value: Any, depth: int) -> Any:
+        kind = type(value)
+        if kind is bool or value is None:
+            return value
+        if kind is float:
+            return value if math.isfinite(value) else {"$float": repr(value)}
+        if kind is int:
+            return self._integer(value)
+        if kind is str:
+            return _string(value)
+        if depth >= MAX_DEPTH:
+            raise ValueError(
+                f"expected at most {MAX_DEPTH} levels of nesting, found more (a value in itself?)"
+            )
+        if isinstance(value, (np.generic, np.ndarray)):
+            return self._numpy(value, depth)
+        if isinstance(value, dict):
+            return self._mapping(value, depth)
+        return self._other(value, depth)
+
+    def _other(self, value: Any, depth: int) -> Any:
+        if isinstance(value, list):
+            return self._items(value, depth)
+        if isinstance(value, tuple):
+            return self._items(value, depth) if self.plain else {"$tuple": self._items(value, depth)}
+        if isinstance(value, (set, frozenset)):
+            tag = "$set" if isinstance(value, set) else "$frozenset"
+            # Sorted by text: the order of a set differs from process to process.
+            return {tag: sorted(self._items(value, depth), key=json.dumps)}
+        if isinstance(value, (bytes, bytearray)):
+            return {"$bytes" if isinstance(value, bytes) else "$bytearray": _base64(value)}
+        if isinstance(value, complex):
+            return {"$complex": [self.encode(value.real, depth + 1), self.encode(value.imag, depth + 1)]}
+        if isinstance(value, str):  # from here subclasses: enumerations and the like
+            return self.encode(str.__str__(value), depth + 1)
+        if isinstance(value, int):
+            return self.encode(int.__int__(value), depth + 1)
+        if isinstance(value, float):
+            return self.encode(float.__float__(value), depth + 1)
+        return self._fall_back(value, depth)
+
+    def _fall_back(self, value: Any, depth: int) -> Any:
+        if self.fallback is None:
+            raise _UnstorableError(value)
+        return self.encode(self.fallback(value), depth + 1)
+
+    def _integer(self, value: int) -> Any:
+        return value if value.bit_length() <= self.int_bits else {"$int": f"{value:x}"}
+
+    def _items(self, values: Iterable[Any], depth: int) -> list[Any]:
+        items: list[Any] = []
+        try:
+            for value in values:
+                items.append(self.encode(value, depth + 1))  # noqa: PERF401 (the length says where it failed)
+        except _UnstorableError as err:
+            err.path.append(f"[{len(items)}]")
+            raise
+        return items
+
+    def _mapping(self, value: dict[Any, Any], depth: int) -> Any:
+        plain = True
+        items: dict[Any, Any] = {}
+        key: Any = None
+        try:
+            for key, item in value.items():
+                plain = plain and type(key) is str and not key.startswith("$") and _is_unicode(key)
+                items[key] = self.encode(item, depth + 1)
+        except _UnstorableError as err:
+            err.path.append(f"[{key!r}]")
+            raise
+        if plain:
+            return items
+        if self.plain:
+            named = {_json_key(key): item for key, item in items.items()}
+            if len(named) == len(items) and all(type(name) is str for name in named):
+                return named
+        exact = _Encoder(self.fallback, plain=False)  # a list is no key
+        return {"$dict": [[exact.encode(key, depth + 1), item] for key, item in items.items()]}
+
+    def _numpy(self, value: Any, depth: int) -> Any:
+        if isinstance(value, np.str_):
+            text = _string(str.__str__(value))  # str() would drop trailing NULs
+            return text if self.plain else {"$numpy_str": text}
+        if isinstance(value, np.bytes_):
+            return {"$numpy_bytes": _base64(bytes(value))}
+        dtype = value.dtype
+        if dtype.kind not in _KINDS or dtype.itemsize == 0 or isinstance(value, np.ma.MaskedArray):
+            return self._fall_back(value, depth)
+        if self.plain and dtype.kind in "biufU":
+            if dtype.char == "g":  # .item() of a long double is a long double again
+                value = value.astype(np.float64)
+            return self.encode(value.item() if value.ndim == 0 else value.tolist(), depth + 1)
+        data = np.asarray(value)
+        if dtype.kind == "b":
+            data = data.view(np.uint8) != 0  # a bool made by a view may hold any byte
+        tagged = {"dtype": dtype.str, "data": _base64(data.tobytes())}
+        if isinstance(value, np.ndarray):
+            tagged["shape"] = list(value.shape)
+        return {"$numpy": tagged}
+
+
+def _json_key(key: Any) -> Any:
+    """Return the name `json` gives a key, or the key itself where it gives none."""
+    if isinstance(key, np.generic):
+        key = key.item()
+    if type(key) is str:
+        return None if key.startswith("$") or not _is_unicode(key) else key
+    if key is None or type(key) is bool:
+        return {None: "null", True: "true", False: "false"}[key]
+    if type(key) is int and key.bit_length() <= _PLAIN_INT_BITS:
+        return str(key)
+    return repr(key) if type(key) is float and math.isfinite(key) else None
+
+
+def _is_unicode(text: str) -> bool:
+    return text.isascii() or _SURROGATE.search(text) is None
+
+
+def _string(text: str) -> Any:
+    return text if _is_unicode(text) else {"$str": [ord(character) for character in text]}
+
+
+def _base64(data: bytes | bytearray) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
+def _check_depth(text: str) -> None:
+    deepest = _BRACKETS_A_LEVEL * (MAX_DEPTH + 1)
+    if text.count("[") + text.count("{") <= deepest:
+        return
+    depth = 0
+    for match in _TOKEN.finditer(text):
+        token = match[0]
+        if token in "[{":
+            depth += 1
+            if depth > deepest:
+                raise ValueError(f"expected at most {MAX_DEPTH} levels of nesting, found more")
+        elif token in "]}":
+            depth -= 1
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f'expected strict JSON, found {name}, which is written {{"$float": "nan"}} or alike')
+
+
+def _restore(tagged: dict[str, Any]) -> Any:
+    """Called for every object of a text, innermost first."""
+    for key in tagged:
+        if key.startswith("$"):
+            break
+    else:
+        return tagged
+    restore = _RESTORE.get(key)
+    if restore is None or len(tagged) != 1:
+        raise ValueError(f"expected one known tag in an object, found {_short(list(tagged))}")
+    try:
+        return restore(tagged[key])
+    except (TypeError, ValueError, OverflowError, binascii.Error, KeyError, AttributeError) as err:
+        raise ValueError(f"expected a value of {key!r}, found {_short(tagged[key])} ({err})") from err
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _list(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise TypeError("not a list")
+    return value
+
+
+def _from_float(value: Any) -> float:
+    return {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}[value]
+
+
+def _from_int(value: Any) -> int:
+    if not re.fullmatch(r"-?[0-9a-f]+", value):
+        raise ValueError("not hexadecimal")
+    return int(value, 16)
+
+
+def _from_complex(value: Any) -> complex:
+    real, imaginary = _list(value)
+    if type(real) is not float or type(imaginary) is not float:
+        raise TypeError("not two floats")
+    return complex(real, imaginary)
+
+
+def _from_str(value: Any) -> str:
+    return "".join([chr(code) for code in _list(value)])
+
+
+def _from_base64(value: Any) -> bytes:
+    if not isinstance(value, str):
+        raise TypeError("not base64")
+    return base64.b64decode(value, validate=True)
+
+
+def _from_pairs(value: Any) -> dict[Any, Any]:
+    pairs = {key: item for key, item in _list(value)}  # noqa: C416 (two items each, or ValueError)
+    if len(pairs) != len(value):
+        raise ValueError("a key occurs twice")
+    return pairs
+
+
+def _from_numpy(value: Any) -> Any:
+    name, data = value["dtype"], _from_base64(value["data"])
+    if not isinstance(name, str) or not _DTYPE.fullmatch(name) or value.keys() - {"dtype", "data", "shape"}:
+        raise ValueError("not a dtype of numbers, strings, bytes or times")
+    shape = _list(value.get("shape", []))
+    if not all(type(length) is int and length >= 0 for length in shape):
+        raise ValueError("not a shape")
+    dtype = np.dtype(name)
+    # The size is a claim: it has to agree with the bytes that are here before anything is allocated.
+    if dtype.itemsize * math.prod(shape) != len(data):
+        raise ValueError("bytes and shape do not agree")
+    array = np.ndarray(tuple(shape), dtype, bytearray(data)).copy()
+    if (
+        dtype.kind == "U"
+        and array.size
+        and array.reshape(-1).view(dtype.byteorder + "u4").max() > _MAX_CODE_POINT
+    ):
+        raise ValueError("a code point beyond Unicode")
+    if dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
+        raise ValueError("a boolean that is not 0 or 1")
+    return array if "shape" in value else array[()]
+
+
+def _from_numpy_str(value: Any) -> np.str_:
+    if not isinstance(value, str):
+        raise TypeError("not a string")
+    return np.str_(value)
+
+
+_RESTORE: dict[str, Callable[[Any], Any]] = {
+    "$float": _from_float,
+    "$int": _from_int,
+    "$complex": _from_complex,
+    "$str": _from_str,
+    "$bytes": _from_base64,
+    "$bytearray": lambda value: bytearray(_from_base64(value)),
+    "$tuple": lambda value: tuple(_list(value)),
+    "$set": lambda value: set(_list(value)),
+    "$frozenset": lambda value: frozenset(_list(value)),
+    "$dict": _from_pairs,
+    "$numpy": _from_numpy,
+    "$numpy_str": _from_numpy_str,
+    "$numpy_bytes": lambda value: np.bytes_(_from_base64(value)),
+}

@@ -1,0 +1,318 @@
+"""A Gymnasium space as a JSON object, and back: every bound, start, key and order, to the bit.
+
+The object stays readable from other languages: dtypes by NumPy's names, arrays as one number where all
+elements are equal, else as the flat list of their elements in C order, infinities as `"inf"` and `"-inf"`.
+A Dict is a list of pairs, as its keys have an order and need not be strings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.errors import FormatError, SpaceError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.spacefields import Fields, Json, dtype_name, numbers, short
+
+__all__ = ["MAX_DEPTH", "space_from_json", "space_to_json"]
+
+MAX_DEPTH = 64
+"""Deepest nesting of spaces."""
+
+_MAX_ELEMENTS = (
+    2**26
+)  # of all leaves together: a space holds its bounds in memory, and a file only claims its size
+_MAX_SPACES = 2**16
+
+
+class _Budget:
+    """What a space may still take in memory.
+
+    Gymnasium copies what is below a stacked Sequence or a Graph, so each level of these doubles the count.
+    """
+
+    def __init__(self) -> None:
+        self._elements = _MAX_ELEMENTS
+        self._spaces = _MAX_SPACES
+
+    def take(self, shape: tuple[int, ...], copies: int) -> str | None:
+        """Count a space of this shape; return what is wrong, if anything is."""
+        self._elements -= math.prod(shape) * copies
+        self._spaces -= copies
+        if self._elements < 0:
+            return f"at most {_MAX_ELEMENTS} elements in all, found a shape of {shape}"
+        if self._spaces < 0:
+            return f"at most {_MAX_SPACES} spaces, counting the copies Gymnasium makes, found more"
+        return None
+
+
+def space_to_json(space: gym.Space[Any], name: str = "space") -> Json:
+    """Return an object of `str`, `int`, `float`, `bool`, `list` and `dict` only, which describes `space`.
+
+    The state of its random generator is no part of it.
+
+    Raises:
+        SpaceError: a space that is no part of Gymnasium (a subclass too), a dtype that no message can hold,
+            or a key that has no JSON form; the message starts with the path of the leaf: `name['a'][1]`.
+    """
+    return _write(space, name, 0, 1, _Budget())
+
+
+def space_from_json(obj: Any) -> gym.Space[Any]:
+    """Return the space an object of `space_to_json` describes; sizes are checked before allocating.
+
+    Raises:
+        FormatError: any defect, with its path.
+    """
+    return _read(obj, "space", 0, 1, _Budget())
+
+
+def _write(space: gym.Space[Any], path: str, depth: int, copies: int, budget: _Budget) -> Json:
+    kind = type(space)
+    writer = _WRITERS.get(kind)
+    if writer is None:
+        raise SpaceError(
+            f"{path}: expected a space of Gymnasium itself, found {kind.__module__}.{kind.__qualname__}; "
+            "wrap the environment so that it returns one"
+        )
+    if depth > MAX_DEPTH:
+        raise SpaceError(f"{path}: expected at most {MAX_DEPTH} nested spaces, found more")
+    shape = () if isinstance(space, (spaces.Dict, spaces.Tuple)) else space.shape or ()
+    if (wrong := budget.take(shape, copies)) is not None:
+        raise SpaceError(f"{path}: expected {wrong}")
+
+    def write_sub(sub: gym.Space[Any], step: str, copied: bool = False) -> Json:
+        return _write(sub, path + step, depth + 1, 2 * copies if copied else copies, budget)
+
+    return {"type": kind.__name__, **writer(space, path, write_sub)}
+
+
+def _read(obj: Any, path: str, depth: int, copies: int, budget: _Budget) -> gym.Space[Any]:
+    if not isinstance(obj, dict):
+        raise FormatError(f"{path}: expected the object of a space, found {short(obj)}")
+    reader = _READERS.get(obj["type"]) if isinstance(obj.get("type"), str) else None
+    if reader is None:
+        raise FormatError(f"{path}: expected the type of a space, found {short(obj.get('type'))}")
+    if depth > MAX_DEPTH:
+        raise FormatError(f"{path}: expected at most {MAX_DEPTH} nested spaces, found more")
+    fields = Fields(obj, path)
+    if (wrong := budget.take(fields.shape("shape") if "shape" in obj else (), copies)) is not None:
+        raise FormatError(f"{path}: expected {wrong}")
+
+    def read_sub(sub: Any, step: str, copied: bool = False) -> gym.Space[Any]:
+        return _read(sub, path + step, depth + 1, 2 * copies if copied else copies, budget)
+
+    try:
+        return reader(fields, read_sub)
+    except (
+        ValueError,
+        TypeError,
+        OverflowError,
+        AssertionError,
+        ArithmeticError,
+        NotImplementedError,
+    ) as err:
+        raise FormatError(
+            f"{path}: expected a space of Gymnasium, which refuses this one: {short(err)}"
+        ) from err
+
+
+WriteSub = Callable[..., Json]
+ReadSub = Callable[..., "gym.Space[Any]"]
+
+
+# One writer and one reader a space, side by side, the same fields in the same order.
+
+
+def _write_box(space: Any, path: str, _: WriteSub) -> Json:
+    obj = {"dtype": dtype_name(space.dtype, path), "shape": list(space.shape)}
+    for name in ("low", "high"):
+        bound = getattr(space, name)
+        if bound.dtype != space.dtype or bound.shape != space.shape or np.isnan(bound).any():
+            raise SpaceError(
+                f"{path}: expected {name} of shape {space.shape} and {space.dtype}, found {short(bound)}"
+            )
+        obj[name] = numbers(bound)
+    if space.dtype.kind == "i":  # of a float the bound itself says whether there is one
+        obj["bounded_below"] = numbers(space.bounded_below)
+        obj["bounded_above"] = numbers(space.bounded_above)
+    return obj
+
+
+def _read_box(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+    dtype, shape = fields.dtype(), fields.shape("shape")
+    low, high = fields.array("low", dtype, shape), fields.array("high", dtype, shape)
+    # The constructor takes no arrays of bools in some versions, and mistakes a lowest integer for a bound.
+    as_given = np.uint8 if dtype.kind == "b" else dtype
+    space = spaces.Box(low.astype(as_given), high.astype(as_given), shape, dtype.type)
+    space.low, space.high = low, high
+    if dtype.kind == "i":
+        flag = np.dtype(np.bool_)
+        space.bounded_below = fields.array("bounded_below", flag, shape)
+        space.bounded_above = fields.array("bounded_above", flag, shape)
+    return space
+
+
+def _write_discrete(space: Any, path: str, _: WriteSub) -> Json:
+    return {"dtype": dtype_name(space.dtype, path), "n": int(space.n), "start": int(space.start)}
+
+
+def _read_discrete(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+    dtype: Any = fields.dtype().type
+    return spaces.Discrete(fields.integer("n"), start=fields.integer("start"), dtype=dtype)
+
+
+def _write_multi_discrete(space: Any, path: str, _: WriteSub) -> Json:
+    obj = {"dtype": dtype_name(space.dtype, path), "shape": list(space.nvec.shape)}
+    return {**obj, "nvec": numbers(space.nvec), "start": numbers(space.start)}
+
+
+def _read_multi_discrete(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+    dtype, shape = fields.dtype(), fields.shape("shape")
+    nvec, start = fields.array("nvec", dtype, shape), fields.array("start", dtype, shape)
+    if dtype.kind not in "iu":
+        raise fields.wrong("dtype", "an integer dtype")
+    return spaces.MultiDiscrete(nvec, dtype=dtype.type, start=start)
+
+
+def _write_multi_binary(space: Any, _path: str, _: WriteSub) -> Json:
+    # n = 5 and n = (5,) are different spaces to Gymnasium
+    return {"shape": list(space.shape), "flat": isinstance(space.n, int)}
+
+
+def _read_multi_binary(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+    shape, flat = fields.shape("shape"), fields.flag("flat")
+    if flat and len(shape) != 1:
+        raise fields.wrong("shape", "one length")
+    return spaces.MultiBinary(shape[0] if flat else shape)
+
+
+def _write_text(space: Any, _path: str, _: WriteSub) -> Json:
+    # As code points where there are surrogates: two in a row become one other character in JSON.
+    characters = "".join(space.character_list)
+    try:
+        characters.encode()
+    except UnicodeEncodeError:
+        return {**_text_lengths(space), "characters": [ord(character) for character in characters]}
+    return {**_text_lengths(space), "characters": characters}
+
+
+def _text_lengths(space: Any) -> Json:
+    return {"min_length": space.min_length, "max_length": space.max_length}
+
+
+def _read_text(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+    lengths = {"min_length": fields.integer("min_length"), "max_length": fields.integer("max_length")}
+    characters = fields.take("characters")
+    if isinstance(characters, list):
+        characters = "".join([chr(code) for code in characters])
+    if not isinstance(characters, str) or len(set(characters)) != len(characters):
+        raise fields.wrong("characters", "different characters")
+    return spaces.Text(charset=characters, **lengths)
+
+
+def _write_dict(space: Any, path: str, write_sub: WriteSub) -> Json:
+    return {
+        "spaces": [[_write_key(key, path), write_sub(sub, f"[{key!r}]")] for key, sub in space.spaces.items()]
+    }
+
+
+def _read_dict(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+    pairs = list(_read_pairs(fields, read_sub))
+    if len(dict(pairs)) != len(pairs):
+        raise fields.wrong("spaces", "different keys")
+    return spaces.Dict(pairs)
+
+
+def _read_pairs(fields: Fields, read_sub: ReadSub) -> Iterator[tuple[Any, gym.Space[Any]]]:
+    for pair in fields.items("spaces"):
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise fields.wrong("spaces", "pairs of a key and a space")
+        key = _read_key(pair[0], fields)
+        yield key, read_sub(pair[1], f"[{short(key)}]")
+
+
+def _write_key(key: Any, path: str) -> Any:
+    """A string as it is, another key as an object that holds its text."""
+    try:
+        text = jsonvalue.dumps(key)
+    except (TypeError, ValueError) as err:
+        raise SpaceError(f"{path}: expected keys with a JSON form, found {short(key)}: {err}") from err
+    restored = jsonvalue.loads(text)
+    if (
+        type(restored) is not type(key) or restored != key
+    ):  # an enumeration, a named tuple, an object equal to nothing
+        raise SpaceError(f"{path}: expected keys of built-in types or NumPy's, found {short(key)}")
+    return key if text.startswith('"') else {"key": text}
+
+
+def _read_key(obj: Any, fields: Fields) -> Any:
+    if isinstance(obj, dict) and obj.keys() == {"key"} and isinstance(obj["key"], str):
+        return jsonvalue.loads(obj["key"])
+    if not isinstance(obj, str):
+        raise fields.wrong("spaces", "a key")
+    return obj
+
+
+def _write_tuple(space: Any, _path: str, write_sub: WriteSub) -> Json:
+    return {"spaces": [write_sub(sub, f"[{i}]") for i, sub in enumerate(space.spaces)]}
+
+
+def _read_tuple(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+    return spaces.Tuple([read_sub(sub, f"[{i}]") for i, sub in enumerate(fields.items("spaces"))])
+
+
+def _read_one_of(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+    return spaces.OneOf([read_sub(sub, f"[{i}]") for i, sub in enumerate(fields.items("spaces"))])
+
+
+def _write_sequence(space: Any, _path: str, write_sub: WriteSub) -> Json:
+    return {"stack": bool(space.stack), "space": write_sub(space.feature_space, "[]", bool(space.stack))}
+
+
+def _read_sequence(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+    stack = fields.flag("stack")
+    return spaces.Sequence(read_sub(fields.take("space"), "[]", stack), stack=stack)
+
+
+def _write_graph(space: Any, _path: str, write_sub: WriteSub) -> Json:
+    edges = None if space.edge_space is None else write_sub(space.edge_space, ".edges", True)
+    return {"node_space": write_sub(space.node_space, ".nodes", True), "edge_space": edges}
+
+
+def _read_graph(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+    nodes: Any = read_sub(fields.take("node_space"), ".nodes", True)
+    edges: Any = fields.take("edge_space")
+    return spaces.Graph(nodes, None if edges is None else read_sub(edges, ".edges", True))
+
+
+_WRITERS: dict[type, Callable[[Any, str, WriteSub], Json]] = {
+    spaces.Box: _write_box,
+    spaces.Discrete: _write_discrete,
+    spaces.MultiDiscrete: _write_multi_discrete,
+    spaces.MultiBinary: _write_multi_binary,
+    spaces.Text: _write_text,
+    spaces.Dict: _write_dict,
+    spaces.Tuple: _write_tuple,
+    spaces.Sequence: _write_sequence,
+    spaces.Graph: _write_graph,
+    spaces.OneOf: _write_tuple,
+}
+
+_READERS: dict[str, Callable[[Fields, ReadSub], gym.Space[Any]]] = {
+    "Box": _read_box,
+    "Discrete": _read_discrete,
+    "MultiDiscrete": _read_multi_discrete,
+    "MultiBinary": _read_multi_binary,
+    "Text": _read_text,
+    "Dict": _read_dict,
+    "Tuple": _read_tuple,
+    "Sequence": _read_sequence,
+    "Graph": _read_graph,
+    "OneOf": _read_one_of,
+}
