@@ -23,9 +23,9 @@ def build(record: EnvironmentRecord, *, trust: bool = False) -> gym.Env[Any, Any
     """Rebuild an environment.
 
     A spec is built when its id is registered on this machine (with the entry points the file names) and its
-    wrappers are gymnasium's own or come from the environment's own package, already imported. Everything else,
-    the pickled environment above all, is code from a file: it runs only if this user made or trusted it
-    (`tupli_mcap.trust`) or `trust=True` is given. Arguments in a spec are data for code that is installed here.
+    wrappers are gymnasium's own or come from the environment's own package, already imported. Everything
+    else, the pickled environment above all, is code from a file: it runs only if this user made or trusted
+    it (`tupli_mcap.trust`) or `trust=True` is given. Arguments in a spec are data for code installed here.
 
     Raises:
         UntrustedError: Code would run that nobody here has trusted; nothing has been executed.
