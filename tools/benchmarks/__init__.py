@@ -1,0 +1,1 @@
+"""The parts of `tools/bench.py`: workloads, the peers, and a module for each kind of work."""
