@@ -9,6 +9,7 @@ import random
 import subprocess
 import sys
 import textwrap
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import pytest
 from gymnasium.utils import EzPickle
 
 from tupli_mcap import trust
-from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture
+from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture, record_environment
 from tupli_mcap.errors import FormatError, TupliError, UntrustedError
 
 
@@ -190,14 +191,23 @@ def test_snapshot_keeps_the_state_it_was_taken_in() -> None:
 
 def test_an_environment_that_cannot_be_pickled_fails_only_when_needed() -> None:
     env = Counter()
-    env.handle = open(__file__)  # type: ignore[attr-defined]  # noqa: PTH123, SIM115
-    env.lock = __import__("threading").Lock()  # type: ignore[attr-defined]
+    env.lock = threading.Lock()  # type: ignore[attr-defined]
     snapshot = Snapshot(env)
-    env.handle.close()  # type: ignore[attr-defined]
-    with pytest.raises(
-        TupliError, match="the environment Counter cannot be captured, since it cannot be pickled"
-    ):
+    with pytest.raises(TupliError, match=r"the environment .*Counter cannot be pickled \(TypeError: .*lock"):
         snapshot.record()
+    copy = snapshot.restore()
+    assert copy.lock is env.lock  # type: ignore[attr-defined]
+    copy.lock = None  # type: ignore[attr-defined]
+    assert record_environment(copy).pickle is not None
+
+
+def test_copies_do_not_close_what_they_share() -> None:
+    env = Engine()
+    env.__dict__.pop("_ezpickle_args")
+    with pytest.raises(TupliError, match="cannot be"):
+        capture(env)
+    assert not env.world.closed
+    env.close()
 
 
 def test_changes_to_an_environment_that_pickles_as_its_arguments_are_kept() -> None:

@@ -39,7 +39,8 @@ class Snapshot:
     """The state of an environment at one moment, kept in this process.
 
     Taking one costs about as much as pickling the environment, changes nothing in it and draws from no random
-    generator. An environment that cannot be pickled is only complained about when the snapshot is used.
+    generator. An environment that cannot be pickled is only complained about when the snapshot is used;
+    objects in it that cannot be pickled (open files, windows) are shared with copies.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -83,7 +84,12 @@ class Snapshot:
         try:
             return record_environment(env, by_reference=by_reference)
         finally:
-            _close(env)
+            self.discard(env)
+
+    def discard(self, copy: gym.Env[Any, Any]) -> None:
+        """Close a copy that `restore` made, unless that would close what the original still uses."""
+        if self._copy is not None and not self._copy.shares:
+            _close(copy)
 
 
 def record_environment(env: gym.Env[Any, Any], *, by_reference: bool = False) -> EnvironmentRecord:
@@ -103,8 +109,13 @@ def record_environment(env: gym.Env[Any, Any], *, by_reference: bool = False) ->
     try:
         data = dump(env, by_reference=by_reference)
     except Exception as err:
-        hint = "" if by_reference else "; by_reference=True stores the names of its classes only"
-        raise TupliError(f"the environment {classes[-1]} cannot be pickled: {_brief(err)}{hint}") from err
+        hint = (
+            "" if by_reference else ", or try by_reference=True, which stores the names of its classes only"
+        )
+        raise TupliError(
+            f"the environment {classes[-1]} cannot be pickled ({_brief(err)}): wrap it before rendering or "
+            f"opening files, give its class __getstate__ and __setstate__{hint}"
+        ) from err
     return EnvironmentRecord(name=classes[-1], pickle=data, classes=classes, versions=versions)
 
 
@@ -149,11 +160,12 @@ def _same(env: gym.Env[Any, Any], fresh: gym.Env[Any, Any]) -> bool:
         return False
     # Both went through a pickle, so that the one is no more "used" than the other.
     _forget_cached_specs(env)
-    fresh_copy = Snapshot(fresh).restore()
+    snapshot = Snapshot(fresh)
+    fresh_copy = snapshot.restore()
     try:
         return state(env) == state(fresh_copy)
     finally:
-        _close(fresh_copy)
+        snapshot.discard(fresh_copy)
 
 
 def _layers(env: gym.Env[Any, Any]) -> Iterator[gym.Env[Any, Any]]:

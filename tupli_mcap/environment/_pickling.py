@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import pickle
 from collections.abc import Callable
+from types import FunctionType
 from typing import Any, cast
 
 import cloudpickle
@@ -23,19 +24,24 @@ _MAX_PLAIN_DEPTH = 20
 
 
 class InProcessCopy:
-    """An environment pickled for this process only: classes are kept as they are, by reference, so that any
-    class can be copied (locally defined ones too) and copies are instances of the very same classes."""
+    """An environment pickled for this process only.
+
+    Classes are kept as they are, by reference, so that any class can be copied (locally defined ones too) and
+    copies are instances of the very same classes. So are objects that cannot be pickled (open files): `shares`
+    tells whether copies have such objects in common with the original.
+    """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        buffer = io.BytesIO()
-        pickler = _InProcessPickler(buffer)
-        pickler.dump(env)
-        self._data = buffer.getvalue()
-        self._classes = pickler.classes
+        self.shares = False
+        try:
+            self._data, self._kept = _dump_in_process(_InProcessPickler, env)
+        except Exception:  # noqa: BLE001 - any class may fail to pickle in its own way
+            self._data, self._kept = _dump_in_process(_SharingPickler, env)
+            self.shares = True
 
     def restore(self) -> gym.Env[Any, Any]:
         """A new environment in the state that was captured."""
-        return cast("gym.Env[Any, Any]", _InProcessUnpickler(io.BytesIO(self._data), self._classes).load())
+        return cast("gym.Env[Any, Any]", _InProcessUnpickler(io.BytesIO(self._data), self._kept).load())
 
 
 def dump(env: gym.Env[Any, Any], *, by_reference: bool) -> bytes:
@@ -54,16 +60,13 @@ def load(data: bytes) -> Any:
     return _Unpickler(io.BytesIO(data)).load()
 
 
-def state(env: gym.Env[Any, Any]) -> tuple[bytes, list[type]]:
+def state(env: gym.Env[Any, Any]) -> tuple[bytes, list[Any]]:
     """The state of an environment, equal for equal environments within this process.
 
     Left out are what the comparison of specs covers (EnvSpec objects), what does not belong to the
     environment's dynamics (the random state of spaces) and which of two equal strings is the same object.
     """
-    buffer = io.BytesIO()
-    pickler = _StatePickler(buffer)
-    pickler.dump(env)
-    return buffer.getvalue(), pickler.classes
+    return _dump_in_process(_StatePickler, env)
 
 
 def rebuild_ezpickled(
@@ -107,16 +110,34 @@ class _ByReferencePickler(_EnvPickler):
 class _InProcessPickler(_EnvPickler):
     def __init__(self, buffer: io.BytesIO) -> None:
         super().__init__(buffer, _PROTOCOL)
-        self.classes: list[type] = []
-        self._numbers: dict[type, int] = {}
+        self.kept: list[Any] = []
+        self._numbers: dict[int, int] = {}
 
     def persistent_id(self, obj: Any) -> Any:
-        if isinstance(obj, type):
-            if obj not in self._numbers:
-                self._numbers[obj] = len(self.classes)
-                self.classes.append(obj)
-            return self._numbers[obj]
+        return self._keep(obj) if isinstance(obj, type) else None
+
+    def _keep(self, obj: Any) -> int:
+        if id(obj) not in self._numbers:
+            self._numbers[id(obj)] = len(self.kept)
+            self.kept.append(obj)  # which also keeps its id from being used again
+        return self._numbers[id(obj)]
+
+
+class _SharingPickler(_InProcessPickler):
+    def persistent_id(self, obj: Any) -> Any:
+        if isinstance(obj, type) or not self._can_pickle(obj):
+            return self._keep(obj)
         return None
+
+    def _can_pickle(self, obj: Any) -> bool:
+        if type(obj) in (*_PLAIN_ATOMS, list, tuple, dict, set, frozenset, FunctionType):
+            return True
+        try:
+            reduce = self.dispatch_table.get(type(obj))
+            _ = obj.__reduce_ex__(_PROTOCOL) if reduce is None else reduce(obj)
+        except Exception:  # noqa: BLE001 - any class may fail to pickle in its own way
+            return False
+        return True
 
 
 class _StatePickler(_InProcessPickler):
@@ -136,13 +157,20 @@ class _StatePickler(_InProcessPickler):
         return super().reducer_override(obj)
 
 
+def _dump_in_process(pickler: type[_InProcessPickler], env: gym.Env[Any, Any]) -> tuple[bytes, list[Any]]:
+    buffer = io.BytesIO()
+    made = pickler(buffer)
+    made.dump(env)
+    return buffer.getvalue(), made.kept
+
+
 class _InProcessUnpickler(pickle.Unpickler):
-    def __init__(self, buffer: io.BytesIO, classes: list[type]) -> None:
+    def __init__(self, buffer: io.BytesIO, kept: list[Any]) -> None:
         super().__init__(buffer)
-        self._classes = classes
+        self._kept = kept
 
     def persistent_load(self, pid: Any) -> Any:
-        return self._classes[pid]
+        return self._kept[pid]
 
 
 class _Unpickler(pickle.Unpickler):
