@@ -1,0 +1,206 @@
+"""How the leaves of a value of variable size are written and read: numbers, one or many, and text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.errors import FormatError, SpaceError, StepError
+from tupli_mcap.messages import cdr
+from tupli_mcap.messages.exact import exact_array, shorten
+from tupli_mcap.messages.leaves import ROS_TYPES, ros_type
+
+__all__ = [
+    "Codec",
+    "Decode",
+    "Encode",
+    "Leaf",
+    "empty_batch",
+    "expect_tuple",
+    "numeric",
+    "numeric_batch",
+    "numeric_items",
+    "text",
+]
+
+Encode = Callable[[Any, bytearray, int], None]
+Decode = Callable[[memoryview, int, int], tuple[Any, int]]
+
+
+@dataclass(frozen=True)
+class Codec:
+    """How a value is stored; `kind` says how it is left out: fixed and message as `[]`, others empty."""
+
+    ros: str
+    kind: Literal["nothing", "fixed", "array", "string", "message"]
+    encode: Encode
+    decode: Decode
+    count: int = 1  # elements, where fixed
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """An array or scalar of constant size."""
+
+    dtype: np.dtype[Any]  # little-endian
+    shape: tuple[int, ...]
+    scalar: bool  # samples are NumPy scalars, not arrays
+
+    @classmethod
+    def of(cls, space: gym.Space[Any], path: str) -> Leaf:
+        dtype, shape = np.dtype(space.dtype), tuple(space.shape or ())
+        if dtype.name not in ROS_TYPES or not dtype.isnative:
+            raise SpaceError(
+                f"{path}: expected a dtype of {', '.join(ROS_TYPES)}, found {dtype.str} ({dtype.name})"
+            )
+        # As Gymnasium's own samples are: an integer or bool Box rounds, which turns a 0-d array to a scalar.
+        is_array = type(space) is spaces.MultiBinary or (type(space) is spaces.Box and dtype.kind == "f")
+        return cls(dtype.newbyteorder("<"), shape, shape == () and not is_array)
+
+    @property
+    def count(self) -> int:
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    def to_bytes(self) -> Callable[[Any], bytes]:
+        """A function from a value to its little-endian bytes, or to a StepError without the path."""
+        dtype, shape, array = self.dtype, self.shape, np.ndarray
+        scalar = dtype.type if shape == () and dtype.isnative else None
+
+        def convert(value: Any) -> bytes:
+            kind = type(value)
+            if kind is scalar or (kind is array and value.dtype == dtype and value.shape == shape):
+                return value.tobytes()  # type: ignore[no-any-return]
+            return exact_bytes(value, dtype, shape)
+
+        return partial(exact_bytes, dtype=dtype, shape=shape) if dtype.kind == "b" else convert
+
+    def from_array(self, array: np.ndarray[Any, Any]) -> Any:
+        return array[0] if self.scalar else array.reshape(self.shape)
+
+    def split(self, array: np.ndarray[Any, Any], number: int) -> tuple[Any, ...]:
+        """The items of a Sequence whose elements lie in a row."""
+        if self.shape == () and not self.scalar:
+            return tuple([array[i : i + 1].reshape(()) for i in range(number)])
+        return tuple(array.reshape(number, *self.shape))
+
+
+def numeric(space: gym.Space[Any], path: str) -> Codec:
+    leaf = Leaf.of(space, path)
+    dtype, count, itemsize = leaf.dtype, leaf.count, leaf.dtype.itemsize
+    to_bytes, from_array = leaf.to_bytes(), leaf.from_array
+
+    def encode(value: Any, out: bytearray, origin: int) -> None:
+        cdr.write_array(out, origin, to_bytes(value), itemsize)
+
+    def decode(data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
+        array, offset = cdr.read_array(data, offset, origin, dtype, count)
+        return from_array(array), offset
+
+    if count == 0:
+        return Codec("", "nothing", encode, decode)
+    ros = ros_type(dtype) if leaf.shape == () else f"{ros_type(dtype)}[{count}]"
+    return Codec(ros, "fixed", encode, decode, count)
+
+
+def numeric_items(leaf: Leaf) -> Codec:
+    dtype, count, itemsize = leaf.dtype, leaf.count, leaf.dtype.itemsize
+    to_bytes = leaf.to_bytes()
+
+    def encode(value: Any, out: bytearray, origin: int) -> None:
+        expect_tuple(value)
+        parts: list[bytes] = []
+        try:
+            for item in value:
+                parts.append(to_bytes(item))  # noqa: PERF401 (the length says where it failed)
+        except StepError as err:
+            raise StepError(f"[{len(parts)}]{err}") from err.__cause__
+        cdr.write_length(out, origin, len(parts) * count)
+        cdr.write_array(out, origin, b"".join(parts), itemsize)
+
+    def decode(data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
+        number, offset = _read_number(data, offset, origin, count)
+        array, offset = cdr.read_array(data, offset, origin, dtype, number * count)
+        return leaf.split(array, number), offset
+
+    return Codec(f"{ros_type(dtype)}[]", "array", encode, decode)
+
+
+def numeric_batch(leaf: Leaf) -> Codec:
+    dtype, shape, count, itemsize = leaf.dtype, leaf.shape, leaf.count, leaf.dtype.itemsize
+    plain = dtype.kind != "b"
+
+    def encode(value: Any, out: bytearray, origin: int) -> None:
+        number = _batch_length(value, dtype, shape)
+        if value.dtype == dtype and value.shape[1:] == shape and plain:
+            data = value.tobytes()
+        else:
+            data = exact_bytes(value, dtype, (number, *shape))
+        cdr.write_length(out, origin, number * count)
+        cdr.write_array(out, origin, data, itemsize)
+
+    def decode(data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
+        number, offset = _read_number(data, offset, origin, count)
+        array, offset = cdr.read_array(data, offset, origin, dtype, number * count)
+        return array.reshape(number, *shape), offset
+
+    return Codec(f"{ros_type(dtype)}[]", "array", encode, decode)
+
+
+def empty_batch(leaf: Leaf) -> Codec:
+    """Arrays without elements: only their number is left to store."""
+    dtype, shape = leaf.dtype, leaf.shape
+
+    def encode(value: Any, out: bytearray, origin: int) -> None:
+        number = _batch_length(value, dtype, shape)
+        exact_array(value, dtype, (number, *shape), "")
+        cdr.write_length(out, origin, number)
+
+    def decode(data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
+        number, offset = cdr.read_length(data, offset, origin)
+        return np.empty((number, *shape), dtype.newbyteorder("=")), offset
+
+    return Codec("uint32", "array", encode, decode)
+
+
+def _batch_length(value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> int:
+    if not isinstance(value, np.ndarray) or value.ndim == 0:
+        lengths = ", ".join(["n", *map(str, shape)])
+        raise StepError(f": expected an array of {dtype.name} and shape ({lengths}), found {shorten(value)}")
+    return len(value)
+
+
+def _read_number(data: memoryview, offset: int, origin: int, count: int) -> tuple[int, int]:
+    elements, offset = cdr.read_length(data, offset, origin)
+    if elements % count:
+        raise FormatError(f"expected a multiple of {count} elements before offset {offset}, found {elements}")
+    return elements // count, offset
+
+
+def text() -> Codec:
+    """A string."""
+
+    def encode(value: Any, out: bytearray, origin: int) -> None:
+        if not isinstance(value, str):
+            raise StepError(f": expected a string, found {shorten(value)}")
+        cdr.write_string(out, origin, value)
+
+    return Codec("string", "string", encode, cdr.read_string)
+
+
+def expect_tuple(value: Any) -> None:
+    """StepError unless `value` is a tuple: a list would come back as one."""
+    if not isinstance(value, tuple):
+        raise StepError(f": expected a tuple, found {shorten(value)}")
+
+
+def exact_bytes(value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    """The little-endian bytes of a value that need not be of this dtype, or StepError."""
+    array = exact_array(value, dtype, shape, "")
+    # A bool made by a view may hold any byte, and readers drop a message where it is not 0 or 1.
+    return (array.view(np.uint8) != 0 if dtype.kind == "b" else array).tobytes()

@@ -1,0 +1,228 @@
+"""Values of variable size (Text, Sequence, Graph, OneOf, and whatever is inside them) as fields of a message.
+
+A space becomes a tree of small functions when the field is made, so that writing a value looks nothing up.
+The structure comes from the space alone:
+
+| space | one value | items of a Sequence | stacked, or the nodes and edges of a Graph |
+|---|---|---|---|
+| Box, Discrete, MultiDiscrete, MultiBinary | `T` or `T[n]` | `T[]`, all elements in a row | the same |
+| the same without elements | no field | a message of one dummy byte each | `uint32`, their number |
+| Text | `string` | `string[]` | the same |
+| Dict, Tuple | a message, a field an entry | `Message[]` | a message of stacked fields |
+| Sequence | as its column to the right | a message with a field `value` each | the same |
+| Graph | message: `nodes`, `has_edges`, `edges`, `has_edge_links`, `edge_links` | `Message[]` | the same |
+| OneOf | message: `index`, and a field an option, empty unless chosen | `Message[]` | the same |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.errors import FormatError, SpaceError, StepError
+from tupli_mcap.messages.leafcodecs import (
+    Codec,
+    Decode,
+    Encode,
+    Leaf,
+    empty_batch,
+    numeric,
+    numeric_batch,
+    numeric_items,
+    text,
+)
+from tupli_mcap.messages.leaves import ROS_TYPES, NameRegistry
+from tupli_mcap.messages.nestedcodecs import (
+    Maybe,
+    Step,
+    decode_dict,
+    decode_graph,
+    decode_one_of,
+    decode_tuple,
+    encode_dict,
+    encode_graph,
+    encode_one_of,
+    encode_tuple,
+    items_of,
+    with_dummy,
+)
+
+__all__ = ["VariableField"]
+
+_MAX_DEPTH = 64
+_NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_EDGE_LINKS = np.dtype("<i4")
+_DUMMY = "structure_needs_at_least_one_member"  # the name ROS 2 gives it
+
+
+class VariableField:
+    """One field of a message that holds values of `space`; it has no state and may be shared by threads.
+
+    `field_type` is its ROS type, `definitions` the names and texts of the messages nested in it. `path` names
+    the field in errors. `taken` is a set of type names (without package) in use; this field adds its own.
+
+    Raises:
+        SpaceError: a space that is no part of Gymnasium, or a dtype that no message can hold.
+    """
+
+    def __init__(
+        self,
+        space: gym.Space[Any],
+        name: str,
+        package: str = "tupli_mcap",
+        type_prefix: str = "Value",
+        *,
+        path: str | None = None,
+        taken: set[str] | None = None,
+    ) -> None:
+        self.name = name
+        self.path = name if path is None else path
+        builder = _Builder(package, set() if taken is None else taken)
+        codec = builder.single(space, type_prefix, self.path, 0)
+        self.field_type: str = codec.ros
+        self.definitions: list[tuple[str, str]] = builder.definitions
+        self._encode = codec.encode
+        self._decode = codec.decode
+
+    def encode(self, value: Any, out: bytearray, origin: int) -> None:
+        """Append `value` to `out`, aligned from `origin`.
+
+        Raises:
+            StepError: another structure, or a leaf that is not stored exactly; `out` is as before.
+        """
+        start = len(out)
+        try:
+            self._encode(value, out, origin)
+        except StepError as err:
+            del out[start:]
+            raise StepError(f"{self.path}{err}") from err.__cause__
+
+    def decode(self, data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
+        """Return the value at `offset`, of the types the space's samples have, and the offset after it.
+
+        Raises:
+            FormatError: the bytes are no value of the space.
+        """
+        try:
+            return self._decode(data, offset, origin)
+        except FormatError as err:
+            raise FormatError(f"{self.path}: {err}") from err
+
+
+@dataclass
+class _Builder:
+    """Makes codecs and collects the message definitions they need."""
+
+    package: str
+    taken: set[str]
+    definitions: list[tuple[str, str]] = field(default_factory=list)
+
+    def single(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
+        """One value of a space."""
+        _check_depth(path, depth)
+        if type(space) in _NUMERIC:
+            return numeric(space, path)
+        if type(space) is spaces.Text:
+            return text()
+        if type(space) is spaces.Dict or type(space) is spaces.Tuple:
+            return self._composite(space, type_name, path, depth, self.single)
+        if type(space) is spaces.Sequence:
+            make = self._stacked if space.stack else self._items
+            return make(space.feature_space, type_name, f"{path}[]", depth + 1)
+        if type(space) is spaces.Graph:
+            return self._graph(space, type_name, path, depth)
+        if type(space) is spaces.OneOf:
+            return self._one_of(space, type_name, path, depth)
+        raise SpaceError(
+            f"{path}: expected a space of Gymnasium itself, found {type(space).__qualname__}; "
+            "wrap the environment so that it returns one"
+        )
+
+    def _items(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
+        """A tuple of values, as a Sequence without `stack` has it."""
+        if type(space) in _NUMERIC and (leaf := Leaf.of(space, path)).count:
+            return numeric_items(leaf)
+        codec = self.single(space, f"{type_name}Item", path, depth)
+        if codec.kind not in ("message", "string"):
+            codec = self._message(f"{type_name}Item", [(codec.ros, "value")], codec.encode, codec.decode)
+        return items_of(codec)
+
+    def _stacked(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
+        """Values of a space in one batch, as `gymnasium.vector.utils.concatenate` makes it."""
+        if type(space) in _NUMERIC:
+            leaf = Leaf.of(space, path)
+            return numeric_batch(leaf) if leaf.count else empty_batch(leaf)
+        if type(space) is spaces.Dict or type(space) is spaces.Tuple:
+            return self._composite(space, type_name, path, depth, self._stacked)
+        return self._items(space, type_name, path, depth)
+
+    def _composite(
+        self, space: Any, type_name: str, path: str, depth: int, make: Callable[..., Codec]
+    ) -> Codec:
+        """A Dict or Tuple, its entries made by `make`."""
+        _check_depth(path, depth)
+        is_dict = type(space) is spaces.Dict
+        entries = list(space.spaces.items() if is_dict else enumerate(space.spaces))
+        names = NameRegistry(tuple(ROS_TYPES))
+        fields: list[tuple[str, str]] = []
+        steps: list[Step] = []
+        decoders: list[Decode] = []
+        for key, sub in entries:
+            name = names.take(str(key) if is_dict else f"item_{key}")
+            codec = make(sub, type_name + _camel(name), f"{path}[{key!r}]", depth + 1)
+            fields.append((codec.ros, name))
+            steps.append((key, f"[{key!r}]", codec.encode))
+            decoders.append(codec.decode)
+        if not is_dict:
+            return self._message(type_name, fields, encode_tuple(steps), decode_tuple(decoders))
+        decode = decode_dict([key for key, _ in entries], decoders)
+        return self._message(type_name, fields, encode_dict(steps), decode)
+
+    def _graph(self, space: Any, type_name: str, path: str, depth: int) -> Codec:
+        nodes = self._stacked(space.node_space, f"{type_name}Nodes", f"{path}.nodes", depth + 1)
+        links = Maybe.of(numeric_batch(Leaf(_EDGE_LINKS, (2,), False)))
+        fields = [(nodes.ros, "nodes")]
+        edges = None
+        if space.edge_space is not None:
+            edges = Maybe.of(self._stacked(space.edge_space, f"{type_name}Edges", f"{path}.edges", depth + 1))
+            fields += [("bool", "has_edges"), (edges.codec.ros, "edges")]
+        fields += [("bool", "has_edge_links"), (links.codec.ros, "edge_links")]
+        encode, decode = encode_graph(nodes, edges, links), decode_graph(nodes, edges, links)
+        return self._message(type_name, fields, encode, decode)
+
+    def _one_of(self, space: Any, type_name: str, path: str, depth: int) -> Codec:
+        options = [
+            Maybe.of(self.single(sub, f"{type_name}Option{i}", f"{path}[{i}]", depth + 1))
+            for i, sub in enumerate(space.spaces)
+        ]
+        fields = [("uint32", "index")]
+        fields += [(option.codec.ros, f"option_{i}") for i, option in enumerate(options)]
+        return self._message(type_name, fields, encode_one_of(options), decode_one_of(options))
+
+    def _message(
+        self, type_name: str, fields: list[tuple[str, str]], encode: Encode, decode: Decode
+    ) -> Codec:
+        """A nested message; `fields` are ROS type and name of what `encode` writes, no type for no bytes."""
+        lines = [f"{ros} {name}\n" for ros, name in fields if ros]
+        unique, n = type_name, 2
+        while unique in self.taken:
+            unique, n = f"{type_name}N{n}", n + 1
+        self.taken.add(unique)
+        self.definitions.append((f"{self.package}/{unique}", "".join(lines) or f"uint8 {_DUMMY}\n"))
+        if not lines:
+            encode, decode = with_dummy(encode, decode)
+        return Codec(f"{self.package}/{unique}", "message", encode, decode)
+
+
+def _check_depth(path: str, depth: int) -> None:
+    if depth > _MAX_DEPTH:
+        raise SpaceError(f"{path}: a space nested more than {_MAX_DEPTH} deep cannot be recorded")
+
+
+def _camel(name: str) -> str:
+    return "".join(part.capitalize() for part in name.split("_"))
