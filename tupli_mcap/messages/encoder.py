@@ -1,0 +1,323 @@
+"""Generated encoders: one Python function per recording that writes a step into a row of constant layout.
+
+The source is generated from the live environment's spaces only, never from a file. It takes the fast way when a value
+has the recorded type, and otherwise calls an exact (slow) cast that refuses what it cannot store.
+
+A row is a complete MCAP Message record. One `struct` call writes the end of row j (action, reward, flags) and the start
+of row j+1 (record header and the new observation); one more writes sequence and log_time of row j, which commits it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from struct import Struct
+from typing import Any, Protocol
+
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.errors import StepError
+from tupli_mcap.messages.exact import exact_array, leaf_value, shorten
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.leaves import DType, Leaf
+from tupli_mcap.messages.step import StepLayout
+
+__all__ = ["COMMIT", "SEQUENCE_OFFSET", "Cursor", "RowEncoder", "make_row_encoder"]
+
+SEQUENCE_OFFSET = 11  # of `sequence` in a Message record; log_time follows it
+COMMIT = Struct("<IQ")
+PREFIX = BODY + 8  # record header, CDR header, episode, step: the same for a whole episode
+_LARGE = 2048  # bytes from which a leaf is copied as an array instead of through `bytes`
+_INT_FORMATS = {
+    "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
+}  # fmt: skip
+
+
+class Cursor:
+    """Where the next row goes. `offset` is of the running row in the buffer, `end` that of the spare row."""
+
+    __slots__ = ("end", "offset", "prefix", "sequence", "total")
+
+    def __init__(self) -> None:
+        self.offset = 0
+        self.end = 0
+        self.sequence = 0
+        self.prefix = b""
+        self.total: Any = 0.0
+
+
+class ImageSink(Protocol):
+    """Takes images: `check` first, so that a refused step writes none of its images."""
+
+    def check(self, value: Any) -> np.ndarray[Any, Any]:
+        """The image as it will be stored; StepError if it cannot be."""
+        ...
+
+    def put(self, image: np.ndarray[Any, Any]) -> None:
+        """The image of the next state; called before the step is committed."""
+        ...
+
+    def put_first(self, image: np.ndarray[Any, Any]) -> None:
+        """The image of a reset: replaces the running row's."""
+        ...
+
+
+@dataclass
+class RowEncoder:
+    """`put(action, state, reward, terminal, timeout)` writes and commits a step; `put_state(state)` starts a row."""
+
+    put: Callable[[Any, Any, Any, Any, Any], None]
+    put_state: Callable[[Any], None]
+    state_end: int  # bytes of a row up to the end of its state
+    source: str
+
+
+@dataclass
+class _Source:
+    """The generated body and the objects it names."""
+
+    names: dict[str, Any] = field(default_factory=dict)
+    lines: list[str] = field(default_factory=list)
+
+    def bind(self, prefix: str, value: Any) -> str:
+        name = f"{prefix}{len(self.names)}"
+        self.names[name] = value
+        return name
+
+
+@dataclass
+class _Packed:
+    """Format pieces and argument expressions of one `struct` call, at growing offsets."""
+
+    start: int
+    offset: int
+    format: str = "<"
+    args: list[str] = field(default_factory=list)
+
+    def add(self, offset: int, code: str, size: int, arg: str) -> None:
+        if offset > self.offset:
+            self.format += f"{offset - self.offset}x"
+        self.format += code
+        self.args.append(arg)
+        self.offset = offset + size
+
+
+def make_row_encoder(
+    layout: StepLayout,
+    buffer: Any,
+    cursor: Cursor,
+    images: Sequence[ImageSink],
+    switch: Callable[[], None],
+) -> RowEncoder:
+    """Generates the encoder of a constant layout that writes into `buffer` at `cursor`.
+
+    `images` has a sink for each image leaf; `switch` is called when the row after the last one has been started.
+    """
+    message = layout.step_message
+    size = message.record_size
+    source = _Source()
+    after_state = [leaf.name for leaf in (*layout.action, *layout.reward) if leaf.size] + ["terminal"]
+    begin = BODY + message.offset(after_state[0])
+    tail = _Packed(begin, begin)
+    stores: list[str] = []
+    _structure_checks(source, layout.action_space, "action")
+    _fields(source, layout, layout.action, "action", tail, stores)
+    _fields(source, layout, layout.reward, "reward", tail, stores)
+    tail.add(BODY + message.offset("terminal"), "?", 1, "terminal")
+    tail.add(BODY + message.offset("timeout"), "?", 1, "timeout")
+    tail.add(size, f"{PREFIX}s", PREFIX, "cursor.prefix")
+    state = _Source(source.names)
+    head = _Packed(0, 0)
+    head.add(0, f"{PREFIX}s", PREFIX, "cursor.prefix")
+    _structure_checks(state, layout.observation_space, "state")
+    state_stores: list[str] = []
+    _fields(state, layout, layout.state, "state", head, state_stores)
+    next_state = [line.replace("offset +", f"offset + {size} +") for line in state_stores]
+    shifted = _shift(head, size, tail)
+    puts, firsts = [], []
+    for i, leaf in enumerate(layout.images):
+        check = source.bind("check", images[i].check)
+        state.lines.append(f"image{i} = {check}({_access(source, 'state', leaf.keys)})")
+        puts.append(f"{source.bind('put_image', images[i].put)}(image{i})")
+        firsts.append(f"{source.bind('put_first', images[i].put_first)}(image{i})")
+    put_lines = [
+        *source.lines,
+        *state.lines,
+        f"pack(buffer, offset + {shifted.start}, {', '.join(shifted.args)})",
+        *stores,
+        *next_state,
+        *puts,
+    ]
+    first_lines = [*state.lines, f"pack_state(buffer, offset, {', '.join(head.args)})", *state_stores, *firsts]
+    text = _render(put_lines, first_lines, size)
+    namespace = dict(
+        source.names,
+        buffer=buffer,
+        cursor=cursor,
+        switch=switch,
+        pack=Struct(shifted.format).pack_into,
+        pack_state=Struct(head.format).pack_into,
+        commit=COMMIT.pack_into,
+        time_ns=time.time_ns,
+        diagnose=lambda action, state, reward, err: _diagnose(layout, action, state, reward, err),
+        view=np.frombuffer(buffer, np.uint8),
+    )
+    exec(compile(text, "<tupli_mcap row encoder>", "exec"), namespace)
+    return RowEncoder(namespace["put"], namespace["put_state"], head.offset, text)
+
+
+def _shift(head: _Packed, size: int, tail: _Packed) -> _Packed:
+    """`tail`, followed by the state of the next row (the prefix itself is already in `tail`)."""
+    joined = _Packed(tail.start, tail.offset, tail.format, list(tail.args))
+    joined.format += head.format[1:].removeprefix(f"{PREFIX}s")
+    joined.args += head.args[1:]
+    joined.offset = size + head.offset
+    return joined
+
+
+def _render(put_lines: Sequence[str], first_lines: Sequence[str], size: int) -> str:
+    def block(lines: Sequence[str]) -> str:
+        return "".join(f"        {line}\n" for line in lines)
+
+    return (
+        "def put(action, state, reward, terminal, timeout):\n"
+        "    offset = cursor.offset\n"
+        "    try:\n" + block(put_lines) + "    except Exception as err:\n"
+        "        raise diagnose(action, state, reward, err) from err\n"
+        f"    commit(buffer, offset + {SEQUENCE_OFFSET}, cursor.sequence, time_ns())\n"
+        "    cursor.sequence += 1\n"
+        "    cursor.total += reward\n"
+        f"    cursor.offset = offset = offset + {size}\n"
+        "    if offset == cursor.end:\n"
+        "        switch()\n\n"
+        "def put_state(state):\n"
+        "    offset = cursor.offset\n"
+        "    try:\n" + block(first_lines) + "    except Exception as err:\n"
+        "        raise diagnose(None, state, None, err) from err\n"
+    )
+
+
+def _structure_checks(source: _Source, space: Any, expression: str) -> None:
+    if type(space) not in (spaces.Dict, spaces.Tuple):
+        return
+    n = len(space.spaces)
+    if type(space) is spaces.Tuple:
+        source.lines.append(f"if {expression}.__class__ is not tuple or len({expression}) != {n}: raise TypeError")
+        children = list(enumerate(space.spaces))
+    else:
+        source.lines.append(f"if len({expression}) != {n}: raise TypeError")
+        children = list(space.spaces.items())
+    for key, sub in children:
+        if type(sub) in (spaces.Dict, spaces.Tuple):
+            _structure_checks(source, sub, _access(source, expression, (key,)))
+
+
+def _access(source: _Source, root: str, keys: Sequence[Any]) -> str:
+    parts = [repr(key) if type(key) in (str, int) else source.bind("key", key) for key in keys]
+    return root + "".join(f"[{part}]" for part in parts)
+
+
+def _fields(
+    source: _Source, layout: StepLayout, leaves: Sequence[Leaf], root: str, packed: _Packed, stores: list[str]
+) -> None:
+    for i, leaf in enumerate(leaves):
+        if leaf.kind == "image":
+            continue
+        dtype = layout.dtypes[leaf.name]
+        access = _access(source, root, leaf.keys)
+        if leaf.size == 0:
+            check = source.bind("check", _exact_bytes(leaf, dtype))
+            source.lines.append(f"{check}({access})")
+            continue
+        offset = BODY + layout.step_message.offset(leaf.name)
+        value = f"{root[0]}{i}" if leaf.keys or root != "reward" else "reward"
+        if value != access:
+            source.lines.append(f"{value} = {access}")
+        _leaf(source, leaf, dtype, value, offset, packed, stores)
+
+
+def _leaf(
+    source: _Source, leaf: Leaf, dtype: DType, value: str, offset: int, packed: _Packed, stores: list[str]
+) -> None:
+    nbytes = leaf.size * dtype.itemsize
+    if leaf.kind == "scalar" and dtype.kind in "iu":
+        exact = source.bind("exact", _exact_int(leaf, dtype))
+        kind = source.bind("kind", dtype.type)
+        source.lines.append(
+            f"if {value}.__class__ is not int and {value}.__class__ is not {kind}: {value} = {exact}({value})"
+        )
+        packed.add(offset, _INT_FORMATS[dtype.name], nbytes, value)
+    elif value == "reward" and leaf.shape == () and dtype == np.float64:
+        exact = source.bind("exact", _exact_float(leaf))
+        double = source.bind("double", np.float64)
+        source.lines.append(
+            f"if reward.__class__ is not float and reward.__class__ is not {double}: reward = {exact}(reward)"
+        )
+        packed.add(offset, "d", nbytes, value)
+    else:
+        kind, shape = source.bind("dtype", dtype), source.bind("shape", leaf.shape)
+        raw = f"{value}b"
+        large = nbytes >= _LARGE
+        exact = source.bind("exact", _exact_plain(leaf, dtype) if large else _exact_bytes(leaf, dtype))
+        fast = value if large else f"{value}.tobytes()"
+        source.lines += [
+            "try:",
+            f"    {raw} = {fast} if {value}.dtype is {kind} and {value}.shape == {shape} else {exact}({value})",
+            f"except AttributeError: {raw} = {exact}({value})",
+        ]
+        if large:
+            stores.append(
+                f"view[offset + {offset}:offset + {offset + nbytes}].view({kind}).reshape({shape})[...] = {raw}"
+            )
+        else:
+            packed.add(offset, f"{nbytes}s", nbytes, raw)
+
+
+def _exact_int(leaf: Leaf, dtype: DType) -> Callable[[Any], int]:
+    return lambda value: int(exact_array(value, dtype, leaf.shape, leaf.path))
+
+
+def _exact_float(leaf: Leaf) -> Callable[[Any], float]:
+    dtype = np.dtype(np.float64)
+
+    def exact(value: Any) -> float:
+        if value.__class__ is int and -(2**53) <= value <= 2**53:
+            return float(value)
+        if value.__class__ is np.float32:
+            return float(value)
+        return float(exact_array(value, dtype, (), leaf.path))
+
+    return exact
+
+
+def _exact_bytes(leaf: Leaf, dtype: DType) -> Callable[[Any], bytes]:
+    return lambda value: exact_array(value, dtype, leaf.shape, leaf.path).tobytes()
+
+
+def _exact_plain(leaf: Leaf, dtype: DType) -> Callable[[Any], np.ndarray[Any, Any]]:
+    return lambda value: exact_array(value, dtype, leaf.shape, leaf.path)
+
+
+def _diagnose(layout: StepLayout, action: Any, state: Any, reward: Any, err: Exception) -> StepError:
+    """The StepError that names what the fast path stumbled over."""
+    if isinstance(err, StepError):
+        return err
+    groups: list[tuple[Any, Sequence[Leaf]]] = [(state, layout.state)]
+    if reward is not None:
+        groups += [(action, layout.action), (reward, layout.reward)]
+    for root, leaves in groups:
+        for leaf in leaves:
+            try:
+                value = leaf_value(root, leaf)
+                if leaf.dtype is not None:
+                    exact_array(value, layout.dtypes[leaf.name], leaf.shape, leaf.path)
+            except StepError as found:
+                return found
+    if reward is None:
+        return StepError(f"state: expected a value structured as {layout.observation_space}, found {shorten(state)}")
+    return StepError(
+        f"expected a step structured as state {layout.observation_space} and action {layout.action_space}, "
+        f"found state {shorten(state)} and action {shorten(action)}"
+    )

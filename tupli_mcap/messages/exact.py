@@ -1,0 +1,127 @@
+"""Exactness: which dtype stores a leaf, and casts that lose nothing or refuse."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import StepError
+from tupli_mcap.messages.leaves import ROS_TYPES, DType, Leaf
+
+__all__ = ["check_structure", "decide_dtype", "exact_array", "leaf_value", "shorten"]
+
+_MANTISSA = {"float16": 11, "float32": 24, "float64": 53}
+
+
+def shorten(value: object, limit: int = 120) -> str:
+    """A repr for error messages, cut to `limit` characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+def decide_dtype(leaf: Leaf, values: Sequence[Any]) -> DType:
+    """The dtype that stores a leaf for a whole recording, from its first values (reset's and the first step's).
+
+    Python scalars take the declared dtype, but a Python float in a leaf narrower than float64 makes it float64, since
+    rounding it would lose what the environment returned. NumPy values widen, never narrow. One warning names a leaf
+    whose values stray from its declared dtype.
+    """
+    if leaf.dtype is None:
+        raise StepError(f"{leaf.path}: a value of variable size has no dtype")
+    dtype = leaf.dtype
+    for value in values:
+        dtype = _widen(dtype, value)
+    if dtype.name not in ROS_TYPES:
+        raise StepError(f"{leaf.path}: expected values of dtype {leaf.dtype.name}, found {dtype.name}, which no message holds")
+    if dtype != leaf.dtype:
+        warnings.warn(
+            f"{leaf.path} is declared {leaf.dtype.name}, but the values are {dtype.name}; "
+            f"they are recorded as {dtype.name}, exactly as given",
+            UserWarning,
+            stacklevel=2,
+        )
+    return dtype
+
+
+def _widen(dtype: DType, value: Any) -> DType:
+    if isinstance(value, float) and not isinstance(value, np.generic):
+        return np.result_type(dtype, np.float64)
+    if not isinstance(value, np.ndarray | np.generic):
+        if isinstance(value, list | tuple):
+            return _widen(dtype, np.asarray(value)) if _has_float(value) else dtype
+        return dtype
+    if value.dtype.kind not in "biuf":
+        return dtype  # refused, with its path, when the value is stored
+    wide = np.result_type(dtype, value.dtype)
+    if wide.kind == "f" and dtype.kind in "biu" and value.dtype.kind in "biu":
+        # int64 and uint64 have no common integer: the values' own dtype is what the environment returns
+        wide = value.dtype
+    return np.dtype(wide.name)
+
+
+def _has_float(value: Sequence[Any]) -> bool:
+    return np.asarray(value).dtype.kind == "f"
+
+
+def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> np.ndarray[Any, Any]:
+    """`value` as an array of `dtype` and `shape`, equal to it in every element.
+
+    Raises:
+        StepError: another shape, no numbers, or a value that `dtype` cannot hold exactly.
+    """
+    if isinstance(value, np.ma.MaskedArray):
+        raise StepError(f"{path}: expected an array, found a masked array, whose mask cannot be recorded")
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError) as err:
+        raise StepError(f"{path}: expected {dtype.name}{list(shape)}, found {shorten(value)}") from err
+    if array.dtype.kind not in "biuf":
+        raise StepError(f"{path}: expected {dtype.name}{list(shape)}, found {shorten(value)}")
+    if array.shape != shape:
+        raise StepError(f"{path}: expected shape {shape}, found shape {array.shape}; nothing is reshaped in silence")
+    if array.dtype == dtype:
+        return array
+    with np.errstate(all="ignore"):
+        cast = array.astype(dtype)
+    if not _always_exact(array.dtype, dtype) and not _equal(array, cast):
+        raise StepError(
+            f"{path}: expected values that {dtype.name} holds exactly, found {array.dtype.name} {shorten(value)}; "
+            "the recorded dtype is fixed by the first step, so cast in the environment or the policy"
+        )
+    return cast
+
+
+def _always_exact(source: DType, target: DType) -> bool:
+    if source.kind in "iu" and target.kind == "f":
+        return source.itemsize * 8 <= _MANTISSA[target.name]
+    return np.can_cast(source, target, "safe")
+
+
+def _equal(array: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bool:
+    """Element-wise equality in Python's exact arithmetic (NumPy would round an int64 to compare it with a float64)."""
+    if array.dtype.kind == "f":
+        both_nan = np.isnan(array) & (np.isnan(cast) if cast.dtype.kind == "f" else False)
+        if np.all(both_nan):
+            return True
+        array, cast = array[~both_nan], cast[~both_nan]
+    return bool(np.all(array.astype(object) == cast.astype(object)))
+
+
+def check_structure(value: Any, leaf: Leaf) -> None:
+    """Raises StepError if the Dicts and Tuples above a leaf are not dicts and tuples of the space's own keys."""
+    leaf_value(value, leaf)
+
+
+def leaf_value(value: Any, leaf: Leaf) -> Any:
+    """A leaf's value inside `value`; StepError names the place where the structure differs."""
+    path = leaf.path.split("[", 1)[0]
+    for key in leaf.keys:
+        try:
+            value = value[key]
+        except (KeyError, IndexError, TypeError) as err:
+            raise StepError(f"{path}: expected an entry {key!r}, found {shorten(value)}") from err
+        path += f"[{key!r}]"
+    return value

@@ -1,0 +1,154 @@
+"""Byte layouts: from leaves to ros2msg text, CDR offsets, and the NumPy dtype of a whole Message record.
+
+CDR aligns every primitive to its size, counted from the byte after the 4-byte encapsulation header. A message whose
+fields all have constant size therefore has constant offsets, and a chunk of such messages is one structured array.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.messages.leaves import DType, Leaf, ros_type
+
+__all__ = [
+    "BODY",
+    "CDR_HEADER",
+    "HEADER_FIELDS",
+    "IMAGE_SCHEMA",
+    "RECORD_HEADER",
+    "Field",
+    "MessageLayout",
+    "image_layout",
+    "record_dtype",
+]
+
+CDR_HEADER = b"\x00\x01\x00\x00"
+# opcode, record length, channel, sequence, log_time, publish_time; then the CDR header
+RECORD_HEADER = struct.Struct("<BQHIQQ")
+BODY = RECORD_HEADER.size + len(CDR_HEADER)  # offset of the CDR body in a Message record
+_OPCODE_MESSAGE = 5
+
+HEADER_FIELDS: list[tuple[str, str, int]] = [
+    ("#opcode", "u1", 0),
+    ("#length", "<u8", 1),
+    ("#channel", "<u2", 9),
+    ("#sequence", "<u4", 11),
+    ("#log_time", "<u8", 15),
+    ("#publish_time", "<u8", 23),
+    ("#cdr", "<u4", 31),
+]
+
+_TIME_MSG = "int32 sec\nuint32 nanosec\n"
+_SEPARATOR = "=" * 80 + "\n"
+IMAGE_SCHEMA = (
+    "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"
+    f"{_SEPARATOR}MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    f"{_SEPARATOR}MSG: builtin_interfaces/Time\n{_TIME_MSG}"
+)
+
+
+class Field(NamedTuple):
+    """A field of constant size: `dtype` as users see it, `offset` from the start of the CDR body."""
+
+    name: str
+    dtype: DType
+    shape: tuple[int, ...]
+    offset: int
+
+    @property
+    def nbytes(self) -> int:
+        return int(self.dtype.itemsize * np.prod(self.shape, dtype=np.int64))
+
+
+@dataclass(frozen=True)
+class MessageLayout:
+    """A message of constant size: its fields, the size of its CDR body, and the dtype of one whole record."""
+
+    fields: tuple[Field, ...]
+    body_size: int
+    dtype: DType
+
+    @classmethod
+    def of(cls, fields: Iterable[tuple[str, DType, tuple[int, ...]]]) -> MessageLayout:
+        """Lays the fields out in order, each aligned to the size of its element."""
+        placed, offset = [], 0
+        for name, dtype, shape in fields:
+            if 0 in shape:  # takes no bytes and has no ROS field
+                continue
+            offset = -(-offset // dtype.itemsize) * dtype.itemsize
+            field = Field(name, dtype, shape, offset)
+            placed.append(field)
+            offset += field.nbytes
+        return cls(tuple(placed), offset, record_dtype(placed, offset))
+
+    @property
+    def record_size(self) -> int:
+        """Bytes of one whole Message record."""
+        return BODY + self.body_size
+
+    def offset(self, name: str) -> int:
+        """Where a field starts, from the start of the CDR body."""
+        return next(f.offset for f in self.fields if f.name == name)
+
+    def header(self, channel: int, sequence: int = 0, time: int = 0) -> bytes:
+        """The record's bytes before the CDR body."""
+        length = self.record_size - 9
+        return RECORD_HEADER.pack(_OPCODE_MESSAGE, length, channel, sequence, time, time) + CDR_HEADER
+
+
+def record_dtype(fields: Sequence[Field], body_size: int) -> DType:
+    """Structured dtype of a Message record: `#`-prefixed header fields, then the message's own."""
+    names = [name for name, _, _ in HEADER_FIELDS] + [f.name for f in fields]
+    formats: list[Any] = [fmt for _, fmt, _ in HEADER_FIELDS]
+    formats += [(f.dtype.newbyteorder("<"), f.shape) for f in fields]
+    offsets = [offset for _, _, offset in HEADER_FIELDS] + [BODY + f.offset for f in fields]
+    spec: Any = {"names": names, "formats": formats, "offsets": offsets, "itemsize": BODY + body_size}
+    return np.dtype(spec)
+
+
+def field_line(leaf: Leaf, dtype: DType) -> str:
+    """The ros2msg line of a constant leaf; more than one dimension is flattened (C order)."""
+    count = "" if leaf.shape == () else f"[{leaf.size}]"
+    return f"{ros_type(dtype)}{count} {leaf.name}\n"
+
+
+def message_text(lines: Sequence[str], definitions: Sequence[tuple[str, str]]) -> str:
+    """A ros2msg definition with its nested messages."""
+    parts = "".join(f"{_SEPARATOR}MSG: {name}\n{text}" for name, text in definitions)
+    return "".join(lines) + parts
+
+
+class ImageLayout(NamedTuple):
+    """`sensor_msgs/msg/Image` with every length fixed: the record dtype and the bytes that never change."""
+
+    dtype: DType
+    body: bytes
+
+
+def image_layout(leaf: Leaf) -> ImageLayout:
+    """The layout of an image leaf's messages; field `data` has the leaf's shape, `sec`/`nanosec` its stamp."""
+    height, width, channels = leaf.shape
+    encoding = {1: b"mono8", 3: b"rgb8", 4: b"rgba8"}[channels]
+    body = bytearray(8)
+    for value in (leaf.name.encode(), height, width, encoding, b"", width * channels, leaf.size):
+        if value == b"":
+            body += b"\0"  # is_bigendian
+            continue
+        body += bytes(-len(body) % 4)
+        if isinstance(value, bytes):
+            body += struct.pack("<I", len(value) + 1) + value + b"\0"
+        else:
+            body += struct.pack("<I", value)
+    u1 = np.dtype(np.uint8)
+    fields = [
+        Field("sec", np.dtype(np.int32), (), 0),
+        Field("nanosec", np.dtype(np.uint32), (), 4),
+        Field("fixed", u1, (len(body) - 8,), 8),
+        Field("data", u1, leaf.shape, len(body)),
+    ]
+    return ImageLayout(record_dtype(fields, len(body) + leaf.size), bytes(body))

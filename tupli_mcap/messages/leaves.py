@@ -1,0 +1,186 @@
+"""The leaves of a Gymnasium space: where each value lies in it, and how a message stores it.
+
+A Dict or Tuple is only structure. Everything below it is a leaf: an array or scalar of constant size (Box, Discrete,
+MultiDiscrete, MultiBinary), an image, or a value of variable size (Text, Sequence, Graph, OneOf).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.errors import SpaceError
+
+__all__ = [
+    "ROS_TYPES",
+    "DType",
+    "Leaf",
+    "NameRegistry",
+    "flatten_space",
+    "ros_type",
+    "structure",
+]
+
+DType = np.dtype[Any]
+
+# float16 has no ROS type: its bit pattern is stored, and the channel's metadata says so.
+ROS_TYPES: dict[str, str] = {
+    "bool": "bool",
+    "int8": "int8",
+    "uint8": "uint8",
+    "int16": "int16",
+    "uint16": "uint16",
+    "int32": "int32",
+    "uint32": "uint32",
+    "int64": "int64",
+    "uint64": "uint64",
+    "float16": "uint16",
+    "float32": "float32",
+    "float64": "float64",
+}
+
+_CONSTANT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_VARIABLE = (spaces.Text, spaces.Sequence, spaces.Graph, spaces.OneOf)
+_MAX_DEPTH = 64
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One value of a space.
+
+    `keys` leads to it from the root value, `path` says so for people (`state['pos'][1]`), `name` is its ROS field.
+    `dtype` and `shape` are the declared ones of a constant leaf; a variable leaf has `dtype` None.
+    """
+
+    keys: tuple[Any, ...]
+    path: str
+    name: str
+    space: gym.Space[Any]
+    kind: Literal["array", "scalar", "image", "variable"]
+    dtype: DType | None
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of elements of one value."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    def get(self, value: Any) -> Any:
+        """The leaf's value inside a value of the whole space."""
+        for key in self.keys:
+            value = value[key]
+        return value
+
+
+class NameRegistry:
+    """Gives out ROS field names: sanitised, unique within one message."""
+
+    def __init__(self, reserved: Sequence[str] = ()) -> None:
+        self._taken = set(reserved)
+
+    def take(self, text: str) -> str:
+        base = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_") or "field"
+        if not base[0].isalpha():
+            base = f"f_{base}"
+        name, n = base, 2
+        while name in self._taken:
+            name, n = f"{base}_{n}", n + 1
+        self._taken.add(name)
+        return name
+
+
+def ros_type(dtype: DType) -> str:
+    """The ros2msg primitive that stores `dtype`."""
+    return ROS_TYPES[dtype.name]
+
+
+def flatten_space(
+    space: gym.Space[Any], root: str, names: NameRegistry, *, images: bool = False
+) -> list[Leaf]:
+    """The leaves of `space` in its own order; `root` is "state", "action" or "reward".
+
+    With `images`, uint8 leaves of shape H x W x 1|3|4 become image leaves.
+
+    Raises:
+        SpaceError: a space of another class, or a dtype no message can hold, with the leaf's path.
+    """
+    return list(_walk(space, (), root, root, names, images, 0))
+
+
+def _walk(
+    space: gym.Space[Any],
+    keys: tuple[Any, ...],
+    path: str,
+    name: str,
+    names: NameRegistry,
+    images: bool,
+    depth: int,
+) -> Iterator[Leaf]:
+    if depth > _MAX_DEPTH:
+        raise SpaceError(f"{path}: a space nested more than {_MAX_DEPTH} deep cannot be recorded")
+    if type(space) is spaces.Dict:
+        for key, sub in space.spaces.items():
+            yield from _walk(sub, (*keys, key), f"{path}[{key!r}]", f"{name}_{key}", names, images, depth + 1)
+    elif type(space) is spaces.Tuple:
+        for i, sub in enumerate(space.spaces):
+            yield from _walk(sub, (*keys, i), f"{path}[{i}]", f"{name}_{i}", names, images, depth + 1)
+    elif type(space) in _VARIABLE:
+        yield Leaf(keys, path, names.take(name), space, "variable", None, ())
+    elif type(space) in _CONSTANT:
+        yield _constant_leaf(space, keys, path, names.take(name), images)
+    else:
+        raise SpaceError(
+            f"{path}: expected a space of Gymnasium itself, found {type(space).__qualname__}; "
+            "wrap the environment so that it returns a Box, Discrete, Dict, Tuple, Text, Sequence, Graph or OneOf"
+        )
+
+
+def _constant_leaf(
+    space: gym.Space[Any], keys: tuple[Any, ...], path: str, name: str, images: bool
+) -> Leaf:
+    if space.dtype is None or space.shape is None:
+        raise SpaceError(f"{path}: expected a space with a shape and a dtype, found {space!r}")
+    dtype = np.dtype(space.dtype)
+    if dtype.name not in ROS_TYPES:
+        raise SpaceError(
+            f"{path}: dtype {dtype.name!r} cannot be stored exactly in a message; use one of {', '.join(ROS_TYPES)}"
+        )
+    shape = tuple(int(n) for n in space.shape)
+    kind: Literal["array", "scalar", "image"] = "scalar" if type(space) is spaces.Discrete else "array"
+    if images and dtype == np.uint8 and len(shape) == 3 and shape[2] in (1, 3, 4) and 0 not in shape:
+        kind = "image"
+    return Leaf(keys, path, name, space, kind, np.dtype(dtype.name), shape)
+
+
+def structure(space: gym.Space[Any]) -> Callable[[Sequence[Any]], Any]:
+    """A function that nests a sequence of leaf values (in `flatten_space` order) as `space` is nested."""
+    build, count = _structure(space, 0)
+
+    def nest(values: Sequence[Any]) -> Any:
+        if len(values) != count:
+            raise SpaceError(f"expected {count} leaf values for {space!r}, found {len(values)}")
+        return build(values)
+
+    return nest
+
+
+def _structure(space: gym.Space[Any], start: int) -> tuple[Callable[[Sequence[Any]], Any], int]:
+    if type(space) is spaces.Dict:
+        parts: list[tuple[Any, Callable[[Sequence[Any]], Any]]] = []
+        for key, sub in space.spaces.items():
+            build, start = _structure(sub, start)
+            parts.append((key, build))
+        return (lambda values: {key: build(values) for key, build in parts}), start
+    if type(space) is spaces.Tuple:
+        builds: list[Callable[[Sequence[Any]], Any]] = []
+        for sub in space.spaces:
+            build, start = _structure(sub, start)
+            builds.append(build)
+        return (lambda values: tuple(build(values) for build in builds)), start
+    return (lambda values, i=start: values[i]), start + 1

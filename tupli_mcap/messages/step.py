@@ -1,0 +1,187 @@
+"""The messages of one recording, derived from its spaces and the dtypes decided at the first step.
+
+`StepLayout` is the single source for writer and reader: both derive every schema, offset and dtype from the spaces, and
+a reader refuses a file whose schema text says something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from tupli_mcap.errors import FormatError, SpaceError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.layout import (
+    ImageLayout,
+    MessageLayout,
+    field_line,
+    image_layout,
+    message_text,
+)
+from tupli_mcap.messages.leaves import ROS_TYPES, DType, Leaf, NameRegistry, flatten_space, structure
+from tupli_mcap.messages.spaces import space_from_json, space_to_json
+from tupli_mcap.messages.variable import VariableField
+
+__all__ = ["FINAL_STATE_SCHEMA", "STEP_SCHEMA", "StepLayout"]
+
+STEP_SCHEMA = "tupli_mcap/msg/Step"
+FINAL_STATE_SCHEMA = "tupli_mcap/msg/FinalState"
+_RESERVED = ("episode", "step", "terminal", "timeout", "env")
+_U32, _BOOL = np.dtype(np.uint32), np.dtype(np.bool_)
+
+
+class StepLayout:
+    """Leaves, stored dtypes and message layouts of `/step`, `/final_state` and the image channels.
+
+    `dtypes` maps a leaf's ROS name to its stored dtype; leaves not named keep the declared one.
+
+    Raises:
+        SpaceError: a space that cannot be recorded, with the path of the leaf.
+    """
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        reward_space: gym.Space[Any] | None = None,
+        dtypes: Mapping[str, DType] | None = None,
+    ) -> None:
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.reward_space = reward_space
+        names = NameRegistry(_RESERVED)
+        reward = reward_space if reward_space is not None else gym.spaces.Box(-np.inf, np.inf, (), np.float64)
+        self.state = flatten_space(observation_space, "state", names, images=True)
+        self.action = flatten_space(action_space, "action", names)
+        self.reward = flatten_space(reward, "reward", names)
+        given = dict(dtypes or {})
+        self.dtypes: dict[str, DType] = {
+            leaf.name: given.pop(leaf.name, leaf.dtype) for leaf in self.leaves if leaf.dtype is not None
+        }
+        if given:
+            raise SpaceError(f"dtypes are given for {sorted(given)}, which are no constant leaves of these spaces")
+        self.nest_state = structure(observation_space)
+        self.nest_action = structure(action_space)
+        self.nest_reward = structure(reward)
+
+    @property
+    def leaves(self) -> list[Leaf]:
+        return [*self.state, *self.action, *self.reward]
+
+    @cached_property
+    def images(self) -> list[Leaf]:
+        return [leaf for leaf in self.state if leaf.kind == "image"]
+
+    @cached_property
+    def step_leaves(self) -> list[Leaf]:
+        """The leaves that `/step` itself holds, in message order."""
+        return [leaf for leaf in self.leaves if leaf.kind != "image"]
+
+    @cached_property
+    def final_leaves(self) -> list[Leaf]:
+        """The leaves of `/final_state`: those of `/step` first, at the same offsets, then the images."""
+        return [leaf for leaf in self.state if leaf.kind != "image"] + self.images
+
+    @cached_property
+    def constant(self) -> bool:
+        """True if every step message has the same size."""
+        return all(leaf.kind != "variable" for leaf in self.leaves)
+
+    @cached_property
+    def variable(self) -> dict[str, VariableField]:
+        """Codecs of the leaves of variable size, by ROS name."""
+        return {
+            leaf.name: VariableField(leaf.space, leaf.name, type_prefix=_camel(leaf.name))
+            for leaf in self.leaves
+            if leaf.kind == "variable"
+        }
+
+    @cached_property
+    def step_message(self) -> MessageLayout:
+        """Offsets of `/step`; only for constant layouts."""
+        return MessageLayout.of(
+            [("episode", _U32, ()), ("step", _U32, ())]
+            + [(leaf.name, self.dtypes[leaf.name], leaf.shape) for leaf in self.step_leaves]
+            + [("terminal", _BOOL, ()), ("timeout", _BOOL, ())]
+        )
+
+    @cached_property
+    def final_message(self) -> MessageLayout:
+        """Offsets of `/final_state`, images included; only for constant layouts."""
+        return MessageLayout.of(
+            [("episode", _U32, ()), ("env", _U32, ())]
+            + [(leaf.name, self.dtypes[leaf.name], leaf.shape) for leaf in self.final_leaves]
+        )
+
+    @cached_property
+    def image_messages(self) -> dict[str, ImageLayout]:
+        """Layouts of the image channels, by ROS name of the leaf."""
+        return {leaf.name: image_layout(leaf) for leaf in self.images}
+
+    @cached_property
+    def step_schema(self) -> str:
+        """The ros2msg text of `/step`."""
+        head = ["uint32 episode\n", "uint32 step\n"]
+        return self._text(head, self.step_leaves, ["bool terminal\n", "bool timeout\n"])
+
+    @cached_property
+    def final_schema(self) -> str:
+        """The ros2msg text of `/final_state`."""
+        return self._text(["uint32 episode\n", "uint32 env\n"], self.final_leaves, [])
+
+    def _text(self, head: list[str], leaves: Sequence[Leaf], tail: list[str]) -> str:
+        lines, definitions = list(head), []
+        for leaf in leaves:
+            if leaf.kind == "variable":
+                codec = self.variable[leaf.name]
+                lines.append(f"{codec.field_type} {leaf.name}\n")
+                definitions += codec.definitions
+            elif 0 not in leaf.shape:
+                lines.append(field_line(leaf, self.dtypes[leaf.name]))
+        return message_text(lines + tail, definitions)
+
+    def to_metadata(self) -> dict[str, str]:
+        """What a channel's metadata says of the layout; `from_metadata` rebuilds it."""
+        reward = "" if self.reward_space is None else jsonvalue.dumps(space_to_json(self.reward_space))
+        return {
+            "observation_space": jsonvalue.dumps(space_to_json(self.observation_space)),
+            "action_space": jsonvalue.dumps(space_to_json(self.action_space)),
+            "reward_space": reward,
+            "dtypes": jsonvalue.dumps({name: dtype.name for name, dtype in self.dtypes.items()}),
+        }
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str]) -> StepLayout:
+        """Rebuilds a layout from a channel's metadata.
+
+        Raises:
+            FormatError: the metadata is incomplete or describes no layout.
+        """
+        reward_text = _entry(metadata, "reward_space")
+        reward = space_from_json(jsonvalue.loads(reward_text)) if reward_text else None
+        names = jsonvalue.loads(_entry(metadata, "dtypes"))
+        if not isinstance(names, dict) or not all(name in ROS_TYPES for name in names.values()):
+            raise FormatError(f"channel metadata 'dtypes': expected ROS names with NumPy dtypes, found {names!r:.200}")
+        try:
+            return cls(
+                space_from_json(jsonvalue.loads(_entry(metadata, "observation_space"))),
+                space_from_json(jsonvalue.loads(_entry(metadata, "action_space"))),
+                reward,
+                {name: np.dtype(text) for name, text in names.items()},
+            )
+        except SpaceError as err:
+            raise FormatError(f"channel metadata describes spaces that cannot be recorded: {err}") from err
+
+
+def _entry(metadata: Mapping[str, str], key: str) -> str:
+    if key not in metadata:
+        raise FormatError(f"channel metadata: expected the key {key!r}, found {sorted(metadata)}")
+    return metadata[key]
+
+
+def _camel(name: str) -> str:
+    return "".join(part.capitalize() for part in name.split("_"))

@@ -1,0 +1,202 @@
+"""Whole columns from chunks: one preallocated array a leaf, filled chunk by chunk, in threads if asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.chunks import ChunkStore
+
+__all__ = ["FIELDS", "ColumnReader", "Columns", "Run", "runs_of"]
+
+FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states")
+Array = np.ndarray[Any, Any]
+
+
+@dataclass
+class Columns:
+    """Columns of the asked fields, None for the others.
+
+    A constant leaf is an array of shape (steps, *leaf shape), a leaf of variable size a list; both are nested as the
+    space is. `episode_lengths` (int64) says where episodes end.
+    """
+
+    episode_lengths: Array
+    states: Any = None
+    actions: Any = None
+    rewards: Any = None
+    terminals: Any = None
+    timeouts: Any = None
+    next_states: Any = None
+
+    def __len__(self) -> int:
+        return int(self.episode_lengths.sum())
+
+
+class Run(NamedTuple):
+    """Consecutive rows of a channel that go to consecutive places in the columns."""
+
+    channel: int
+    first: int
+    count: int
+    out: int
+
+
+class Piece(NamedTuple):
+    """Rows `begin:end` of a chunk, and where they go."""
+
+    begin: int
+    end: int
+    out: int
+
+
+def runs_of(episodes: Array, channels: Sequence[int]) -> list[Run]:
+    """The runs of the given index rows, in their order; neighbours that continue each other are one run."""
+    if not len(episodes):
+        return []
+    lengths = episodes["length"].astype(np.int64)
+    first = episodes["first_row"].astype(np.int64)
+    env = episodes["env"].astype(np.int64)
+    if env.max() >= len(channels):
+        raise FormatError(f"an episode names sub-environment {env.max()}, but there are {len(channels)}")
+    out = np.cumsum(lengths) - lengths
+    breaks = np.flatnonzero((env[1:] != env[:-1]) | (first[1:] != first[:-1] + lengths[:-1])) + 1
+    starts = np.concatenate([[0], breaks])
+    ends = np.concatenate([breaks, [len(episodes)]])
+    totals = np.concatenate([[0], np.cumsum(lengths)])
+    return [
+        Run(channels[int(env[a])], int(first[a]), int(totals[b] - totals[a]), int(out[a]))
+        for a, b in zip(starts, ends, strict=True)
+    ]
+
+
+class ColumnReader:
+    """Reads columns of a recording's layout."""
+
+    def __init__(self, layout: StepLayout, store: ChunkStore, images: dict[str, dict[int, int]]) -> None:
+        self._layout = layout
+        self._store = store
+        self._images = images  # leaf name -> step channel -> image channel
+        self._decoder = None if layout.constant else MessageDecoder(layout)
+
+    def read(self, runs: Sequence[Run], total: int, fields: Sequence[str], threads: int, keep: bool) -> dict[str, Any]:
+        """`fields` nested as their spaces are; `keep` puts the chunks read into the cache."""
+        unknown = [field for field in fields if field not in FIELDS]
+        if unknown:
+            raise RecordingError(f"expected fields from {', '.join(FIELDS)}, found {', '.join(map(repr, unknown))}")
+        layout = self._layout
+        wanted = {
+            "states": layout.state, "actions": layout.action, "rewards": layout.reward,
+        }  # fmt: skip
+        leaves = [leaf for field, group in wanted.items() if field in fields for leaf in group]
+        flags = [name for name in ("terminal", "timeout") if f"{name}s" in fields]
+        out: dict[str, Any] = {leaf.name: self._empty(leaf, total) for leaf in leaves}
+        out.update({name: np.empty(total, np.bool_) for name in flags})
+        tasks: list[Callable[[], None]] = []
+        plain = [leaf.name for leaf in leaves if leaf.kind != "image" and leaf.size] + flags
+        if plain and layout.constant:
+            tasks += self._tasks(runs, plain, out, layout.step_message.dtype, keep)
+        elif plain:
+            self._decode(runs, plain, out)
+        for leaf in leaves:
+            if leaf.kind == "image":
+                moved = [run._replace(channel=self._images[leaf.name][run.channel]) for run in runs]
+                tasks += self._tasks(moved, ["data"], {"data": out[leaf.name]}, layout.image_messages[leaf.name].dtype, keep)
+        if threads > 1 and len(tasks) > 1:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(lambda task: task(), tasks))
+        else:
+            for task in tasks:
+                task()
+        nest = {"states": layout.nest_state, "actions": layout.nest_action, "rewards": layout.nest_reward}
+        columns = {
+            field: nest[field]([out[leaf.name] for leaf in group]) for field, group in wanted.items() if field in fields
+        }
+        columns.update({f"{name}s": out[name] for name in flags})
+        return columns
+
+    def _empty(self, leaf: Leaf, total: int) -> Any:
+        if leaf.kind == "variable":
+            return [None] * total
+        return np.empty((total, *leaf.shape), self._layout.dtypes[leaf.name])
+
+    def _tasks(
+        self, runs: Sequence[Run], names: list[str], out: dict[str, Any], dtype: Any, keep: bool
+    ) -> list[Callable[[], None]]:
+        pieces: dict[int, list[Piece]] = {}
+        for run in runs:
+            place = run.out
+            for span in self._store.spans(run.channel, run.first, run.count):
+                pieces.setdefault(span.chunk, []).append(Piece(span.begin, span.end, place))
+                place += span.end - span.begin
+        return [self._task(chunk, parts, names, out, dtype, keep) for chunk, parts in pieces.items()]
+
+    def _task(
+        self, chunk: int, pieces: list[Piece], names: list[str], out: dict[str, Any], dtype: Any, keep: bool
+    ) -> Callable[[], None]:
+        def copy() -> None:
+            rows = self._store.rows(chunk, dtype, keep=keep)
+            if len(pieces) <= 4:
+                for name in names:
+                    source, target = rows[name], out[name]
+                    for begin, end, place in pieces:
+                        target[place : place + end - begin] = _shaped(source[begin:end], target)
+                return
+            sizes = np.array([piece.end - piece.begin for piece in pieces])
+            steps = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+            source_rows = np.repeat([piece.begin for piece in pieces], sizes) + steps
+            places = np.repeat([piece.out for piece in pieces], sizes) + steps
+            for name in names:
+                out[name][places] = _shaped(rows[name][source_rows], out[name])
+
+        return copy
+
+    def _decode(self, runs: Sequence[Run], names: list[str], out: dict[str, Any]) -> None:
+        if self._decoder is None:
+            raise RecordingError("a constant layout is not decoded message by message")
+        for run in runs:
+            for i, body in enumerate(self._store.bodies(run.channel, run.first, run.count)):
+                values = self._decoder.step(body)
+                for name in names:
+                    out[name][run.out + i] = values[name]
+
+    def final_states(self, channel: int, episodes: Array) -> list[dict[str, Any] | None]:
+        """Leaf values of the final state of each given index row, by leaf name; None where there is none."""
+        found: list[dict[str, Any] | None] = []
+        for row in episodes:
+            if row["final_row"] < 0:
+                found.append(None)
+                continue
+            (span,) = self._store.spans(channel, int(row["final_row"]), 1)
+            if self._decoder is None:
+                rows = self._store.rows(span.chunk, self._layout.final_message.dtype)
+                record = rows[span.begin]
+                number = int(record["episode"])
+                values = {leaf.name: record[leaf.name] for leaf in self._layout.state if leaf.size}
+            else:
+                data = memoryview(self._store.load(span.chunk))
+                start, end = self._store.messages(span.chunk)[span.begin]
+                number, values = self._decoder.final(data[start + BODY : end])
+            if number != row["episode"]:
+                raise FormatError(f"expected the final state of episode {row['episode']}, found that of {number}")
+            for leaf in self._layout.state:
+                if leaf.kind != "variable":
+                    dtype = self._layout.dtypes[leaf.name]
+                    value = values.get(leaf.name, np.empty(leaf.shape, dtype))
+                    values[leaf.name] = dtype.type(value) if leaf.kind == "scalar" else np.array(value, dtype)
+            found.append(values)
+        return found
+
+
+def _shaped(values: Array, target: Array) -> Array:
+    """One-element dimensions of a structured field may be folded; the target's shape says what is meant."""
+    return values if values.shape[1:] == target.shape[1:] else values.reshape((len(values), *target.shape[1:]))

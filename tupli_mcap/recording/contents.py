@@ -1,0 +1,89 @@
+"""Everything known of a recording once it is opened: from its summary, or recovered from its chunks and journal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.container import CHUNK_ROWS
+from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME, EpisodeIndex
+from tupli_mcap.recording.source import Source
+from tupli_mcap.recording.summary import (
+    check_magic,
+    foreign,
+    has_summary,
+    read_attachment,
+    read_metadata,
+    read_summary,
+)
+
+__all__ = ["Contents", "read_contents"]
+
+RECORDING_METADATA = "tupli_mcap.recording"
+
+
+@dataclass
+class Contents:
+    """`table` is a CHUNK_ROWS array; `memory` holds the rows of chunks that are only in the journal; `data_end` is the
+    offset where the episode index (or what is to be cut) begins."""
+
+    metadata: dict[str, str]
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    attachments: dict[str, AttachmentIndex] = field(default_factory=dict)
+    metadata_indexes: list[MetadataIndex] = field(default_factory=list)
+    table: np.ndarray = field(default_factory=lambda: np.empty(0, CHUNK_ROWS))  # type: ignore[type-arg]
+    memory: list[bytes] = field(default_factory=list)
+    index: EpisodeIndex = field(default_factory=lambda: EpisodeIndex(np.empty(0, EPISODE_ROWS), np.empty(0, CHUNK_ROWS), b""))
+    complete: bool = True
+    data_end: int = 0
+
+
+def read_contents(source: Source) -> Contents:
+    """Reads a finished file by its summary, another by recovery.
+
+    Raises:
+        FormatError: no MCAP file, no recording of ours, or damaged.
+    """
+    check_magic(source)
+    if not has_summary(source):
+        from tupli_mcap.recording.recover import recover_contents
+
+        return recover_contents(source)
+    summary = read_summary(source)
+    if RECORDING_METADATA not in summary.metadata:
+        raise foreign(source, f"it has no metadata {RECORDING_METADATA!r}")
+    metadata = check_version(source, read_metadata(source, summary.metadata[RECORDING_METADATA]))
+    if INDEX_NAME not in summary.attachments:
+        raise FormatError(f"{source.name}: the recording has no episode index {INDEX_NAME!r}; recover it into a new file")
+    attachment = summary.attachments.pop(INDEX_NAME)
+    index = EpisodeIndex.decode(read_attachment(source, attachment), source.name)
+    if len(index.chunks) != summary.chunks:
+        raise FormatError(
+            f"{source.name}: the episode index lists {len(index.chunks)} chunks, the summary {summary.chunks}"
+        )
+    return Contents(
+        metadata,
+        summary.schemas,
+        summary.channels,
+        summary.attachments,
+        list(summary.metadata.values()),
+        index.chunks,
+        [],
+        index,
+        True,
+        attachment.offset,
+    )
+
+
+def check_version(source: Source, metadata: dict[str, str]) -> dict[str, str]:
+    """Raises FormatError unless the metadata is that of a format this version reads."""
+    version = metadata.get("format_version")
+    if version != "1":
+        raise FormatError(f"{source.name}: expected format version '1', found {version!r}; update tupli-mcap")
+    if len(metadata.get("uuid", "")) != 32:
+        raise FormatError(f"{source.name}: expected a uuid of 32 hex digits, found {metadata.get('uuid')!r:.60}")
+    return metadata

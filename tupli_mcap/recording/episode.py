@@ -1,0 +1,197 @@
+"""An episode as it is read: columns on access, steps when iterated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
+
+import numpy as np
+
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.recording.events import END_NAMES, EpisodeStart
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording.reader import Recording
+
+__all__ = ["Episode", "Episodes", "Step"]
+
+
+class Step(NamedTuple):
+    """One step: `state` is the observation the action was chosen on; `info` is None where none was recorded."""
+
+    state: Any
+    action: Any
+    reward: Any
+    terminal: bool
+    timeout: bool
+    info: dict[str, Any] | None = None
+
+
+class Episode:
+    """One episode of a recording. Columns are arrays (lists for leaves of variable size), nested as the space is.
+
+    Arrays are decoded on access, from the chunks the episode lies in, and kept; they are the caller's own.
+    """
+
+    def __init__(self, recording: Recording, position: int) -> None:
+        self._recording = recording
+        self._position = position
+        self._row = recording.index[position]
+
+    def __len__(self) -> int:
+        return int(self._row["length"])
+
+    @property
+    def number(self) -> int:
+        """The episode's number in its recording, counted from 0."""
+        return int(self._row["episode"])
+
+    @property
+    def env(self) -> int:
+        """The sub-environment, 0 for a single one."""
+        return int(self._row["env"])
+
+    @property
+    def return_(self) -> float:
+        """Sum of the rewards."""
+        return float(self._row["return"])
+
+    @property
+    def end(self) -> str:
+        """"terminal", "timeout" or "interrupted"."""
+        return END_NAMES[self._row["end"]]
+
+    @property
+    def start_time(self) -> int:
+        """Wall clock of the reset (ns)."""
+        return int(self._row["start_time"])
+
+    @property
+    def end_time(self) -> int:
+        """Wall clock of the end (ns)."""
+        return int(self._row["end_time"])
+
+    @cached_property
+    def metadata(self) -> dict[str, Any]:
+        """What the metadata callback returned last."""
+        return self._recording.episode_metadata(self._position)
+
+    @cached_property
+    def start(self) -> EpisodeStart:
+        """The `/episode_start` message."""
+        return self._recording.episode_start(self._position)
+
+    @property
+    def seed(self) -> int | None:
+        """The seed passed to `reset`, else the one the environment drew in an unseeded first reset, else None."""
+        return int(self.start.seed) if self.start.seed else None
+
+    @property
+    def options(self) -> Any:
+        """The options passed to `reset`."""
+        return jsonvalue.loads(self.start.options) if self.start.options else None
+
+    @property
+    def reset_info(self) -> dict[str, Any]:
+        """The info `reset` returned."""
+        info: dict[str, Any] = jsonvalue.loads(self.start.reset_info)
+        return info
+
+    @cached_property
+    def _columns(self) -> Any:
+        return self._recording.read([self._position])
+
+    @property
+    def states(self) -> Any:
+        return self._columns.states
+
+    @property
+    def actions(self) -> Any:
+        return self._columns.actions
+
+    @property
+    def rewards(self) -> Any:
+        return self._columns.rewards
+
+    @property
+    def terminals(self) -> Any:
+        return self._columns.terminals
+
+    @property
+    def timeouts(self) -> Any:
+        return self._columns.timeouts
+
+    @cached_property
+    def next_states(self) -> Any:
+        """The state after each step; that of the last step is the final state."""
+        return self._recording.read([self._position], fields=["next_states"]).next_states
+
+    @cached_property
+    def final_state(self) -> Any:
+        """The observation after the last step; None if it is not known (episodes built by hand)."""
+        return self._recording.final_state(self._position)
+
+    @cached_property
+    def infos(self) -> list[dict[str, Any] | None] | None:
+        """The recorded info of each step (None for a step without); None if the recording has no infos."""
+        return self._recording.infos(self._position)
+
+    def __iter__(self) -> Iterator[Step]:
+        columns, infos = self._columns, self.infos
+        layout = self._recording.layout
+        state = _item(layout.observation_space, columns.states)
+        action = _item(layout.action_space, columns.actions)
+        for i in range(len(self)):
+            yield Step(
+                state(i),
+                action(i),
+                columns.rewards[i].item() if columns.rewards.ndim == 1 else columns.rewards[i],
+                bool(columns.terminals[i]),
+                bool(columns.timeouts[i]),
+                None if infos is None else infos[i],
+            )
+
+    def __repr__(self) -> str:
+        return f"<Episode {self.number}: {len(self)} steps, return {self.return_:g}, {self.end}>"
+
+
+def _item(space: Any, columns: Any) -> Any:
+    """A function from a step's index to its value, of the type the space's own samples have."""
+    from gymnasium import spaces
+
+    if type(space) is spaces.Dict:
+        parts = {key: _item(sub, columns[key]) for key, sub in space.spaces.items()}
+        return lambda i: {key: part(i) for key, part in parts.items()}
+    if type(space) is spaces.Tuple:
+        items = [_item(sub, column) for sub, column in zip(space.spaces, columns, strict=True)]
+        return lambda i: tuple(item(i) for item in items)
+    if isinstance(columns, np.ndarray) and columns.ndim == 1 and type(space) is not spaces.Discrete:
+        return lambda i: np.asarray(columns[i])  # a Box of shape () gives arrays
+    return lambda i: columns[i]
+
+
+class Episodes(Sequence[Episode]):
+    """The episodes of a recording, in the order of their numbers; lazy."""
+
+    def __init__(self, recording: Recording, positions: range | None = None) -> None:
+        self._recording = recording
+        self._positions = range(len(recording.index)) if positions is None else positions
+
+    def __len__(self) -> int:
+        return len(self._positions)
+
+    @overload
+    def __getitem__(self, i: int) -> Episode: ...
+    @overload
+    def __getitem__(self, i: slice) -> Episodes: ...
+    def __getitem__(self, i: int | slice) -> Episode | Episodes:
+        if isinstance(i, slice):
+            return Episodes(self._recording, self._positions[i])
+        try:
+            return Episode(self._recording, self._positions[i])
+        except IndexError as err:
+            raise IndexError(f"expected an episode from 0 to {len(self) - 1}, found {i}") from err
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} episodes of {self._recording.name}>"

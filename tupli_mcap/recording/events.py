@@ -1,0 +1,133 @@
+"""`/episode_start` and `/episode_end`: their schemas, encoders and decoders, adjacent and in field order."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, NamedTuple
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
+
+__all__ = [
+    "END_NAMES",
+    "EpisodeEnd",
+    "EpisodeStart",
+    "read_strings",
+    "record",
+]
+
+END_NAMES = ("terminal", "timeout", "interrupted")
+TERMINAL, TIMEOUT, INTERRUPTED = range(3)
+
+_START = struct.Struct("<IIQ??2x")
+_END = struct.Struct("<IIQQdB?2x")
+_LENGTH = struct.Struct("<I")
+
+
+def record(channel: int, sequence: int, time_ns: int, body: bytes) -> bytes:
+    """A whole Message record around a CDR body."""
+    head = RECORD_HEADER.pack(5, BODY - 9 + len(body), channel, sequence, time_ns, time_ns)
+    return head + CDR_HEADER + body
+
+
+def _strings(offset: int, *texts: bytes) -> bytes:
+    out = bytearray()
+    for text in texts:
+        out += bytes(-(offset + len(out)) % 4)
+        out += _LENGTH.pack(len(text) + 1) + text + b"\0"
+    return bytes(out)
+
+
+def read_strings(body: memoryview, offset: int, count: int) -> list[str]:
+    """`count` CDR strings from `offset` on.
+
+    Raises:
+        FormatError: a length beyond the message, a missing NUL, or text that is not UTF-8.
+    """
+    texts = []
+    for _ in range(count):
+        offset += -offset % 4
+        if offset + 4 > len(body):
+            raise FormatError(f"expected a string at byte {offset} of a message of {len(body)} bytes")
+        (length,) = _LENGTH.unpack_from(body, offset)
+        offset += 4
+        if length < 1 or offset + length > len(body) or body[offset + length - 1] != 0:
+            raise FormatError(f"expected a string of {length} bytes with its NUL at byte {offset} of a message")
+        try:
+            texts.append(str(body[offset : offset + length - 1], "utf-8"))
+        except UnicodeDecodeError as err:
+            raise FormatError(f"expected UTF-8 text at byte {offset} of a message: {err.reason}") from err
+        offset += length
+    return texts
+
+
+class EpisodeStart(NamedTuple):
+    """`first_row` counts from 0 in the episode's step channel.
+
+    `seed` is decimal text, empty if there is none: the one passed to `reset` (`seed_given`), or the one the
+    environment drew. `continued`: stepped on after an end, without a reset.
+    """
+
+    SCHEMA_NAME = "tupli_mcap/msg/EpisodeStart"
+    SCHEMA = (
+        "uint32 episode\nuint32 env\nuint64 first_row\nbool seed_given\nbool continued\n"
+        "string seed\nstring options\nstring reset_info\n"
+    )
+
+    episode: int
+    env: int
+    first_row: int
+    seed_given: bool
+    continued: bool
+    seed: str
+    options: str
+    reset_info: str
+
+    def encode(self) -> bytes:
+        fixed = _START.pack(*self[:5])
+        if self[5:] == ("", "", "{}"):
+            return fixed + _PLAIN_START
+        return fixed + _strings(_START.size, *(text.encode() for text in self[5:]))
+
+    @classmethod
+    def decode(cls, body: memoryview) -> EpisodeStart:
+        if len(body) < _START.size:
+            raise FormatError(f"/episode_start: expected at least {_START.size} bytes, found {len(body)}")
+        fixed: Any = _START.unpack_from(body, 0)
+        seed, options, info = read_strings(body, _START.size, 3)
+        return cls(*fixed, seed, options, info)
+
+
+_PLAIN_START = _strings(_START.size, b"", b"", b"{}")
+
+
+class EpisodeEnd(NamedTuple):
+    """`end` indexes END_NAMES; `episode_return` is the sum of the rewards; `metadata` is JSON."""
+
+    SCHEMA_NAME = "tupli_mcap/msg/EpisodeEnd"
+    SCHEMA = (
+        "uint32 episode\nuint32 env\nuint64 first_row\nuint64 length\nfloat64 episode_return\nuint8 end\n"
+        "bool has_final_state\nstring metadata\n"
+    )
+
+    episode: int
+    env: int
+    first_row: int
+    length: int
+    episode_return: float
+    end: int
+    has_final_state: bool
+    metadata: str
+
+    def encode(self) -> bytes:
+        return _END.pack(*self[:7]) + _strings(_END.size, self.metadata.encode())
+
+    @classmethod
+    def decode(cls, body: memoryview) -> EpisodeEnd:
+        if len(body) < _END.size:
+            raise FormatError(f"/episode_end: expected at least {_END.size} bytes, found {len(body)}")
+        fixed: Any = _END.unpack_from(body, 0)
+        (metadata,) = read_strings(body, _END.size, 1)
+        if fixed[5] >= len(END_NAMES):
+            raise FormatError(f"/episode_end: expected an end of 0, 1 or 2, found {fixed[5]}")
+        return cls(*fixed, metadata)

@@ -1,0 +1,114 @@
+"""The episode index: the last attachment of a recording, one fixed-size row an episode and one a chunk.
+
+The metadata texts lie beside the rows and are read only when asked for.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.container import CHUNK_ROWS
+
+__all__ = ["EPISODE_ROWS", "INDEX_NAME", "EpisodeIndex", "IndexBuilder"]
+
+INDEX_NAME = "episodes.index"
+INDEX_MEDIA_TYPE = "application/x-tupli-mcap-index"
+_HEAD = struct.Struct("<8sQQQ")
+_MAGIC = b"TMIDX\0\0\1"
+_MAX_METADATA = 1 << 26
+
+EPISODE_ROWS = np.dtype(
+    [
+        ("first_row", "<u8"), ("length", "<u8"), ("return", "<f8"), ("start_time", "<i8"), ("end_time", "<i8"),
+        ("seed", "<i8"), ("start_row", "<u8"), ("end_row", "<u8"), ("final_row", "<i8"), ("metadata_offset", "<u8"), ("metadata_length", "<u4"),
+        ("episode", "<u4"), ("env", "<u4"), ("end", "u1"), ("has_seed", "u1"), ("pad", "u1", (2,)),
+    ]
+)  # fmt: skip
+
+
+class EpisodeRow(NamedTuple):
+    """One row; `start_row`, `end_row` and `final_row` (-1: none) count in the three episode channels."""
+
+    first_row: int
+    length: int
+    episode_return: float
+    start_time: int
+    end_time: int
+    seed: int | None
+    start_row: int
+    end_row: int
+    final_row: int
+    episode: int
+    env: int
+    end: int
+
+
+_ROW = struct.Struct("<QQdqqqQQqQIIIBB2x")
+
+
+class IndexBuilder:
+    """Collects rows while recording: 96 bytes an episode, plus its metadata text."""
+
+    def __init__(self) -> None:
+        self.rows = bytearray()
+        self.metadata = bytearray()
+        self.count = 0
+
+    def add(self, row: EpisodeRow, metadata: str) -> None:
+        text = b"" if metadata == "{}" else metadata.encode()
+        seed = row.seed if row.seed is not None and -(2**63) <= row.seed < 2**63 else None
+        self.rows += _ROW.pack(
+            row.first_row, row.length, row.episode_return, row.start_time, row.end_time, seed or 0, row.start_row,
+            row.end_row, row.final_row, len(self.metadata), len(text), row.episode, row.env, row.end, seed is not None,
+        )  # fmt: skip
+        self.metadata += text
+        self.count += 1
+
+    def encode(self, chunk_rows: bytes | bytearray) -> bytes:
+        """The attachment's bytes, episodes in the order of their numbers."""
+        rows = np.frombuffer(bytes(self.rows), EPISODE_ROWS)
+        rows = rows[np.argsort(rows["episode"], kind="stable")]
+        head = _HEAD.pack(_MAGIC, self.count, len(chunk_rows) // CHUNK_ROWS.itemsize, len(self.metadata))
+        return b"".join([head, rows.tobytes(), bytes(chunk_rows), bytes(self.metadata)])
+
+
+class EpisodeIndex(NamedTuple):
+    """A decoded index: structured arrays `episodes` (EPISODE_ROWS), `chunks` (CHUNK_ROWS), and the metadata texts."""
+
+    episodes: np.ndarray[Any, Any]
+    chunks: np.ndarray[Any, Any]
+    metadata: bytes
+
+    @classmethod
+    def decode(cls, data: bytes, where: str) -> EpisodeIndex:
+        """Raises FormatError if counts and sizes do not add up to the attachment."""
+        if len(data) < _HEAD.size:
+            raise FormatError(f"{where}: expected an episode index of at least {_HEAD.size} bytes, found {len(data)}")
+        magic, episodes, chunks, metadata = _HEAD.unpack_from(data)
+        sizes = (episodes * EPISODE_ROWS.itemsize, chunks * CHUNK_ROWS.itemsize, metadata)
+        if magic != _MAGIC or _HEAD.size + sum(sizes) != len(data):
+            raise FormatError(
+                f"{where}: expected an episode index of version 1 with {episodes} episodes and {chunks} chunks, "
+                f"found {magic!r} and {len(data)} bytes"
+            )
+        start = _HEAD.size
+        rows = np.frombuffer(data, EPISODE_ROWS, episodes, start)
+        table = np.frombuffer(data, CHUNK_ROWS, chunks, start + sizes[0])
+        return cls(rows, table, data[start + sizes[0] + sizes[1] :])
+
+    def metadata_text(self, i: int) -> str:
+        """The JSON text of an episode's metadata."""
+        row = self.episodes[i]
+        start, length = int(row["metadata_offset"]), int(row["metadata_length"])
+        if length == 0:
+            return "{}"
+        if length > _MAX_METADATA or start + length > len(self.metadata):
+            raise FormatError(f"episode {i}: its metadata lies outside the index ({start} + {length} bytes)")
+        try:
+            return self.metadata[start : start + length].decode()
+        except UnicodeDecodeError as err:
+            raise FormatError(f"episode {i}: expected UTF-8 metadata, found {err.reason}") from err

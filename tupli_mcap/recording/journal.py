@@ -1,0 +1,204 @@
+"""The journal: a memory-mapped file beside the recording that holds every step not yet in a chunk.
+
+Its pages belong to the file, so they outlive a killed process. The first page describes the areas as JSON; the areas
+follow, page-aligned. Two kinds of area exist:
+
+`RowArea`: two halves of constant-size rows, each with one spare row, for each of its channels.
+`LogArea`: one or two halves of variable-size Message records behind a committed end offset.
+
+Not thread-safe; one writer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import mmap
+import os
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError, RecordingError
+
+__all__ = ["Journal", "LogArea", "RowArea", "journal_path", "read_journal"]
+
+MAGIC = b"TMCAPJ1\0"
+_HEAD = struct.Struct("<8sII")
+PAGE = 4096
+_LOG_HEADER = 64
+_MAX_HEADER = 64 << 20
+
+
+def journal_path(path: str | os.PathLike[str], directory: str | os.PathLike[str] | None = None) -> Path:
+    """Where the journal of a recording lies: beside it, or in `directory`."""
+    path = Path(path)
+    return (path.parent if directory is None else Path(directory)) / f"{path.name}.journal"
+
+
+class RowArea(NamedTuple):
+    """`channels` x `rows` rows of `row_size` bytes, plus a spare row a channel, in each of two halves."""
+
+    name: str
+    row_size: int
+    rows: int
+    channels: int = 1
+
+    @property
+    def block(self) -> int:
+        """Bytes of one channel's rows in one half."""
+        return (self.rows + 1) * self.row_size
+
+    @property
+    def half(self) -> int:
+        return self.block * self.channels
+
+    @property
+    def size(self) -> int:
+        return 2 * self.half
+
+    def to_json(self) -> dict[str, Any]:
+        return {"kind": "rows", **self._asdict()}
+
+
+class LogArea(NamedTuple):
+    """`halves` x `capacity` bytes of Message records; each half starts with its committed end (u64, 64 bytes)."""
+
+    name: str
+    capacity: int
+    halves: int = 1
+
+    @property
+    def half(self) -> int:
+        return _LOG_HEADER + self.capacity
+
+    @property
+    def size(self) -> int:
+        return self.halves * self.half
+
+    def to_json(self) -> dict[str, Any]:
+        return {"kind": "log", **self._asdict()}
+
+
+Area = RowArea | LogArea
+
+
+def _aligned(n: int) -> int:
+    return -(-n // PAGE) * PAGE
+
+
+class Journal:
+    """A journal being written."""
+
+    def __init__(self, path: Path, areas: list[Area], info: Mapping[str, Any]) -> None:
+        self.path = path
+        self.areas = {area.name: area for area in areas}
+        self.info = dict(info)
+        header, self.offsets, size = _plan(areas, self.info)
+        temporary = path.with_name(path.name + ".tmp")
+        try:
+            self._map = _create(temporary, size)
+            self._map[: len(header)] = header
+            temporary.replace(path)
+        except OSError as err:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise RecordingError(
+                f"{path}: expected {size} bytes for the journal, found {err.strerror}; "
+                "free some space or give journal_dir= another place"
+            ) from err
+
+    def buffer(self, name: str) -> memoryview:
+        """The bytes of an area."""
+        start = self.offsets[name]
+        return memoryview(self._map)[start : start + self.areas[name].size]
+
+    def sync(self) -> None:
+        """Writes the mapped pages to the disk."""
+        self._map.flush()
+
+    def close(self, *, unlink: bool) -> None:
+        """Lets go of the map (freed with its last view) and, with `unlink`, removes the file."""
+        if unlink:
+            with contextlib.suppress(FileNotFoundError):
+                self.path.unlink()
+
+
+def _plan(areas: list[Area], info: Mapping[str, Any]) -> tuple[bytes, dict[str, int], int]:
+    body = {"info": dict(info), "areas": [area.to_json() for area in areas]}
+    text = json.dumps(body).encode()
+    header = _HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text
+    offset = _aligned(len(header))
+    offsets = {}
+    for area in areas:
+        offsets[area.name] = offset
+        offset = _aligned(offset + area.size)
+    return header, offsets, offset
+
+
+def _create(path: Path, size: int) -> mmap.mmap:
+    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | getattr(os, "O_CLOEXEC", 0), 0o644)
+    try:
+        _reserve(fd, size)
+        return mmap.mmap(fd, size)
+    finally:
+        os.close(fd)
+
+
+def _reserve(fd: int, size: int) -> None:
+    """Takes the space now: writing into a hole of a full disk would be a SIGBUS instead of an error."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(fd, 0, size)
+        return
+    block = bytes(1 << 20)  # macOS has no such call; zeros take the space as well
+    for start in range(0, size, len(block)):
+        os.pwrite(fd, block[: size - start], start)
+
+
+class JournalContents(NamedTuple):
+    """A journal as found on disk: its description and a private copy of its areas' bytes."""
+
+    info: dict[str, Any]
+    areas: dict[str, Area]
+    data: dict[str, np.ndarray[Any, np.dtype[np.uint8]]]
+
+
+def read_journal(path: Path) -> JournalContents:
+    """Reads a journal, changing nothing.
+
+    Raises:
+        FormatError: the file is no journal, or describes areas it does not have.
+        OSError: the file cannot be read.
+    """
+    raw = np.fromfile(path, dtype=np.uint8)
+    if raw.size < _HEAD.size:
+        raise FormatError(f"{path}: expected a journal header of {_HEAD.size} bytes, found {raw.size} bytes")
+    magic, length, crc = _HEAD.unpack(raw[: _HEAD.size].tobytes())
+    text = raw[_HEAD.size : _HEAD.size + length].tobytes()
+    if magic != MAGIC or length > _MAX_HEADER or len(text) != length or zlib.crc32(text) != crc:
+        raise FormatError(f"{path}: expected a journal of this version, found {magic!r} or a damaged header")
+    try:
+        body = json.loads(text)
+        areas = [_area(entry) for entry in body["areas"]]
+        info = dict(body["info"])
+    except (ValueError, KeyError, TypeError) as err:
+        raise FormatError(f"{path}: expected areas in the journal's header, found {text[:80]!r}") from err
+    _, offsets, _ = _plan(areas, info)
+    data = {}
+    for area in areas:
+        start = offsets[area.name]
+        data[area.name] = raw[start : start + area.size]
+        if data[area.name].size != area.size:
+            raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {data[area.name].size}")
+    return JournalContents(info, {area.name: area for area in areas}, data)
+
+
+def _area(entry: Mapping[str, Any]) -> Area:
+    values = {key: value for key, value in entry.items() if key != "kind"}
+    if any(type(value) is not int or value < 0 for key, value in values.items() if key != "name"):
+        raise ValueError(entry)
+    return RowArea(**values) if entry["kind"] == "rows" else LogArea(**values)

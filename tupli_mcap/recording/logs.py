@@ -1,0 +1,241 @@
+"""Message records of variable size in the journal: the events of all channels, and steps without a constant layout.
+
+A log half is a u64 end offset and the records before it. The end is stored after the bytes, in one machine word: it
+commits them.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError, StepError
+from tupli_mcap.messages.exact import exact_array, leaf_value
+from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.container import Rows
+from tupli_mcap.recording.events import record
+from tupli_mcap.recording.journal import LogArea
+
+__all__ = ["EventLog", "StepLog", "group_records", "iter_records", "leaf_encoders"]
+
+Sink = Callable[[Rows], None]
+Encoder = Callable[[Any, bytearray, int], None]
+_HEADER = 64
+_LENGTH = struct.Struct("<Q")
+
+
+def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
+    """(offset, end, channel, sequence, log_time) of the Message records in `data`.
+
+    Raises:
+        FormatError: bytes that are no whole Message record.
+    """
+    while start < len(data):
+        if start + BODY > len(data):
+            raise FormatError(f"expected a message record at byte {start}, found {len(data) - start} bytes")
+        opcode, length, channel, sequence, log_time, _ = RECORD_HEADER.unpack_from(data, start)
+        end = start + 9 + length
+        if opcode != 5 or length < BODY - 9 or end > len(data):
+            raise FormatError(f"expected a message record at byte {start}, found opcode {opcode} of {length} bytes")
+        yield start, end, channel, sequence, log_time
+        start = end
+
+
+def group_records(data: memoryview) -> list[Rows]:
+    """The records in `data` by channel, in their order."""
+    groups: dict[int, tuple[list[bytes], list[int], list[int], int]] = {}
+    for start, end, channel, sequence, log_time in iter_records(data):
+        parts, sizes, times, _ = groups.setdefault(channel, ([], [], [], sequence))
+        parts.append(bytes(data[start:end]))
+        sizes.append(end - start)
+        times.append(log_time)
+    rows = []
+    for channel, (parts, sizes, times, first) in groups.items():
+        offsets = np.zeros(len(sizes), dtype=np.uint64)
+        np.cumsum(sizes[:-1], out=offsets[1:])
+        rows.append(Rows(channel, first, b"".join(parts), offsets, np.array(times, dtype=np.uint64)))
+    return rows
+
+
+class EventLog:
+    """Records of several channels in one half; when it is full they go to the file, a chunk a channel."""
+
+    def __init__(self, area: LogArea, buffer: memoryview, sink: Sink, sequences: dict[int, int]) -> None:
+        self._records = buffer[_HEADER : _HEADER + area.capacity]
+        self._commit = buffer[:8].cast("Q")
+        self._capacity = area.capacity
+        self._sink = sink
+        self._position = 0
+        self._commit[0] = 0
+        self.sequences = sequences
+        self._times: dict[int, int] = dict.fromkeys(sequences, 0)
+
+    def append(self, channel: int, time_ns: int, body: bytes) -> int:
+        """Adds a message; returns the position before it, for `rewind`."""
+        time_ns = max(time_ns, self._times[channel])
+        self._times[channel] = time_ns
+        data = record(channel, self.sequences[channel], time_ns, body)
+        if self._position + len(data) > self._capacity:
+            self.flush()
+        self.sequences[channel] += 1
+        start = self._position
+        if len(data) > self._capacity:
+            for rows in group_records(memoryview(data)):
+                self._sink(rows)
+            return start
+        self._position = start + len(data)
+        self._records[start : self._position] = data
+        self._commit[0] = self._position
+        return start
+
+    def rewind(self, position: int, channel: int) -> None:
+        """Takes back the last message, which began at `position`."""
+        self._position = position
+        self._commit[0] = position
+        self.sequences[channel] -= 1
+
+    def flush(self) -> None:
+        """Writes the records to the file."""
+        for rows in group_records(self._records[: self._position]):
+            self._sink(rows)
+        self._position = 0
+        self._commit[0] = 0
+
+
+def leaf_encoders(layout: StepLayout, leaves: Sequence[Leaf]) -> list[tuple[Leaf, Encoder]]:
+    """Appending CDR encoders of the given leaves."""
+    return [(leaf, _encoder(layout, leaf)) for leaf in leaves]
+
+
+def _encoder(layout: StepLayout, leaf: Leaf) -> Encoder:
+    if leaf.kind == "variable":
+        return layout.variable[leaf.name].encode
+    dtype = layout.dtypes[leaf.name]
+
+    def encode(value: Any, out: bytearray, origin: int) -> None:
+        data = exact_array(value, dtype, leaf.shape, leaf.path).tobytes()
+        if data:
+            out += bytes(-(len(out) - origin) % dtype.itemsize)
+            out += data
+
+    return encode
+
+
+class StepLog:
+    """The steps of one environment whose messages vary in size.
+
+    A record starts with its state, so the running record's state is in the journal before its action is known.
+    """
+
+    def __init__(
+        self, layout: StepLayout, area: LogArea, buffer: memoryview, channel: int, sink: Sink, images: Sequence[Any], first: int = 0
+    ) -> None:
+        self._layout = layout
+        self._area = area
+        self._records = [buffer[h * area.half + _HEADER : (h + 1) * area.half] for h in range(2)]
+        self._ends = [buffer[h * area.half : h * area.half + 8].cast("Q") for h in range(2)]
+        self._channel = channel
+        self._sink = sink
+        self._images = images
+        self._half = 0
+        self._position = 0
+        self._emitted = 0
+        self._episode = 0
+        self._step = 0
+        self._time = 0
+        self._pending = bytearray()
+        self._state = leaf_encoders(layout, [leaf for leaf in layout.state if leaf.kind != "image"])
+        self._rest = leaf_encoders(layout, [*layout.action, *layout.reward])
+        self.count = first
+        self.total: Any = 0.0
+        self.grow: Callable[[int], None] | None = None
+        for end in self._ends:
+            end[0] = 0
+
+    def begin_episode(self, episode: int) -> None:
+        """The records that follow belong to `episode`."""
+        self._episode, self._step, self.total = episode, 0, 0.0
+
+    def put_state(self, state: Any) -> None:
+        """Starts the running record over: the state of a reset."""
+        pending, images = self._encode_state(state, 0)
+        self._reserve(len(pending))
+        self._pending = pending
+        self._write_pending(self._position)
+        for sink, image in zip(self._images, images, strict=True):
+            sink.put_first(image)
+
+    def put(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
+        """Completes and commits the running record; `state` starts the next one."""
+        out = bytearray(self._pending)
+        for leaves, root in ((self._layout.action, action), (self._layout.reward, reward)):
+            self._encode(out, leaves, root)
+        out += bytes((bool(terminal), bool(timeout)))
+        pending, images = self._encode_state(state, self._step + 1)
+        self._reserve(len(out) + len(pending))
+        self._time = max(time.time_ns(), self._time)
+        RECORD_HEADER.pack_into(out, 0, 5, len(out) - 9, self._channel, self.count, self._time, self._time)
+        records, start = self._records[self._half], self._position
+        end = start + len(out)
+        records[start:end] = out
+        self._pending = pending
+        self._write_pending(end)
+        for sink, image in zip(self._images, images, strict=True):
+            sink.put(image)
+        self._ends[self._half][0] = end
+        self._position = end
+        self.count += 1
+        self._step += 1
+        self.total += reward
+
+    def pending_state(self) -> bytes:
+        """The CDR bytes of the running record's state, as they follow `episode` and `env` in `/final_state`."""
+        return bytes(self._pending[BODY + 8 :])
+
+    def _encode(self, out: bytearray, leaves: Sequence[Leaf], root: Any) -> None:
+        for leaf, encode in self._state + self._rest:
+            if leaf in leaves:
+                encode(leaf_value(root, leaf), out, BODY)
+
+    def _encode_state(self, state: Any, step: int) -> tuple[bytearray, list[Any]]:
+        out = bytearray(RECORD_HEADER.size) + CDR_HEADER
+        out += self._episode.to_bytes(4, "little") + step.to_bytes(4, "little")
+        self._encode(out, [leaf for leaf in self._layout.state if leaf.kind != "image"], state)
+        images = [
+            sink.check(leaf_value(state, leaf)) for sink, leaf in zip(self._images, self._layout.images, strict=True)
+        ]
+        return out, images
+
+    def _write_pending(self, position: int) -> None:
+        self._records[self._half][position : position + len(self._pending)] = self._pending
+
+    def _reserve(self, size: int) -> None:
+        if self._position + size <= self._area.capacity:
+            return
+        if self._position:
+            self._switch()
+        if size > self._area.capacity:
+            if self.grow is None:
+                raise StepError(f"a step of {size} bytes does not fit into {self._area.capacity} bytes of journal")
+            self.grow(size)
+
+    def _switch(self) -> None:
+        full, end, begin = self._half, self._position, self._emitted
+        other = 1 - full
+        self._ends[other][0] = 0
+        self._records[other][: len(self._pending)] = self._pending
+        self._half, self._position, self._emitted = other, 0, 0
+        for rows in group_records(self._records[full][begin:end]):
+            self._sink(rows)
+
+    def flush(self) -> None:
+        """Writes the committed records that are not in the file yet."""
+        begin, self._emitted = self._emitted, self._position
+        for rows in group_records(self._records[self._half][begin : self._position]):
+            self._sink(rows)

@@ -1,0 +1,327 @@
+"""`Recording`: one file, opened by its summary and episode index, read by columns, episodes and steps."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, BinaryIO, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from tupli_mcap.environment import EnvironmentRecord, build
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.step import STEP_SCHEMA, StepLayout
+from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns, runs_of
+from tupli_mcap.recording.contents import Contents, read_contents
+from tupli_mcap.recording.episode import Episodes
+from tupli_mcap.recording.events import EpisodeStart
+from tupli_mcap.recording.infos import InfoDecoder
+from tupli_mcap.recording.source import open_source
+from tupli_mcap.recording.summary import read_attachment
+
+__all__ = ["AttachmentInfo", "RecordedBenchmark", "Recording"]
+
+CACHE_BYTES = 512 << 20
+
+
+class AttachmentInfo(NamedTuple):
+    """What a recording says of an attachment."""
+
+    name: str
+    media_type: str
+    size: int
+
+
+class RecordedBenchmark(NamedTuple):
+    """The environment a recording was made with, as data."""
+
+    id: str
+    record: EnvironmentRecord
+
+    def make_env(self, *, trust: bool = False) -> gym.Env[Any, Any]:
+        """Rebuilds the environment.
+
+        Raises:
+            UntrustedError: code from the file would run, and nobody here has trusted it.
+        """
+        return build(self.record, trust=trust)
+
+
+class Recording:
+    """An MCAP recording, open for reading.
+
+    Opening reads the summary and the episode index only. A file without a summary (its writer was killed, or is still
+    at work) is recovered in memory: `complete` is False, all finished steps are there, the last episode is
+    "interrupted". Nothing in the file is executed. Reading is safe from several threads.
+
+    Args:
+        source: a path, a URL (with the extra `remote`), or an open binary file.
+        cache_bytes: budget for decompressed chunks.
+
+    Raises:
+        RecordingError: the file cannot be opened.
+        FormatError: it is no recording, or damaged.
+    """
+
+    def __init__(self, source: str | os.PathLike[str] | BinaryIO, *, cache_bytes: int = CACHE_BYTES) -> None:
+        self._source = open_source(source)
+        self.name = self._source.name
+        self.path: Path | None = self._source.path
+        try:
+            self._contents: Contents = read_contents(self._source)
+            self._store = ChunkStore(self._source, self._contents.table, self._contents.memory, cache_bytes)
+            self._prepare()
+        except BaseException:
+            self._source.close()
+            raise
+
+    def _prepare(self) -> None:
+        contents = self._contents
+        self.complete = contents.complete
+        self.metadata: Mapping[str, str] = MappingProxyType(contents.metadata)
+        self.index = contents.index.episodes
+        topics = {channel.topic: channel for channel in contents.channels.values()}
+        steps = sorted(
+            (channel for channel in contents.channels.values() if channel.topic.endswith("/step")),
+            key=lambda channel: int(channel.metadata.get("env", "0")),
+        )
+        self._step_channels = [channel.id for channel in steps]
+        self._layout: StepLayout | None = None
+        self._columns: ColumnReader | None = None
+        self._topics = {topic: channel.id for topic, channel in topics.items()}
+        self._infos: dict[int, dict[int, dict[str, Any]]] | None = None
+        if steps:
+            self._layout = StepLayout.from_metadata(steps[0].metadata)
+            for channel in steps:
+                schema = contents.schemas.get(channel.schema_id)
+                text = self._layout.step_schema.encode()
+                if schema is None or schema.name != STEP_SCHEMA or schema.data != text:
+                    raise FormatError(f"{self.name}: the schema of {channel.topic} is not the one its spaces have")
+            images = {
+                leaf.name: {
+                    channel.id: self._topics.get(f"{channel.topic.removesuffix('/step')}/image/{leaf.name}", 0)
+                    for channel in steps
+                }
+                for leaf in self._layout.images
+            }
+            self._columns = ColumnReader(self._layout, self._store, images)
+
+    # ---- facts
+
+    @property
+    def uuid(self) -> str:
+        """32 hex digits, made when the recording was."""
+        return self.metadata["uuid"]
+
+    @property
+    def benchmark_id(self) -> str:
+        """The id of the benchmark; empty if there is none."""
+        return self.metadata.get("benchmark_id", "")
+
+    @property
+    def created_ns(self) -> int:
+        """Wall clock (ns) when the recording was made."""
+        text = self.metadata.get("created_ns", "0")
+        return int(text) if text.isdecimal() else 0
+
+    @property
+    def layout(self) -> StepLayout:
+        """The layout of the steps; RecordingError if there is none yet."""
+        if self._layout is None:
+            raise RecordingError(f"{self.name} has no step yet, so its spaces are not known; record a step first")
+        return self._layout
+
+    @property
+    def observation_space(self) -> gym.Space[Any]:
+        return self.layout.observation_space
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        return self.layout.action_space
+
+    @property
+    def num_envs(self) -> int:
+        """Sub-environments; 1 for a single environment."""
+        return len(self._step_channels)
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of all episodes."""
+        return int(self.index["length"].sum())
+
+    @property
+    def episodes(self) -> Episodes:
+        """The episodes, lazily: length, indexing, slicing, iteration."""
+        return Episodes(self)
+
+    @property
+    def attachments(self) -> Mapping[str, AttachmentInfo]:
+        """The attachments, the episode index left out."""
+        return {
+            name: AttachmentInfo(name, a.media_type, a.data_size) for name, a in self._contents.attachments.items()
+        }
+
+    def read_attachment(self, name: str) -> bytes:
+        """An attachment's bytes, its CRC checked."""
+        if name not in self._contents.attachments:
+            known = ", ".join(self._contents.attachments) or "none"
+            raise RecordingError(f"{self.name} has no attachment {name!r}; it has {known}")
+        return read_attachment(self._source, self._contents.attachments[name])
+
+    @property
+    def benchmark(self) -> RecordedBenchmark:
+        """The environment that was recorded, as data; `make_env()` rebuilds it."""
+        if "benchmark.json" not in self._contents.attachments:
+            raise RecordingError(f"{self.name} carries no environment; load its benchmark from the storage it is in")
+        pickle = None
+        if "env.cloudpickle" in self._contents.attachments:
+            pickle = self.read_attachment("env.cloudpickle")
+        where = f"{self.name}: benchmark.json"
+        record = EnvironmentRecord.from_json(self.read_attachment("benchmark.json"), pickle, where=where)
+        return RecordedBenchmark(self.benchmark_id, record)
+
+    # ---- episodes
+
+    def episode_metadata(self, i: int) -> dict[str, Any]:
+        """The metadata of episode `i`."""
+        value = jsonvalue.loads(self._contents.index.metadata_text(i))
+        if not isinstance(value, dict):
+            raise FormatError(f"{self.name}: episode {i} expected metadata as a JSON object, found {value!r:.80}")
+        return value
+
+    def all_metadata(self) -> list[str]:
+        """The metadata of all episodes as JSON texts; "{}" where there is none."""
+        return [self._contents.index.metadata_text(i) for i in range(len(self.index))]
+
+    def episode_start(self, i: int) -> EpisodeStart:
+        """The `/episode_start` message of episode `i`."""
+        row = self.index[i]
+        (body,) = self._store.bodies(self._topics["/episode_start"], int(row["start_row"]), 1)
+        start = EpisodeStart.decode(body)
+        if start.episode != row["episode"]:
+            raise FormatError(f"{self.name}: expected the start of episode {row['episode']}, found {start.episode}")
+        return start
+
+    def final_state(self, i: int) -> Any:
+        """The final state of episode `i`, nested as the observation space; None if it is not known."""
+        (values,) = self._finals(self.index[i : i + 1])
+        if values is None:
+            return None
+        return self.layout.nest_state([values[leaf.name] for leaf in self.layout.state])
+
+    def _finals(self, rows: Any) -> list[dict[str, Any] | None]:
+        return self._reader.final_states(self._topics["/final_state"], rows)
+
+    @property
+    def _reader(self) -> ColumnReader:
+        if self._columns is None:
+            raise RecordingError(f"{self.name} has no step yet; record a step first")
+        return self._columns
+
+    def infos(self, i: int) -> list[dict[str, Any] | None] | None:
+        """The recorded infos of episode `i`, one a step; None if the recording has none."""
+        channel = self._topics.get("/info")
+        if channel is None:
+            return None
+        if self._infos is None:
+            decoder = InfoDecoder(self._contents.channels[channel].metadata)
+            found: dict[int, dict[int, dict[str, Any]]] = {}
+            for body in self._store.bodies(channel, 0, self._store.count(channel)):
+                episode, step, info = decoder.decode(body)
+                found.setdefault(episode, {})[step] = info
+            self._infos = found
+        row = self.index[i]
+        steps = self._infos.get(int(row["episode"]), {})
+        return [steps.get(step) for step in range(int(row["length"]))]
+
+    # ---- columns
+
+    def read(
+        self,
+        episodes: Sequence[int] | None = None,
+        fields: Sequence[str] | None = None,
+        threads: int | None = None,
+    ) -> Columns:
+        """Columns of the given episodes (all by default), one after another in the order given.
+
+        Args:
+            episodes: positions in `self.episodes`.
+            fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states"; the first five by
+                default.
+            threads: how many threads decompress; by default as many as there are cores, at most 4.
+
+        Where an episode's final state is not known, `next_states` repeats its last state.
+        """
+        fields = FIELDS[:5] if fields is None else list(fields)
+        rows = self.index
+        if episodes is not None:
+            chosen = np.asarray(episodes, dtype=np.int64)
+            if len(chosen) and (chosen.min() < 0 or chosen.max() >= len(rows)):
+                raise RecordingError(f"{self.name}: expected episodes from 0 to {len(rows) - 1}, found {episodes!r:.100}")
+            rows = rows[chosen]
+        lengths = rows["length"].astype(np.int64)
+        total = int(lengths.sum())
+        limit = sum(self._store.count(channel) for channel in self._step_channels)
+        if episodes is None and total > limit:
+            raise FormatError(f"{self.name}: the episode index names {total} steps, the chunks hold {limit}")
+        columns = Columns(lengths)
+        if self._layout is None:
+            return columns
+        threads = threads or min(4, os.cpu_count() or 1)
+        keep = episodes is not None
+        needed = [field for field in fields if field != "next_states"]
+        if "next_states" in fields and "states" not in needed:
+            needed.append("states")
+        found = self._reader.read(runs_of(rows, self._step_channels), total, needed, threads, keep)
+        if "next_states" in fields:
+            columns.next_states = self._next_states(found["states"], rows, lengths)
+        for field in fields:
+            if field in found:
+                setattr(columns, field, found[field])
+        return columns
+
+    def _next_states(self, states: Any, rows: Any, lengths: Any) -> Any:
+        finals = self._finals(rows)
+        layout = self.layout
+        ends = np.cumsum(lengths) - 1
+        known = [(int(end), values) for end, values in zip(ends, finals, strict=True) if values is not None]
+        columns = []
+        for leaf in layout.state:
+            column = leaf.get(states)
+            if isinstance(column, list):
+                shifted: Any = column[1:] + column[-1:]
+            else:
+                shifted = np.concatenate([column[1:], column[-1:]])
+            for end in ends[[values is None for values in finals]] if len(ends) else []:
+                shifted[end] = column[end]
+            if known and not isinstance(shifted, list):
+                shifted[[end for end, _ in known]] = np.array([values[leaf.name] for _, values in known], shifted.dtype)
+            else:
+                for end, values in known:
+                    shifted[end] = values[leaf.name]
+            columns.append(shifted)
+        return layout.nest_state(columns)
+
+    def close(self) -> None:
+        """Closes the file; what was read stays valid."""
+        self._source.close()
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def __repr__(self) -> str:
+        state = "" if self.complete else ", recovered"
+        return f"<Recording {self.name}: {len(self.index)} episodes, {self.num_steps} steps{state}>"
+
+

@@ -1,0 +1,224 @@
+"""Rows of constant size in the journal, and their way into chunks.
+
+`SingleRows` holds the steps of one environment, `ImageRows` the images of one leaf.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.messages.encoder import Cursor, ImageSink, make_row_encoder
+from tupli_mcap.messages.exact import exact_array
+from tupli_mcap.messages.layout import BODY, ImageLayout, RECORD_HEADER, CDR_HEADER
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.container import Rows
+from tupli_mcap.recording.journal import RowArea
+
+__all__ = ["ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
+
+Array = np.ndarray[Any, Any]
+Sink = Callable[[Rows], None]
+
+
+def rows_per_half(row_size: int, chunk_size: int) -> int:
+    """Rows that make a chunk of about `chunk_size` bytes, at least one."""
+    return max(1, chunk_size // row_size)
+
+
+class RowDeriver:
+    """Fills what `step()` left out: `step`, a `log_time` that never decreases, `publish_time`.
+
+    It carries the running episode from one batch of rows of a channel to the next.
+    """
+
+    def __init__(self, episode: int = -1, step: int = -1, time_ns: int = 0) -> None:
+        self._episode = episode
+        self._step = step
+        self._time = time_ns
+
+    def fill(self, rows: Array) -> None:
+        """Completes consecutive rows in place."""
+        n = len(rows)
+        if not n:
+            return
+        times = rows["#log_time"].astype(np.uint64)
+        times[0] = max(int(times[0]), self._time)
+        np.maximum.accumulate(times, out=times)
+        rows["#log_time"] = times
+        rows["#publish_time"] = times
+        episodes = rows["episode"].astype(np.int64)
+        index = np.arange(n)
+        starts = np.zeros(n, dtype=np.int64)
+        starts[1:] = np.where(episodes[1:] != episodes[:-1], index[1:], 0)
+        np.maximum.accumulate(starts, out=starts)
+        steps = index - starts
+        if episodes[0] == self._episode:
+            first = int(np.searchsorted(starts, 1))
+            steps[:first] += self._step + 1
+        rows["step"] = steps
+        self._episode, self._step, self._time = int(episodes[-1]), int(steps[-1]), int(times[-1])
+
+
+def even_rows(channel: int, first: int, data: Any, rows: Array) -> Rows:
+    """`Rows` of constant size: `rows` is the structured view of `data`."""
+    offsets = np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.dtype.itemsize)
+    return Rows(channel, first, data, offsets, rows["#log_time"].astype(np.uint64))
+
+
+class SingleRows:
+    """The step rows of one environment.
+
+    `put` and `put_state` are the generated encoders; `channel` is the MCAP channel, `sink` takes full chunks.
+    """
+
+    def __init__(
+        self,
+        layout: StepLayout,
+        area: RowArea,
+        buffer: memoryview,
+        channel: int,
+        sink: Sink,
+        images: list[ImageSink],
+        first: int = 0,
+        deriver: RowDeriver | None = None,
+    ) -> None:
+        self._layout = layout
+        self._dtype = layout.step_message.dtype
+        self._area = area
+        self._buffer = buffer
+        self._channel = channel
+        self._sink = sink
+        self._half = 0
+        self._flushed = 0  # rows of the running half that are in the file
+        self._deriver = deriver or RowDeriver()
+        self.cursor = Cursor()
+        self.cursor.sequence = first
+        self.cursor.end = area.rows * area.row_size
+        self._header = layout.step_message.header(channel)
+        encoder = make_row_encoder(layout, buffer, self.cursor, images, self._switch)
+        self.put = encoder.put
+        self.put_state = encoder.put_state
+        self._state_end = encoder.state_end
+        self.begin_episode(0)
+
+    @property
+    def count(self) -> int:
+        """Rows of the channel so far, those of earlier sessions included."""
+        return self.cursor.sequence
+
+    def begin_episode(self, episode: int) -> None:
+        """The rows that follow belong to `episode`."""
+        self.cursor.prefix = self._header + episode.to_bytes(4, "little") + bytes(4)
+        self.cursor.total = 0.0
+        start = self.cursor.offset
+        self._buffer[start : start + len(self.cursor.prefix)] = self.cursor.prefix
+
+    def pending_state(self) -> bytes:
+        """The CDR bytes of the running row's state, as they follow `episode` and `env` in `/final_state`."""
+        start = self.cursor.offset
+        return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
+
+    def _switch(self) -> None:
+        """The half is full: go on in the other one, then write this one as a chunk."""
+        area, half = self._area, self._half
+        spare = half * area.half + area.rows * area.row_size
+        self._half = 1 - half
+        start = self._half * area.half
+        self._buffer[start : start + self._state_end] = self._buffer[spare : spare + self._state_end]
+        flushed, self._flushed = self._flushed, 0
+        self.cursor.offset, self.cursor.end = start, start + area.rows * area.row_size
+        self._emit(half * area.half, flushed, area.rows, self.cursor.sequence - area.rows + flushed)
+
+    def flush(self) -> None:
+        """Writes the rows of the running half that are not in the file yet."""
+        start = self._half * self._area.half
+        rows = (self.cursor.offset - start) // self._area.row_size
+        flushed, self._flushed = self._flushed, rows
+        self._emit(start, flushed, rows, self.cursor.sequence - rows + flushed)
+
+    def _emit(self, start: int, begin: int, end: int, first: int) -> None:
+        if begin == end:
+            return
+        size = self._area.row_size
+        data = self._buffer[start + begin * size : start + end * size]
+        rows = np.frombuffer(data, self._dtype)
+        self._deriver.fill(rows)
+        self._sink(even_rows(self._channel, first, data, rows))
+
+
+class ImageRows:
+    """The images of one leaf: row j is the state of step j, so the running row is always one ahead of the steps."""
+
+    def __init__(
+        self, leaf: Leaf, layout: ImageLayout, area: RowArea, buffer: memoryview, channel: int, sink: Sink, first: int = 0
+    ) -> None:
+        self._leaf = leaf
+        self._area = area
+        self._buffer = buffer
+        self._channel = channel
+        self._sink = sink
+        self._sequence = first
+        self._row = 0
+        self._half = 0
+        self._flushed = 0
+        self._time = 0
+        dtype = layout.dtype
+        self._rows: Array = np.frombuffer(buffer, dtype).reshape(2, area.rows + 1)
+        self._rows["fixed"] = np.frombuffer(layout.body[8:], np.uint8)
+        record = RECORD_HEADER.pack(5, dtype.itemsize - 9, channel, 0, 0, 0) + CDR_HEADER
+        template = np.frombuffer(record + bytes(dtype.itemsize - len(record)), dtype)[0]
+        for name in ("#opcode", "#length", "#channel", "#cdr"):
+            self._rows[name] = template[name]
+        self._data: Array = self._rows["data"]
+        self._uint8 = np.dtype(np.uint8)
+
+    def check(self, value: Any) -> Array:
+        """`value` as an image of the leaf's shape; StepError if it is none."""
+        if type(value) is np.ndarray and value.dtype is self._uint8 and value.shape == self._leaf.shape:
+            return value
+        return exact_array(value, self._uint8, self._leaf.shape, self._leaf.path)
+
+    def put(self, image: Array) -> None:
+        """Writes the image of the state that follows the running row's."""
+        self._advance()
+        self.put_first(image)
+
+    def put_first(self, image: Array) -> None:
+        """Overwrites the running row: the image of a reset."""
+        self._data[self._half, self._row] = image
+        self._time = now = max(time.time_ns(), self._time)
+        row = self._rows[self._half, self._row]
+        row["#log_time"] = row["#publish_time"] = now
+        row["sec"], row["nanosec"] = divmod(now, 10**9)
+        row["#sequence"] = self._sequence
+
+    def pending(self) -> bytes:
+        """The running row's image."""
+        return self._data[self._half, self._row].tobytes()
+
+    def _advance(self) -> None:
+        self._row += 1
+        self._sequence += 1
+        if self._row < self._area.rows:
+            return
+        half, rows, flushed = self._half, self._area.rows, self._flushed
+        self._half, self._row, self._flushed = 1 - half, 0, 0
+        self._emit(half, flushed, rows, self._sequence - rows + flushed)
+
+    def flush(self) -> None:
+        """Writes the rows before the running one."""
+        flushed, self._flushed = self._flushed, self._row
+        self._emit(self._half, flushed, self._row, self._sequence - self._row + flushed)
+
+    def _emit(self, half: int, begin: int, end: int, first: int) -> None:
+        if begin == end:
+            return
+        size = self._area.row_size
+        start = half * self._area.half
+        data = self._buffer[start + begin * size : start + end * size]
+        self._sink(even_rows(self._channel, first, data, np.frombuffer(data, self._rows.dtype)))

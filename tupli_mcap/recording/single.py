@@ -1,0 +1,153 @@
+"""Episodes of one environment: from resets and steps to rows, starts and ends."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.messages.exact import check_structure, decide_dtype, exact_array, leaf_value
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.events import INTERRUPTED
+from tupli_mcap.recording.infos import InfoRecorder
+from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
+
+__all__ = ["SingleRecorder", "decide_layout"]
+
+Put = Callable[[Any, Any, Any, Any, Any], None]
+
+
+def decide_layout(
+    spaces: StepLayout, states: list[Any], actions: list[Any], rewards: list[Any], recorded: StepLayout | None
+) -> StepLayout:
+    """The layout of a recording from its first values; on append, the one the file has.
+
+    Raises:
+        StepError: a value whose structure, shape or kind differs from its space.
+    """
+    if recorded is not None:
+        return recorded
+    dtypes = {}
+    for leaves, roots in ((spaces.state, states), (spaces.action, actions), (spaces.reward, rewards)):
+        for leaf in leaves:
+            if leaf.dtype is None:
+                continue
+            values = [leaf_value(root, leaf) for root in roots]
+            default_reward = leaf.name == "reward" and spaces.reward_space is None
+            dtype = leaf.dtype if default_reward or leaf.kind == "image" else decide_dtype(leaf, values)
+            for value in values:
+                exact_array(value, dtype, leaf.shape, leaf.path)
+            dtypes[leaf.name] = dtype
+    return StepLayout(spaces.observation_space, spaces.action_space, spaces.reward_space, dtypes)
+
+
+class SingleRecorder:
+    """Records one environment's episodes. `put` is the function to call with each step; it changes as episodes go by."""
+
+    def __init__(
+        self,
+        writer: RecordingWriter,
+        spaces: StepLayout,
+        infos: InfoRecorder | None = None,
+    ) -> None:
+        self._writer = writer
+        self._spaces = spaces
+        self._infos = infos
+        self._reset: tuple[Any, ResetFacts] | None = None
+        self._episode: StartedEpisode | None = None
+        self.put: Put = self._unreset
+
+    def reset(self, state: Any, facts: ResetFacts, metadata: str = "{}") -> None:
+        """Starts an episode at `state`; a running one ends as interrupted, with `metadata`.
+
+        Raises:
+            StepError: the state cannot be stored exactly.
+        """
+        self.end(INTERRUPTED, metadata)
+        rows = self._writer.rows
+        if rows is None:
+            for leaf in self._spaces.state:
+                check_structure(state, leaf)
+            self._reset = (copy.deepcopy(state), facts)
+            self.put = self._first
+            return
+        self.put = self._unreset
+        rows.begin_episode(self._writer.next_episode)
+        rows.put_state(state)
+        self._episode = self._writer.start_episode(0, rows.count, facts)
+        self.put = rows.put
+
+    def end(self, end: int, metadata: str = "{}") -> None:
+        """Ends the running episode; an episode without a step is dropped."""
+        episode, rows = self._episode, self._writer.rows
+        self._episode = None
+        if episode is None or rows is None:
+            return
+        length = rows.count - episode.first_row
+        if length == 0:
+            self._writer.drop_start(episode)
+            return
+        total = rows.cursor.total if hasattr(rows, "cursor") else rows.total
+        final = rows.pending_state() + b"".join(sinks[0].pending() for sinks in self._writer.images)
+        self._writer.end_episode(episode, end, length, total, final, metadata)
+        self.put = self._continue
+
+    def refuse(self) -> None:
+        """After a step that could not be stored: the episode ends before it, and a reset must follow."""
+        self.end(INTERRUPTED)
+        self.put = self._refused
+
+    @property
+    def step_index(self) -> int:
+        """Steps of the running episode so far."""
+        if self._episode is None or self._writer.rows is None:
+            return 0
+        return self._writer.rows.count - self._episode.first_row
+
+    def put_info(self, info: Mapping[str, Any]) -> None:
+        """Records the info of the step just put."""
+        if self._infos is not None and self._episode is not None:
+            self._infos.put(self._writer, self._episode.number, self.step_index - 1, info)
+
+    def _first(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
+        if self._reset is None:
+            raise StepError("expected a reset before the first step; call env.reset()")
+        first, facts = self._reset
+        layout = decide_layout(self._spaces, [first, state], [action], [reward], self._writer.layout)
+        schema = None if self._infos is None else self._infos.schema()
+        self._writer.begin(layout, 1, vector=False, info_schema=schema)
+        self._reset = None
+        self.reset(first, facts)
+        self.put(action, state, reward, terminal, timeout)
+
+    def _continue(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
+        """A step after an end, without a reset: another episode, which starts at the last one's final state."""
+        rows = self._writer.rows
+        if rows is None:
+            raise StepError("expected a reset before the first step; call env.reset()")
+        rows.begin_episode(self._writer.next_episode)
+        facts = ResetFacts(None, None, "", "{}", 0, continued=True)
+        self._episode = self._writer.start_episode(0, rows.count, facts)
+        self.put = rows.put
+        rows.put(action, state, reward, terminal, timeout)
+
+    def _unreset(self, *_: Any) -> None:
+        raise StepError("expected a reset before the first step; call env.reset()")
+
+    def _refused(self, *_: Any) -> None:
+        raise StepError("the step before this one could not be recorded; call env.reset() to go on with a new episode")
+
+    def close(self, metadata: str = "{}") -> None:
+        """Ends the running episode as interrupted and closes the recording."""
+        if self._writer.closed:
+            return
+        try:
+            if self._writer.failed is None:
+                self.end(INTERRUPTED, metadata)
+        finally:
+            self.put = self._closed
+            self._writer.close()
+
+    def _closed(self, *_: Any) -> None:
+        raise self._writer.failed or RecordingError(f"{self._writer.path} is closed; wrap the environment again to record")

@@ -1,0 +1,116 @@
+"""Where a recording's bytes come from: a local path, an open binary file, or a URL read by ranges."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
+
+__all__ = ["Source", "open_source"]
+
+
+class Source(Protocol):
+    """Random access; `read` is safe from several threads."""
+
+    name: str
+    path: Path | None
+    size: int
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Exactly `length` bytes, or FormatError."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class PathSource:
+    """A local file, read with positioned reads."""
+
+    def __init__(self, path: Path) -> None:
+        self.path: Path | None = path
+        self.name = str(path)
+        try:
+            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError as err:
+            raise RecordingError(f"{path} does not exist; give the path of a recording (.mcap)") from err
+        except OSError as err:
+            raise RecordingError(f"{path} cannot be opened: {err.strerror}") from err
+        self.size = os.fstat(self._fd).st_size
+        if path.is_dir():
+            self.close()
+            raise RecordingError(f"{path} is a directory; give a recording (.mcap), or open it as a FileStorage")
+
+    def read(self, offset: int, length: int) -> bytes:
+        if self._fd < 0:
+            raise RecordingError(f"{self.name} is closed; open it again with Recording(...)")
+        data = os.pread(self._fd, length, offset) if offset + length <= self.size else b""
+        if len(data) != length:
+            raise FormatError(
+                f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
+            )
+        return data
+
+    def close(self) -> None:
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def __del__(self) -> None:
+        with contextlib.suppress(AttributeError):
+            self.close()
+
+
+class FileSource:
+    """An open, seekable binary file; it is not closed unless it is ours."""
+
+    def __init__(self, file: BinaryIO, name: str, *, owned: bool) -> None:
+        self.path: Path | None = None
+        self.name = name
+        self._file = file
+        self._owned = owned
+        self._lock = threading.Lock()
+        try:
+            self.size = file.seek(0, os.SEEK_END)
+        except (OSError, ValueError, AttributeError) as err:
+            raise RecordingError(f"{name}: expected a seekable binary file, found {file!r}") from err
+
+    def read(self, offset: int, length: int) -> bytes:
+        if offset + length > self.size:
+            raise FormatError(f"{self.name}: expected {length} bytes at offset {offset}, found the end at {self.size}")
+        with self._lock:
+            self._file.seek(offset)
+            data = self._file.read(length)
+        if len(data) != length:
+            raise FormatError(f"{self.name}: expected {length} bytes at offset {offset}, found {len(data)}")
+        return data
+
+    def close(self) -> None:
+        if self._owned:
+            self._file.close()
+
+
+def open_source(source: str | os.PathLike[str] | BinaryIO) -> Source:
+    """A Source for a path, an URL (`https://…`, `s3://…`, through fsspec) or an open binary file."""
+    if isinstance(source, str) and "://" in source:
+        return _open_url(source)
+    if isinstance(source, str | os.PathLike):
+        return PathSource(Path(source))
+    if not hasattr(source, "read") or not hasattr(source, "seek"):
+        raise RecordingError(f"expected a path, a URL or a seekable binary file, found {source!r}")
+    return FileSource(source, str(getattr(source, "name", "<file>")), owned=False)
+
+
+def _open_url(url: str) -> Source:
+    try:
+        import fsspec
+    except ImportError as err:
+        raise MissingExtraError(f"reading {url} needs fsspec; pip install 'tupli-mcap[remote]'") from err
+    try:
+        file: Any = fsspec.open(url, "rb", block_size=1 << 18, cache_type="readahead").open()
+    except Exception as err:  # each of fsspec's file systems raises errors of its own
+        raise RecordingError(f"{url} cannot be opened: {err}; check the address and your rights") from err
+    return FileSource(file, url, owned=True)

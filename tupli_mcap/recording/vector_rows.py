@@ -1,0 +1,150 @@
+"""Step rows of a vector environment: a batch is written by whole-array assignment, one block of rows a sub-environment.
+
+A sub-environment that took no step in a batch (the ignored step of next-step autoreset) leaves a hole, recognised by
+its sequence; holes are squeezed out when the rows go to the file.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.messages.exact import exact_array, leaf_value
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.journal import RowArea
+from tupli_mcap.recording.rows import Array, RowDeriver, Sink, even_rows
+
+__all__ = ["HOLE", "VectorRows"]
+
+HOLE = 0xFFFFFFFF
+
+
+class VectorRows:
+    """The step rows of `channels` sub-environments. Arrays given to `put` have the sub-environments first."""
+
+    def __init__(
+        self,
+        layout: StepLayout,
+        area: RowArea,
+        buffer: memoryview,
+        channels: Sequence[int],
+        sink: Sink,
+        counts: Array,
+        derivers: Sequence[RowDeriver] | None = None,
+    ) -> None:
+        message = layout.step_message
+        self._layout = layout
+        self._area = area
+        self._sink = sink
+        self._channels = list(channels)
+        n = len(channels)
+        self._rows: Array = np.frombuffer(buffer, message.dtype).reshape(2, n, area.rows + 1)
+        header = np.frombuffer(message.header(0) + bytes(message.body_size), message.dtype)[0]
+        for name in ("#opcode", "#length", "#cdr"):
+            self._rows[name] = header[name]
+        self._rows["#channel"] = np.asarray(channels, dtype=np.uint16)[None, :, None]
+        self._rows["#sequence"] = HOLE
+        self._derivers = list(derivers) if derivers else [RowDeriver() for _ in channels]
+        self.counts = counts  # rows of each channel so far
+        self._half = 0
+        self._row = 0
+        self._flushed = 0
+        self._state = [self._writer(leaf) for leaf in layout.state if leaf.kind != "image"]
+        self._action = [self._writer(leaf) for leaf in layout.action]
+        self._reward = [self._writer(leaf) for leaf in layout.reward]
+        self._flags = (self._rows["terminal"], self._rows["timeout"])
+        self._episode = self._rows["episode"]
+        self._time = self._rows["#log_time"]
+        self._sequence = self._rows["#sequence"]
+        self._state_bytes: Array = (
+            np.frombuffer(buffer, np.uint8).reshape(2, n, area.rows + 1, area.row_size)
+        )
+        ends = [message.offset(f.name) + f.nbytes for f in message.fields if f.name in {leaf.name for leaf in layout.state}]
+        self._state_end = BODY + max(ends, default=8)
+
+    def _writer(self, leaf: Leaf) -> tuple[Leaf, Array | None, np.dtype[Any], tuple[int, ...]]:
+        view = None if leaf.size == 0 else self._rows[leaf.name]
+        return leaf, view, self._layout.dtypes[leaf.name], (len(self._channels), *leaf.shape)
+
+    def _store(self, fields: Sequence[Any], root: Any, row: int) -> None:
+        for leaf, view, dtype, shape in fields:
+            value = leaf_value(root, leaf) if leaf.keys else root
+            if not (value.__class__ is np.ndarray and value.dtype == dtype and value.shape == shape):
+                value = exact_array(value, dtype, shape, leaf.path)
+            if view is not None:
+                view[self._half, :, row] = value
+
+    def check(self, state: Any) -> None:
+        """Raises StepError if a batch of states cannot be stored."""
+        for leaf, _, dtype, shape in self._state:
+            exact_array(leaf_value(state, leaf), dtype, shape, leaf.path)
+
+    def put_state(self, state: Any, mask: Array | None = None) -> None:
+        """The states of a reset: of all sub-environments, or of those in `mask`."""
+        for leaf, view, dtype, shape in self._state:
+            value = exact_array(leaf_value(state, leaf), dtype, shape, leaf.path)
+            if view is None:
+                continue
+            if mask is None:
+                view[self._half, :, self._row] = value
+            else:
+                view[self._half, mask, self._row] = value[mask]
+
+    def put(
+        self, action: Any, state: Any, reward: Any, terminal: Array, timeout: Array, episodes: Array, active: Array | None
+    ) -> None:
+        """Writes a batch; `active` None: every sub-environment took a step, `episodes` numbers theirs."""
+        half, row = self._half, self._row
+        self._store(self._action, action, row)
+        self._store(self._reward, reward, row)
+        self._flags[0][half, :, row] = terminal
+        self._flags[1][half, :, row] = timeout
+        self._store(self._state, state, row + 1)
+        self._episode[half, :, row] = episodes
+        self._time[half, :, row] = time.time_ns()
+        if active is None:
+            self._sequence[half, :, row] = self.counts
+            self.counts += 1
+        else:
+            self._sequence[half, :, row] = np.where(active, self.counts, HOLE)
+            self.counts += active
+        self._row = row + 1
+        if self._row == self._area.rows:
+            self._switch()
+
+    def pending_state(self, i: int) -> bytes:
+        """The CDR bytes of a sub-environment's running state, as they follow `episode` and `env` in `/final_state`."""
+        data: bytes = self._state_bytes[self._half, i, self._row, BODY + 8 : self._state_end].tobytes()
+        return data
+
+    def _switch(self) -> None:
+        half, rows, flushed = self._half, self._area.rows, self._flushed
+        self._half = 1 - half
+        end = self._state_end
+        self._state_bytes[self._half, :, 0, BODY:end] = self._state_bytes[half, :, rows, BODY:end]
+        self._row = self._flushed = 0
+        self._emit(half, flushed, rows)
+
+    def flush(self) -> None:
+        """Writes the rows of the running half that are not in the file yet."""
+        flushed, self._flushed = self._flushed, self._row
+        self._emit(self._half, flushed, self._row)
+
+    def _emit(self, half: int, begin: int, end: int) -> None:
+        if begin == end:
+            return
+        for i, channel in enumerate(self._channels):
+            rows = self._rows[half, i, begin:end]
+            kept = rows["#sequence"] != HOLE
+            if not kept.all():
+                rows = rows[kept]
+            if len(rows):
+                self._derivers[i].fill(rows)
+                data = np.ascontiguousarray(rows).view(np.uint8)
+                self._sink(even_rows(channel, int(rows["#sequence"][0]), data, rows))
+

@@ -1,0 +1,384 @@
+"""One recording being written: the file, its journal, its channels and its episodes.
+
+The wrappers' recorders (`single`, `vector`) put steps into the row stores made here; everything that happens once an
+episode or once a chunk is in this module. Not thread-safe.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+import uuid
+import weakref
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
+from tupli_mcap.messages.layout import IMAGE_SCHEMA
+from tupli_mcap.recording.container import Container, Rows
+from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
+from tupli_mcap.recording.journal import Area, Journal, LogArea, RowArea, journal_path
+from tupli_mcap.recording.lock import FileLock
+from tupli_mcap.recording.logs import EventLog, StepLog
+from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows, rows_per_half
+from tupli_mcap.recording.vector_rows import VectorRows
+
+__all__ = ["FORMAT_VERSION", "RECORDING_METADATA", "Mode", "RecordingWriter", "WriterOptions"]
+
+FORMAT_VERSION = "1"
+RECORDING_METADATA = "tupli_mcap.recording"
+Mode = Literal["x", "w", "a"]
+LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
+
+
+class WriterOptions(NamedTuple):
+    """How to write: `chunk_size` in bytes before compression, `flush_seconds` None flushes by size only."""
+
+    compression: str = "zstd"
+    mode: Mode = "x"
+    benchmark_id: str = ""
+    attachments: Mapping[str, tuple[str, bytes]] | None = None
+    journal_dir: str | os.PathLike[str] | None = None
+    chunk_size: int = 512 * 1024
+    flush_seconds: float | None = None
+
+
+class Channels(NamedTuple):
+    """MCAP channel ids."""
+
+    steps: list[int]
+    images: list[list[int]]  # by image leaf, then by sub-environment
+    final_state: int
+    start: int
+    end: int
+    info: int | None
+
+
+_live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
+
+
+class RecordingWriter:
+    """Writes one recording; `begin` is called at the first step, when the layout is known."""
+
+    def __init__(self, path: str | os.PathLike[str], options: WriterOptions) -> None:
+        self.path = Path(path)
+        self.options = options
+        self.closed = False
+        self.failed: RecordingError | None = None
+        self.layout: StepLayout | None = None
+        self.index = IndexBuilder()
+        self.next_episode = 0
+        self.journal: Journal | None = None
+        self.rows: SingleRows | StepLog | None = None
+        self.vector: VectorRows | list[StepLog] | None = None
+        self.images: list[list[ImageRows]] = []
+        self.events: EventLog | None = None
+        self.infos: EventLog | None = None
+        self.num_envs = 1
+        self.uuid = uuid.uuid4().hex
+        self._flushed_at = time.monotonic()
+        self.lock = FileLock(self.path, options.mode)
+        try:
+            self._open()
+        except BaseException:
+            self.lock.release()
+            if options.mode == "x":
+                with contextlib.suppress(OSError):
+                    self.path.unlink()
+            raise
+        _live.add(self)
+
+    def _open(self) -> None:
+        self.container = Container(self.lock.fd, str(self.path), self.options.compression)
+        if self.options.mode == "a" and self.path.stat().st_size:
+            from tupli_mcap.recording.append import resume
+
+            resume(self)
+            return
+        os.ftruncate(self.lock.fd, 0)
+        now = time.time_ns()
+        values = {
+            "uuid": self.uuid,
+            "format_version": FORMAT_VERSION,
+            "library": f"tupli-mcap {version('tupli-mcap')}",
+            "created_ns": str(now),
+            "benchmark_id": self.options.benchmark_id,
+        }
+        if self.options.journal_dir is not None:
+            values["journal"] = str(journal_path(self.path, self.options.journal_dir).resolve())
+        self.container.start(values["library"])
+        self.container.add_metadata(RECORDING_METADATA, values)
+        for name, (media_type, data) in (self.options.attachments or {}).items():
+            self.container.add_attachment(name, media_type, data, now)
+
+    # ---- the first step
+
+    def begin(
+        self, layout: StepLayout, num_envs: int, *, vector: bool, info_schema: tuple[str, Mapping[str, str]] | None = None
+    ) -> None:
+        """Fixes the layout: registers the channels, makes the journal and the row stores."""
+        self.layout = layout
+        self.num_envs = num_envs
+        self.is_vector = vector
+        self.channels = self._register(layout, info_schema)
+        self._make_stores(self._areas())
+
+    def _register(self, layout: StepLayout, info: tuple[str, Mapping[str, str]] | None) -> Channels:
+        known = {channel.topic: channel.id for channel in self.container.channels.values()}
+        schemas = {schema.name: schema.id for schema in self.container.schemas.values()}
+
+        def channel(topic: str, schema_name: str, text: str, metadata: Mapping[str, str]) -> int:
+            if topic in known:
+                return known[topic]
+            if schema_name not in schemas:
+                schemas[schema_name] = self.container.add_schema(schema_name, text)
+            return self.container.add_channel(topic, schemas[schema_name], metadata)
+
+        description = layout.to_metadata()
+        tops = [f"/env_{i}" for i in range(self.num_envs)] if self.is_vector else [""]
+        steps = [
+            channel(f"{top}/step", STEP_SCHEMA, layout.step_schema, {**description, "env": str(i)})
+            for i, top in enumerate(tops)
+        ]
+        images = [
+            [
+                channel(f"{top}/image/{leaf.name}", "sensor_msgs/msg/Image", IMAGE_SCHEMA, {"env": str(i), "leaf": leaf.name})
+                for i, top in enumerate(tops)
+            ]
+            for leaf in layout.images
+        ]
+        return Channels(
+            steps,
+            images,
+            channel("/final_state", FINAL_STATE_SCHEMA, layout.final_schema, description),
+            channel("/episode_start", EpisodeStart.SCHEMA_NAME, EpisodeStart.SCHEMA, {}),
+            channel("/episode_end", EpisodeEnd.SCHEMA_NAME, EpisodeEnd.SCHEMA, {}),
+            None if info is None else channel("/info", "tupli_mcap/msg/Info", info[0], info[1]),
+        )
+
+    def _areas(self, step_capacity: int = 0) -> list[Area]:
+        assert self.layout is not None
+        n, size = self.num_envs, self.options.chunk_size
+        if n > 1:  # one chunk a sub-environment: smaller ones, but never below 64 KiB
+            size = max(64 * 1024, size // n)
+        areas: list[Area] = []
+        if not self.layout.constant:
+            areas += [LogArea(f"steps/{i}", max(size, step_capacity), 2) for i in range(n)]
+        else:
+            row = self.layout.step_message.record_size
+            areas.append(RowArea("steps", row, rows_per_half(row, size), n))
+        for leaf in self.layout.images:
+            row = self.layout.image_messages[leaf.name].dtype.itemsize
+            areas += [RowArea(f"{leaf.name}/{i}", row, rows_per_half(row, size)) for i in range(n)]
+        areas.append(LogArea("events", 512 * 1024))
+        if self.channels.info is not None:
+            areas.append(LogArea("info", size))
+        return areas
+
+    def _make_stores(self, areas: Sequence[Area]) -> None:
+        assert self.layout is not None
+        layout, channels = self.layout, self.channels
+        counts = self.container.counts
+        definitions = {
+            "uuid": self.uuid,
+            "vector": self.is_vector,
+            "channels": [channels.steps, channels.images, *channels[2:]],
+            "definitions": {str(c): self.container.definitions(c).hex() for c in self.container.channels},
+        }
+        self.journal = Journal(journal_path(self.path, self.options.journal_dir), list(areas), definitions)
+        by_name = self.journal.areas
+        buffer = self.journal.buffer
+        self.images = []
+        for leaf, ids in zip(layout.images, channels.images, strict=True):
+            self.images.append(
+                [
+                    ImageRows(
+                        leaf, layout.image_messages[leaf.name], by_name[f"{leaf.name}/{i}"], buffer(f"{leaf.name}/{i}"),
+                        channel, self.add_chunk, counts[channel],
+                    )  # type: ignore[arg-type]
+                    for i, channel in enumerate(ids)
+                ]
+            )  # fmt: skip
+        if not layout.constant:
+            logs = [
+                StepLog(
+                    layout, by_name[f"steps/{i}"], buffer(f"steps/{i}"), channel, self.add_chunk,
+                    [sinks[i] for sinks in self.images], counts[channel],
+                )  # type: ignore[arg-type]
+                for i, channel in enumerate(channels.steps)
+            ]  # fmt: skip
+            for log in logs:
+                log.grow = self._grow
+            if self.is_vector:
+                self.vector = logs
+            else:
+                self.rows = logs[0]
+        elif self.is_vector:
+            before = np.array([counts[c] for c in channels.steps], dtype=np.int64)
+            self.vector = VectorRows(layout, by_name["steps"], buffer("steps"), channels.steps, self.add_chunk, before)  # type: ignore[arg-type]
+        else:
+            self.rows = SingleRows(
+                layout, by_name["steps"], buffer("steps"), channels.steps[0], self.add_chunk,
+                [sinks[0] for sinks in self.images], counts[channels.steps[0]], RowDeriver(),
+            )  # type: ignore[arg-type]  # fmt: skip
+        events = {c: counts[c] for c in (channels.final_state, channels.start, channels.end)}
+        self.events = EventLog(by_name["events"], buffer("events"), self.add_chunk, events)  # type: ignore[arg-type]
+        if channels.info is not None:
+            self.infos = EventLog(by_name["info"], buffer("info"), self.add_chunk, {channels.info: counts[channels.info]})  # type: ignore[arg-type]
+
+    # ---- episodes
+
+    def start_episode(self, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
+        """Writes `/episode_start`; it is taken back by `drop_start` if no step follows."""
+        assert self.events is not None
+        seed = reset.seed if reset.seed is not None else reset.drawn_seed
+        message = EpisodeStart(
+            self.next_episode,
+            env,
+            first_row,
+            reset.seed is not None,
+            reset.continued,
+            "" if seed is None else str(seed),
+            reset.options,
+            reset.info,
+        )
+        row = self.events.sequences[self.channels.start]
+        position = self.events.append(self.channels.start, reset.time_ns, message.encode())
+        self.next_episode += 1
+        return StartedEpisode(message.episode, env, first_row, reset.time_ns, seed, row, position)
+
+    def drop_start(self, episode: StartedEpisode) -> None:
+        """Takes back the last `/episode_start`: a reset without a step is no episode."""
+        assert self.events is not None
+        self.events.rewind(episode.position, self.channels.start)
+        self.next_episode -= 1
+
+    def end_episode(
+        self, episode: StartedEpisode, end: int, length: int, total: Any, final_state: bytes | None, metadata: str
+    ) -> None:
+        """Writes `/final_state` and `/episode_end`, and the episode's row of the index."""
+        assert self.events is not None
+        now = time.time_ns()
+        total = float(total) if isinstance(total, float) else float(np.sum(total))
+        row = self.events.sequences[self.channels.end]
+        final_row = -1
+        if final_state is not None:
+            final_row = self.events.sequences[self.channels.final_state]
+            head = episode.number.to_bytes(4, "little") + episode.env.to_bytes(4, "little")
+            self.events.append(self.channels.final_state, now, head + final_state)
+        message = EpisodeEnd(
+            episode.number, episode.env, episode.first_row, length, total, end, final_state is not None, metadata
+        )
+        self.events.append(self.channels.end, now, message.encode())
+        self.index.add(
+            EpisodeRow(
+                episode.first_row, length, total, episode.start_time, now, episode.seed, episode.start_row, row,
+                final_row, episode.number, episode.env, end,
+            ),  # fmt: skip
+            metadata,
+        )
+        if self.options.flush_seconds is not None and time.monotonic() - self._flushed_at > self.options.flush_seconds:
+            self.flush()
+
+    # ---- chunks
+
+    def add_chunk(self, rows: Rows) -> None:
+        """Writes a chunk; after a failure nothing more is accepted, and the journal keeps what it holds."""
+        if self.failed is not None:
+            raise self.failed
+        if rows.first + len(rows.offsets) > LAST_ROW:
+            raise RecordingError(f"{self.path}: a channel holds at most {LAST_ROW} messages; go on in a new recording")
+        try:
+            self.container.add_chunk(rows)
+        except RecordingError as err:
+            self.failed = err
+            raise
+
+    def _step_stores(self) -> list[Any]:
+        if self.vector is None:
+            stores: list[Any] = [] if self.rows is None else [self.rows]
+        else:
+            stores = list(self.vector) if isinstance(self.vector, list) else [self.vector]
+        return stores
+
+    def flush(self) -> None:
+        """Writes everything recorded so far into chunks (the file still has no summary)."""
+        self._flushed_at = time.monotonic()
+        stores = [*self._step_stores(), *(sink for sinks in self.images for sink in sinks), self.infos, self.events]
+        for store in stores:
+            if store is not None:
+                store.flush()
+
+    def _grow(self, size: int) -> None:
+        """Makes a larger journal for steps of `size` bytes; the running states move into it."""
+        self.flush()
+        raise RecordingError(f"{self.path}: a step of {size} bytes is larger than the journal's half")
+
+    def close(self) -> None:
+        """Writes the rest, the episode index and the summary, and removes the journal."""
+        if self.closed:
+            return
+        self.closed = True
+        _live.discard(self)
+        try:
+            self.flush()
+            data = self.index.encode(self.container.chunk_rows)
+            self.container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, time.time_ns())
+            self.container.finish()
+        except BaseException:
+            if self.journal is not None:
+                self.journal.close(unlink=False)
+            raise
+        else:
+            if self.journal is not None:
+                self.journal.close(unlink=True)
+        finally:
+            self.lock.release()
+
+    def abandon(self) -> None:
+        """In a forked child: lets go of the file and its lock without writing; the parent goes on."""
+        self.closed = True
+        self.failed = RecordingError(
+            f"{self.path} is recorded by the process that opened it, not by its forked child; wrap the environment there"
+        )
+        self.lock.abandon()
+
+
+class ResetFacts(NamedTuple):
+    """What a reset was given and gave; `options` and `info` are JSON texts."""
+
+    seed: int | None
+    drawn_seed: int | None
+    options: str
+    info: str
+    time_ns: int
+    continued: bool = False
+
+
+class StartedEpisode(NamedTuple):
+    """An episode whose start is in the journal."""
+
+    number: int
+    env: int
+    first_row: int
+    start_time: int
+    seed: int | None
+    start_row: int
+    position: int
+
+
+def _abandon_all() -> None:
+    for writer in list(_live):
+        writer.abandon()
+    _live.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_abandon_all)

@@ -1,0 +1,196 @@
+"""`RecordEpisodes`: a Gymnasium wrapper that records every step of one environment."""
+
+from __future__ import annotations
+
+import copy
+import os
+import time
+import weakref
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+
+from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.episode import Step
+from tupli_mcap.recording.events import TERMINAL, TIMEOUT
+from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
+from tupli_mcap.recording.single import SingleRecorder
+from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
+from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+from tupli_mcap.wrappers.benchmark import benchmark_attachments
+
+__all__ = ["RecordEpisodes"]
+
+StepCallback = Callable[[Step], Mapping[str, Any] | None]
+
+
+class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
+    """Records the episodes of `env` into the MCAP file `path`.
+
+    Nothing the policy sees changes: the same objects are returned. A step is safe, whatever happens to the process,
+    as soon as `step()` has returned. A reset in mid-episode, `close()`, garbage collection and the end of the
+    interpreter end the running episode as "interrupted".
+
+    Args:
+        env: any environment whose spaces are Gymnasium's own.
+        path: the recording; `mode` "x" refuses to overwrite, "w" replaces, "a" continues a recording.
+        metadata_callback: called with every step (an RLTuple), returns the episode's metadata (a dict); reset after it.
+        record_info: False, True (everything), a list of names, or a function from info to what is recorded.
+        step_callback: called with every Step; returns entries to record with its info (log-probabilities, say).
+        compression: "zstd", "lz4" or "none".
+        reward_space: for rewards that are arrays.
+        benchmark_id: the benchmark the episodes belong to.
+        attachments: name -> (media type, bytes), written before the first step.
+        flush_seconds: also write a chunk when an episode ends this many seconds after the last one.
+        journal_dir: where the journal goes, if not beside the recording (a local disk for a network path).
+        chunk_size: bytes of a chunk before compression.
+
+    Raises:
+        SpaceError: a space that cannot be recorded, with the path of the leaf.
+        RecordingError: the file exists, is being written, or cannot be written.
+
+    Not thread-safe. A forked child cannot go on recording; the parent can.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        path: str | os.PathLike[str],
+        *,
+        metadata_callback: EpisodeMetadataCallback | None = None,
+        record_info: RecordInfo = False,
+        step_callback: StepCallback | None = None,
+        compression: str = "zstd",
+        mode: Mode = "x",
+        reward_space: gym.Space[Any] | None = None,
+        benchmark_id: str = "",
+        attachments: Mapping[str, tuple[str, bytes]] | None = None,
+        flush_seconds: float | None = None,
+        journal_dir: str | os.PathLike[str] | None = None,
+        chunk_size: int = 512 * 1024,
+    ) -> None:
+        super().__init__(env)
+        self.path = Path(path)
+        self._metadata_callback = metadata_callback
+        self._step_callback = step_callback
+        if attachments is None:
+            attachments = benchmark_attachments(env)
+        wanted = record_info is not False or step_callback is not None
+        infos = InfoRecorder([] if record_info is False else record_info) if wanted else None
+        self._records_info = record_info is not False
+        options = WriterOptions(
+            compression, mode, benchmark_id, attachments, journal_dir, chunk_size, flush_seconds
+        )
+        spaces = StepLayout(env.observation_space, env.action_space, reward_space)  # refused before a file is made
+        spaces.to_metadata()
+        self._writer = RecordingWriter(path, options)
+        self._recorder = SingleRecorder(self._writer, spaces, infos)
+        self._watches = metadata_callback is not None or infos is not None
+        self._metadata: list[str] = ["{}"]  # shared with the finalizer, which must not hold the wrapper
+        self._stepped = False
+        self._state: Any = None
+        self._finalizer = weakref.finalize(self, _close, self._recorder, self._metadata)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The inner environment's: a recorder is no part of what an environment is."""
+        return self.env.spec
+
+    @property
+    def closed(self) -> bool:
+        """True once the recording is finished."""
+        return self._writer.closed
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        result = self.env.step(action)
+        state, reward, terminal, timeout, info = result
+        try:
+            self._recorder.put(action, state, reward, terminal, timeout)
+        except StepError:
+            self._recorder.refuse()
+            raise
+        if self._watches:
+            self._watch(action, state, reward, terminal, timeout, info)
+        if terminal or timeout:
+            self._end(TERMINAL if terminal else TIMEOUT)
+        return result
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        unseeded = seed is None and getattr(self.env.unwrapped, "_np_random", 0) is None
+        result = self.env.reset(seed=seed, options=options)
+        state, info = result
+        facts = ResetFacts(
+            seed,
+            _drawn_seed(self.env) if unseeded else None,
+            "" if options is None else jsonvalue.dumps(options, fallback=repr),
+            jsonvalue.dumps(info, fallback=repr) if info else "{}",
+            time.time_ns(),
+        )
+        interrupted, self._metadata[0] = self._metadata[0], "{}"
+        self._recorder.reset(state, facts, interrupted)
+        if self._metadata_callback is not None and self._stepped:
+            self._metadata_callback.reset()
+        self._stepped = False
+        if self._watches:
+            self._state = copy.deepcopy(state)
+        return result
+
+    def _watch(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any, info: dict[str, Any]) -> None:
+        before, entries = self._state, dict(info) if self._records_info else {}
+        if self._step_callback is not None:
+            extra = self._step_callback(Step(before, action, reward, terminal, timeout, info))
+            entries.update(extra or {})
+        self._recorder.put_info(entries)
+        if self._metadata_callback is not None:
+            rl_tuple = RLTuple.model_construct(
+                state=before, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
+            )
+            metadata = self._metadata_callback(rl_tuple)
+            self._metadata[0] = jsonvalue.dumps_plain(metadata) if metadata else "{}"
+        self._stepped = True
+        self._state = copy.deepcopy(state)  # the environment may reuse its arrays
+
+    def _end(self, end: int) -> None:
+        metadata, self._metadata[0] = self._metadata[0], "{}"
+        self._recorder.end(end, metadata)
+        self._stepped = False
+        if self._metadata_callback is not None:
+            self._metadata_callback.reset()
+
+    def flush(self) -> None:
+        """Writes everything recorded so far into chunks; the journal already protects it."""
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Finishes the recording, then closes the environment. Calling it twice is fine."""
+        try:
+            self._finalizer()
+        finally:
+            super().close()
+
+    def __enter__(self) -> RecordEpisodes:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise RecordingError(
+            f"a wrapper that records to {self.path} cannot be pickled or copied; wrap the environment in the other process"
+        )
+
+
+def _close(recorder: SingleRecorder, metadata: list[str]) -> None:
+    recorder.close(metadata[0])
+
+
+def _drawn_seed(env: gym.Env[Any, Any]) -> int | None:
+    seed = getattr(env.unwrapped, "_np_random_seed", None)
+    return seed if isinstance(seed, int) and seed >= 0 else None
