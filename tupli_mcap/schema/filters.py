@@ -73,8 +73,8 @@ _SYMBOL: Final[Mapping[FilterType, str]] = {
 class BaseFilter(BaseModel):
     """A filter: a comparison (`key`, `value`) or a combination (`filters`), as `type` says.
 
-    Immutable and hashable; `filters` and the `value` of IN are tuples. Equality is of content, not of class, so
-    that a filter equals what its JSON is read back to.
+    Immutable and hashable; `filters` and the `value` of IN are tuples. Equality is of content, not of class,
+    so that a filter equals what its JSON is read back to.
 
     Raises:
         FilterError: The filter has no meaning. (Validation of data, `model_validate` and so on, raises

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.filters import BaseFilter, FilterType, path_of
 from tupli_mcap.schema.keys import join_key
-from tupli_mcap.schema.values import Scalar, classify, compare, untag_float
+from tupli_mcap.schema.values import Scalar, against_floats, classify, compare, untag_float
 
 Item: TypeAlias = Mapping[str, Any] | BaseModel
 Predicate: TypeAlias = Callable[[Item], bool]
@@ -231,18 +231,10 @@ def _compare_ints(operation: str, array: npt.NDArray[Any], number: float) -> Mas
 def _compare_floats(operation: str, array: npt.NDArray[Any], number: float) -> Mask:
     # NumPy would round the number to float32 or float16 before it compares.
     array = array.astype(np.float64) if array.dtype.itemsize < 8 else array
-    try:
-        nearest = float(number)
-    except OverflowError:
-        nearest = math.inf if number > 0 else -math.inf
-    if nearest != number:  # an int that is no float: no float lies between it and the nearest one
-        if operation == "EQ":
-            return np.zeros(len(array), np.bool_)
-        if operation in ("GT", "GEQ"):
-            operation = "GT" if nearest < number else "GEQ"
-        else:
-            operation = "LEQ" if nearest < number else "LT"
-    return _apply(operation, array, np.float64(nearest))
+    exact = against_floats(operation, number)
+    if exact is None:
+        return np.zeros(len(array), np.bool_)
+    return _apply(exact[0], array, np.float64(exact[1]))
 
 
 def _apply(operation: str, array: npt.NDArray[Any], value: Any) -> Mask:

@@ -72,6 +72,24 @@ def compare(operation: str, found: Scalar, wanted: Scalar) -> bool:
     return same_kind and found.kind in ("number", "text") and _ORDER[operation](found.value, wanted.value)
 
 
+def against_floats(operation: str, number: float) -> tuple[str, float] | None:
+    """A comparison with a number, as one with a float that says the same of every float; None if never true.
+
+    An int may lie between two neighbouring floats, or beyond them all.
+    """
+    try:
+        nearest = float(number)
+    except OverflowError:
+        nearest = math.inf if number > 0 else -math.inf
+    if nearest == number:
+        return operation, nearest
+    if operation == "EQ":
+        return None
+    if operation in ("GT", "GEQ"):
+        return ("GT" if nearest < number else "GEQ"), nearest
+    return ("LEQ" if nearest < number else "LT"), nearest
+
+
 def tag_float(value: float) -> float | dict[str, str]:
     """A float as strict JSON can hold it: NaN and the infinities become `{"$float": ...}`."""
     if math.isfinite(value):
