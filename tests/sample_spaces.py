@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any
 
 import gymnasium as gym
@@ -22,6 +23,8 @@ from gymnasium.spaces import (
 AnySpace = gym.Space[Any]
 
 _INTEGERS = (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64)
+# Gymnasium 1.0 has no dtype of a Discrete yet.
+_DISCRETE_DTYPES = _INTEGERS if "dtype" in signature(Discrete).parameters else ()
 _FLOATS = (np.float16, np.float32, np.float64)
 
 BOXES: list[AnySpace] = [
@@ -41,7 +44,7 @@ BOXES: list[AnySpace] = [
 FUNDAMENTAL_SPACES: list[AnySpace] = [
     Discrete(3),
     Discrete(3, start=-1),
-    *(Discrete(5, start=2, dtype=dtype) for dtype in _INTEGERS),
+    *(Discrete(5, start=2, dtype=dtype) for dtype in _DISCRETE_DTYPES),
     *BOXES,
     MultiDiscrete([2, 2]),
     MultiDiscrete([[2, 3], [3, 2]]),
@@ -55,7 +58,7 @@ FUNDAMENTAL_SPACES: list[AnySpace] = [
     Text(6),
     Text(min_length=3, max_length=6),
     Text(6, charset="abcdef"),
-    Text(4, min_length=0, charset='é日本😀"\\\n\x1a'),
+    Text(4, min_length=0, charset='é日本😀"\\\n'),
 ]
 
 COMPOSITE_SPACES: list[AnySpace] = [

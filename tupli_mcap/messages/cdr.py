@@ -1,8 +1,8 @@
 """Plain CDR, little-endian: the primitives, appended to a bytearray and read from a memoryview.
 
 A primitive is aligned to its size, counted from an origin (the byte after the encapsulation header).
-A sequence is its length (uint32) and its elements; an empty one has no padding after the length. A string is its
-length with the terminating NUL, UTF-8, NUL.
+A sequence is its length (uint32) and its elements; an empty one has no padding after the length. A string is
+its length with the terminating NUL, UTF-8, NUL.
 
 CDR strings hold no NUL and UTF-8 no lone surrogates, but a Python string may. These, and the escape character
 itself, are written as U+001A (SUBSTITUTE) and four hexadecimal digits, so that every string comes back,

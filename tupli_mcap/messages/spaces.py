@@ -164,7 +164,8 @@ def _write_discrete(space: Any, path: str, _: WriteSub) -> Json:
 
 def _read_discrete(fields: Fields, _: ReadSub) -> gym.Space[Any]:
     dtype: Any = fields.dtype().type
-    return spaces.Discrete(fields.integer("n"), start=fields.integer("start"), dtype=dtype)
+    of_dtype = {} if dtype is np.int64 else {"dtype": dtype}  # Gymnasium 1.0 has int64 only
+    return spaces.Discrete(fields.integer("n"), start=fields.integer("start"), **of_dtype)
 
 
 def _write_multi_discrete(space: Any, path: str, _: WriteSub) -> Json:
