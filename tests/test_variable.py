@@ -19,6 +19,7 @@ from sample_spaces import SPACES, space_id
 
 from tupli_mcap.errors import FormatError, SpaceError, StepError
 from tupli_mcap.messages.variable import VariableField
+from tupli_mcap.messages.widening import variable_dtypes
 
 Box, Dict, Discrete, Graph = spaces.Box, spaces.Dict, spaces.Discrete, spaces.Graph
 OneOf, Sequence, Text, Tuple = spaces.OneOf, spaces.Sequence, spaces.Text, spaces.Tuple
@@ -421,3 +422,65 @@ def test_decoded_arrays_are_ones_own():
     value = decode(field, data)
     value[0] = 5
     assert same(decode(field, data), np.ones((2, 2), np.float32))
+
+
+def f8(*shape: int) -> np.ndarray[Any, Any]:
+    return np.full(shape, 0.1)
+
+
+WIDER = [
+    (Sequence(Box(0, 1, (2,))), (f8(2), np.ones(2, np.float32)), {"[]": "float64"}),
+    (Sequence(Box(0, 1, (2,)), stack=True), f8(3, 2), {"[]": "float64"}),
+    (Sequence(Box(0, 1, (), np.float16)), (0.1, np.float32(0.5)), {"[]": "float64"}),
+    (Sequence(Discrete(3, start=1)), (1.0, np.float64(1.5)), {"[]": "float64"}),
+    (Sequence(Discrete(3)), (1, True, np.int8(2)), {}),
+    (OneOf([Text(2), Box(0, 1, (2,))]), (1, f8(2)), {"[1]": "float64"}),
+    (OneOf([Text(2), Box(0, 1, (2,))]), (np.int64(0), "x"), {}),
+    (Sequence(Dict(a=Tuple((Box(0, 1, (1,)), Text(2))))), ({"a": (f8(1), "x")},), {"[]['a'][0]": "float64"}),
+    (Sequence(Dict(a=Box(0, 1, (1,))), stack=True), {"a": f8(2, 1)}, {"[]['a']": "float64"}),
+    (
+        Graph(Box(0, 1, (2,)), Box(0, 1, ())),
+        GraphInstance(f8(3, 2), f8(1), np.zeros((1, 2), np.int64)),
+        {".nodes": "float64", ".edges": "float64", ".edge_links": "int64"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("space", "value", "dtypes"), WIDER, ids=str)
+@pytest.mark.filterwarnings("ignore:note:UserWarning")
+def test_wider_values_than_declared_are_stored_as_they_are(space, value, dtypes):
+    assert variable_dtypes(space, [value], "note") == dtypes
+    field = VariableField(space, "note", dtypes=dtypes)
+    again = decode(field, encode(field, value))
+    assert repr(flat(again)) == repr(flat(value)) or not dtypes
+    ros_decode(field, value, 1)
+    if dtypes:
+        with pytest.raises(StepError, match=r"^note.*: expected"):
+            encode(VariableField(space, "note"), value)
+
+
+def test_wider_values_warn_once_a_leaf():
+    space = Sequence(Box(0, 1, (2,)))
+    with pytest.warns(UserWarning, match=r"^state\['a'\]\[\] is declared float32, but .* float64") as caught:
+        variable_dtypes(space, [(f8(2), f8(2)), (f8(2),)], "state['a']")
+    assert len(caught) == 1
+
+
+@pytest.mark.parametrize(
+    "value", [None, 3, (3, 4), {"a": 1}, GraphInstance(None, 1, 2), ("x", 1), (5, 1)], ids=str
+)
+@pytest.mark.parametrize("space", FIELDS[-20:], ids=space_id)
+def test_values_of_another_structure_widen_nothing_or_are_refused(space, value):
+    try:
+        dtypes = variable_dtypes(space, [value], "note")
+        field = VariableField(space, "note", dtypes=dtypes)
+        data = encode(field, value)
+    except StepError:
+        return
+    assert same(decode(field, data), value) or value == (3, 4)  # as NumPy scalars
+
+
+@pytest.mark.parametrize("dtypes", [{"[0]": "float64"}, {"[]": "complex64"}, {"": "float64"}], ids=str)
+def test_dtypes_of_other_leaves_are_refused(dtypes):
+    with pytest.raises(SpaceError, match=r"^note(\[\])?: expected (dtypes of leaves|a dtype)"):
+        VariableField(Sequence(Box(0, 1, (2,))), "note", dtypes=dtypes)

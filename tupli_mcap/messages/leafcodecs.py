@@ -53,7 +53,8 @@ class Leaf:
     scalar: bool  # samples are NumPy scalars, not arrays
 
     @classmethod
-    def of(cls, space: gym.Space[Any], path: str) -> Leaf:
+    def of(cls, space: gym.Space[Any], path: str, wide: str | None = None) -> Leaf:
+        """The leaf of a space, of its dtype or of a wider one."""
         dtype, shape = np.dtype(space.dtype), tuple(space.shape or ())
         if dtype.name not in ROS_TYPES or not dtype.isnative:
             raise SpaceError(
@@ -61,6 +62,10 @@ class Leaf:
             )
         # As Gymnasium's own samples are: an integer or bool Box rounds, which turns a 0-d array to a scalar.
         is_array = type(space) is spaces.MultiBinary or (type(space) is spaces.Box and dtype.kind == "f")
+        if wide is not None:
+            if wide not in ROS_TYPES:
+                raise SpaceError(f"{path}: expected a dtype of {', '.join(ROS_TYPES)}, found {shorten(wide)}")
+            dtype = np.dtype(wide)
         return cls(dtype.newbyteorder("<"), shape, shape == () and not is_array)
 
     @property
@@ -90,8 +95,8 @@ class Leaf:
         return tuple(array.reshape(number, *self.shape))
 
 
-def numeric(space: gym.Space[Any], path: str) -> Codec:
-    leaf = Leaf.of(space, path)
+def numeric(leaf: Leaf) -> Codec:
+    """One array or scalar."""
     dtype, count, itemsize = leaf.dtype, leaf.count, leaf.dtype.itemsize
     to_bytes, from_array = leaf.to_bytes(), leaf.from_array
 
@@ -109,6 +114,7 @@ def numeric(space: gym.Space[Any], path: str) -> Codec:
 
 
 def numeric_items(leaf: Leaf) -> Codec:
+    """A tuple of arrays or scalars, their elements in a row."""
     dtype, count, itemsize = leaf.dtype, leaf.count, leaf.dtype.itemsize
     to_bytes = leaf.to_bytes()
 
@@ -132,6 +138,7 @@ def numeric_items(leaf: Leaf) -> Codec:
 
 
 def numeric_batch(leaf: Leaf) -> Codec:
+    """Arrays or scalars stacked in one array."""
     dtype, shape, count, itemsize = leaf.dtype, leaf.shape, leaf.count, leaf.dtype.itemsize
     plain = dtype.kind != "b"
 

@@ -16,12 +16,11 @@ The structure comes from the space alone:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import FormatError, SpaceError, StepError
@@ -51,12 +50,12 @@ from tupli_mcap.messages.nestedcodecs import (
     items_of,
     with_dummy,
 )
+from tupli_mcap.messages.widening import EDGE_LINKS
 
 __all__ = ["VariableField"]
 
 _MAX_DEPTH = 64
 _NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-_EDGE_LINKS = np.dtype("<i4")
 _DUMMY = "structure_needs_at_least_one_member"  # the name ROS 2 gives it
 
 
@@ -65,9 +64,11 @@ class VariableField:
 
     `field_type` is its ROS type, `definitions` the names and texts of the messages nested in it. `path` names
     the field in errors. `taken` is a set of type names (without package) in use; this field adds its own.
+    `dtypes` are those of `widening.variable_dtypes`, where leaves are stored wider than their space declares.
 
     Raises:
-        SpaceError: a space that is no part of Gymnasium, or a dtype that no message can hold.
+        SpaceError: a space that is no part of Gymnasium, a dtype that no message can hold, or one for a leaf
+            that is not in the space.
     """
 
     def __init__(
@@ -79,11 +80,17 @@ class VariableField:
         *,
         path: str | None = None,
         taken: set[str] | None = None,
+        dtypes: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
         self.path = name if path is None else path
-        builder = _Builder(package, set() if taken is None else taken)
+        wide = {self.path + where: dtype for where, dtype in (dtypes or {}).items()}
+        builder = _Builder(package, set() if taken is None else taken, wide)
         codec = builder.single(space, type_prefix, self.path, 0)
+        if wide:
+            raise SpaceError(
+                f"{self.path}: expected dtypes of leaves in {space}, found some of {sorted(wide)}"
+            )
         self.field_type: str = codec.ros
         self.definitions: list[tuple[str, str]] = builder.definitions
         self._encode = codec.encode
@@ -120,13 +127,14 @@ class _Builder:
 
     package: str
     taken: set[str]
+    wide: dict[str, str]  # path to dtype; each is taken out when it is used
     definitions: list[tuple[str, str]] = field(default_factory=list)
 
     def single(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
         """One value of a space."""
         _check_depth(path, depth)
         if type(space) in _NUMERIC:
-            return numeric(space, path)
+            return numeric(self._leaf(space, path))
         if type(space) is spaces.Text:
             return text()
         if type(space) is spaces.Dict or type(space) is spaces.Tuple:
@@ -143,10 +151,13 @@ class _Builder:
             "wrap the environment so that it returns one"
         )
 
+    def _leaf(self, space: gym.Space[Any], path: str) -> Leaf:
+        return Leaf.of(space, path, self.wide.pop(path, None))
+
     def _items(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
         """A tuple of values, as a Sequence without `stack` has it."""
-        if type(space) in _NUMERIC and (leaf := Leaf.of(space, path)).count:
-            return numeric_items(leaf)
+        if type(space) in _NUMERIC and 0 not in (space.shape or ()):
+            return numeric_items(self._leaf(space, path))
         codec = self.single(space, f"{type_name}Item", path, depth)
         if codec.kind not in ("message", "string"):
             codec = self._message(f"{type_name}Item", [(codec.ros, "value")], codec.encode, codec.decode)
@@ -155,7 +166,7 @@ class _Builder:
     def _stacked(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
         """Values of a space in one batch, as `gymnasium.vector.utils.concatenate` makes it."""
         if type(space) in _NUMERIC:
-            leaf = Leaf.of(space, path)
+            leaf = self._leaf(space, path)
             return numeric_batch(leaf) if leaf.count else empty_batch(leaf)
         if type(space) is spaces.Dict or type(space) is spaces.Tuple:
             return self._composite(space, type_name, path, depth, self._stacked)
@@ -185,7 +196,8 @@ class _Builder:
 
     def _graph(self, space: Any, type_name: str, path: str, depth: int) -> Codec:
         nodes = self._stacked(space.node_space, f"{type_name}Nodes", f"{path}.nodes", depth + 1)
-        links = Maybe.of(numeric_batch(Leaf(_EDGE_LINKS, (2,), False)))
+        links_space = spaces.Box(0, 1, (2,), EDGE_LINKS.type)
+        links = Maybe.of(numeric_batch(self._leaf(links_space, f"{path}.edge_links")))
         fields = [(nodes.ros, "nodes")]
         edges = None
         if space.edge_space is not None:
