@@ -1,7 +1,7 @@
 """Which dtypes store the numbers inside a value of variable size, where an environment strays from its space.
 
-A path starts after the value itself: `[]` is an item of a Sequence, `['a']` an entry of a Dict, `[1]` one of a
-Tuple or an option of a OneOf; `.nodes`, `.edges` and `.edge_links` are of a Graph.
+A path starts after the value itself: `[]` is an item of a Sequence, `['a']` an entry of a Dict, `[1]` one of
+a Tuple or an option of a OneOf; `.nodes`, `.edges` and `.edge_links` are of a Graph.
 """
 
 from __future__ import annotations
