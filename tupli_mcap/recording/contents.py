@@ -8,7 +8,7 @@ import numpy as np
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.container import CHUNK_ROWS
+from tupli_mcap.recording.container import CHUNK_ROWS, Rows
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME, EpisodeIndex
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import (
@@ -27,7 +27,8 @@ RECORDING_METADATA = "tupli_mcap.recording"
 
 @dataclass
 class Contents:
-    """`table` is a CHUNK_ROWS array; `memory` holds the rows of chunks that are only in the journal; `data_end` is the
+    """`table` is a CHUNK_ROWS array; `memory` holds the rows of chunks that are only in the journal
+    (`tail`, as the writer would take them); `data_end` is the
     offset where the episode index (or what is to be cut) begins."""
 
     metadata: dict[str, str]
@@ -37,6 +38,7 @@ class Contents:
     metadata_indexes: list[MetadataIndex] = field(default_factory=list)
     table: np.ndarray = field(default_factory=lambda: np.empty(0, CHUNK_ROWS))  # type: ignore[type-arg]
     memory: list[bytes] = field(default_factory=list)
+    tail: list[Rows] = field(default_factory=list)
     index: EpisodeIndex = field(default_factory=lambda: EpisodeIndex(np.empty(0, EPISODE_ROWS), np.empty(0, CHUNK_ROWS), b""))
     complete: bool = True
     data_end: int = 0
@@ -72,10 +74,8 @@ def read_contents(source: Source) -> Contents:
         summary.attachments,
         list(summary.metadata.values()),
         index.chunks,
-        [],
-        index,
-        True,
-        attachment.offset,
+        index=index,
+        data_end=attachment.offset,
     )
 
 

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, SpaceError
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.layout import IMAGE_SCHEMA
 from tupli_mcap.recording.container import Container, Rows
@@ -82,6 +82,9 @@ class RecordingWriter:
         self.events: EventLog | None = None
         self.infos: EventLog | None = None
         self.num_envs = 1
+        self.is_vector = False
+        self.recorded_envs: int | None = None  # on append: sub-environments in the file
+        self.recorded_vector = False
         self.uuid = uuid.uuid4().hex
         self._flushed_at = time.monotonic()
         self.lock = FileLock(self.path, options.mode)
@@ -136,6 +139,11 @@ class RecordingWriter:
 
         def channel(topic: str, schema_name: str, text: str, metadata: Mapping[str, str]) -> int:
             if topic in known:
+                old = self.container.schemas[self.container.channels[known[topic]].schema_id]
+                if old.data != text.encode():
+                    raise RecordingError(
+                        f"{self.path} records {topic} with other fields; choose the same ones, or record to another file"
+                    )
                 return known[topic]
             if schema_name not in schemas:
                 schemas[schema_name] = self.container.add_schema(schema_name, text)
@@ -185,7 +193,7 @@ class RecordingWriter:
     def _make_stores(self, areas: Sequence[Area]) -> None:
         assert self.layout is not None
         layout, channels = self.layout, self.channels
-        counts = self.container.counts
+        counts, before_ns = self.container.counts, self.container.end_time
         definitions = {
             "uuid": self.uuid,
             "vector": self.is_vector,
@@ -222,11 +230,14 @@ class RecordingWriter:
                 self.rows = logs[0]
         elif self.is_vector:
             before = np.array([counts[c] for c in channels.steps], dtype=np.int64)
-            self.vector = VectorRows(layout, by_name["steps"], buffer("steps"), channels.steps, self.add_chunk, before)  # type: ignore[arg-type]
+            derivers = [RowDeriver(time_ns=before_ns) for _ in channels.steps]
+            self.vector = VectorRows(
+                layout, by_name["steps"], buffer("steps"), channels.steps, self.add_chunk, before, derivers
+            )  # type: ignore[arg-type]
         else:
             self.rows = SingleRows(
                 layout, by_name["steps"], buffer("steps"), channels.steps[0], self.add_chunk,
-                [sinks[0] for sinks in self.images], counts[channels.steps[0]], RowDeriver(),
+                [sinks[0] for sinks in self.images], counts[channels.steps[0]], RowDeriver(time_ns=before_ns),
             )  # type: ignore[arg-type]  # fmt: skip
         events = {c: counts[c] for c in (channels.final_state, channels.start, channels.end)}
         self.events = EventLog(by_name["events"], buffer("events"), self.add_chunk, events)  # type: ignore[arg-type]
@@ -307,6 +318,22 @@ class RecordingWriter:
         else:
             stores = list(self.vector) if isinstance(self.vector, list) else [self.vector]
         return stores
+
+    def check_spaces(self, spaces: StepLayout, num_envs: int, *, vector: bool) -> None:
+        """On append: raises SpaceError unless the environment is one the file can go on with."""
+        if self.layout is None or self.recorded_envs is None:
+            return
+        if (self.recorded_envs, self.recorded_vector) != (num_envs, vector):
+            raise SpaceError(
+                f"{self.path} records {self.recorded_envs} sub-environment(s), found {num_envs}; record to another file"
+            )
+        old, new = self.layout.to_metadata(), spaces.to_metadata()
+        for key in ("observation_space", "action_space", "reward_space"):
+            if old[key] != new[key]:
+                raise SpaceError(
+                    f"{self.path}: expected the recorded {key} {getattr(self.layout, key)}, found "
+                    f"{getattr(spaces, key)}; record to another file"
+                )
 
     def flush(self) -> None:
         """Writes everything recorded so far into chunks (the file still has no summary)."""

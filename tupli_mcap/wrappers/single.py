@@ -13,7 +13,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
@@ -89,6 +89,11 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         spaces = StepLayout(env.observation_space, env.action_space, reward_space)  # refused before a file is made
         spaces.to_metadata()
         self._writer = RecordingWriter(path, options)
+        try:
+            self._writer.check_spaces(spaces, 1, vector=False)
+        except SpaceError:
+            self._writer.close()
+            raise
         self._recorder = SingleRecorder(self._writer, spaces, infos)
         self._watches = metadata_callback is not None or infos is not None
         self._metadata: list[str] = ["{}"]  # shared with the finalizer, which must not hold the wrapper

@@ -1,0 +1,88 @@
+"""Going on with a recording: its tail (index, summary) is cut off, everything before it stays as it is."""
+
+from __future__ import annotations
+
+import os
+import struct
+from typing import TYPE_CHECKING
+
+from mcap.records import ChunkIndex
+
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.container import COMPRESSIONS
+from tupli_mcap.recording.contents import Contents, read_contents
+from tupli_mcap.recording.source import PathSource, Source
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording.writer import RecordingWriter
+
+__all__ = ["resume"]
+
+_CHUNK_HEAD = struct.Struct("<BQQQ")  # opcode, length, start time, end time
+
+
+def resume(writer: RecordingWriter) -> None:
+    """Takes over the file of `writer` (already locked): a finished one, or one whose writer was killed.
+
+    Everything that is cut is derivable from the chunks, so a crash in between loses nothing.
+
+    Raises:
+        FormatError: the file is no recording.
+        RecordingError: it belongs to another benchmark.
+    """
+    source = PathSource(writer.path)
+    try:
+        contents = read_contents(source)
+        asked, found = writer.options.benchmark_id, contents.metadata.get("benchmark_id", "")
+        if asked and asked != found:
+            raise RecordingError(
+                f"{writer.path} holds episodes of benchmark {found or 'none'!r}, not {asked!r}; record to another file"
+            )
+        _restore(writer, contents, source)
+    finally:
+        source.close()
+    os.ftruncate(writer.lock.fd, contents.data_end)
+    os.lseek(writer.lock.fd, contents.data_end, os.SEEK_SET)
+    writer.container.position = contents.data_end
+    for rows in contents.tail:
+        writer.container.add_chunk(rows)
+
+
+def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> None:
+    container = writer.container
+    writer.uuid = contents.metadata["uuid"]
+    container.schemas = dict(sorted(contents.schemas.items()))
+    container.channels = dict(sorted(contents.channels.items()))
+    if list(container.channels) != list(range(1, len(container.channels) + 1)):
+        raise FormatError(f"{writer.path}: expected channels numbered from 1, found {list(container.channels)}")
+    container.counts = dict.fromkeys(container.channels, 0)
+    container.attachment_indexes = list(contents.attachments.values())
+    container.metadata_indexes = contents.metadata_indexes
+    for row in contents.table[contents.table["offset"] < 1 << 63]:
+        offset, length = int(row["offset"]), int(row["length"])
+        _, _, start, end = _CHUNK_HEAD.unpack(source.read(offset, _CHUNK_HEAD.size))
+        index_length = 9 + int.from_bytes(source.read(offset + length + 1, 8), "little")
+        name = COMPRESSIONS[int(row["compression"])].replace("none", "")
+        index = ChunkIndex(
+            chunk_length=length,
+            chunk_start_offset=offset,
+            compression=name,
+            compressed_size=length - 9 - 40 - len(name),
+            message_end_time=end,
+            message_index_length=index_length,
+            message_index_offsets={int(row["channel"]): offset + length},
+            message_start_time=start,
+            uncompressed_size=int(row["uncompressed"]),
+        )
+        container.note_chunk(index, tuple(int(value) for value in row.tolist()))
+    index_rows = contents.index.episodes
+    writer.index.rows = bytearray(index_rows.tobytes())
+    writer.index.metadata = bytearray(contents.index.metadata)
+    writer.index.count = len(index_rows)
+    writer.next_episode = int(index_rows["episode"].max()) + 1 if len(index_rows) else 0
+    steps = [c for c in container.channels.values() if c.topic.endswith("/step")]
+    if steps:
+        writer.layout = StepLayout.from_metadata(steps[0].metadata)
+        writer.recorded_envs = len(steps)
+        writer.recorded_vector = steps[0].topic != "/step"

@@ -1,0 +1,337 @@
+"""Recovery in memory: the journal first, then the file's valid prefix; what the writer could not finish is derived.
+
+Nothing is written. Repeating it changes nothing.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.records import Channel, Schema
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
+from tupli_mcap.recording.container import CHUNK_ROWS, Rows
+from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_version
+from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
+from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
+from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, journal_path, read_journal
+from tupli_mcap.recording.salvage import (
+    Salvage,
+    committed_rows,
+    image_rows,
+    log_records,
+    running_record,
+    to_rows,
+)
+from tupli_mcap.recording.scan import Scan, is_ours, scan
+from tupli_mcap.recording.source import Source
+from tupli_mcap.recording.summary import foreign, records
+
+__all__ = ["recover_contents"]
+
+
+@dataclass
+class _Tail:
+    """What the journal adds to the file, as rows that are not in it; `pending` are states by sub-environment."""
+
+    rows: list[Rows] = field(default_factory=list)
+    pending: dict[int, bytes] = field(default_factory=dict)
+
+
+def recover_contents(source: Source) -> Contents:
+    """The contents of a recording that has no summary.
+
+    Raises:
+        FormatError: it is no recording of ours, or its first records are damaged.
+    """
+    head = scan(source, only_metadata=True)
+    if RECORDING_METADATA not in head.metadata:
+        if is_ours(head) or head.profile == "":
+            raise FormatError(
+                f"{source.name}: the file is cut off or damaged before its first step; nothing can be read from it"
+            )
+        raise foreign(source, f"its profile is {head.profile!r}")
+    metadata = check_version(source, head.metadata[RECORDING_METADATA])
+    journal = _find_journal(source, metadata)  # before the chunks: a live writer moves rows from there to here
+    found = scan(source)
+    if journal is not None:
+        _define(found, journal, source)
+    tail = _Tail()
+    end = found.end
+    if found.unindexed is not None:
+        tail.rows.append(found.unindexed)
+        found.counts[found.unindexed.channel] = found.counts.get(found.unindexed.channel, 0) + len(
+            found.unindexed.offsets
+        )
+    contents = Contents(
+        metadata, found.schemas, found.channels, found.attachments, found.metadata_indexes, complete=False, data_end=end
+    )
+    steps = sorted(
+        (c for c in found.channels.values() if c.topic.endswith("/step")), key=lambda c: int(c.metadata.get("env", "0"))
+    )
+    if steps:
+        layout = StepLayout.from_metadata(steps[0].metadata)
+        if journal is not None:
+            _salvage(source, found, journal, layout, [c.id for c in steps], tail)
+        _complete(source, found, layout, [c.id for c in steps], tail, contents)
+    return contents
+
+
+def _find_journal(source: Source, metadata: dict[str, str]) -> JournalContents | None:
+    if source.path is None:
+        return None
+    path = Path(metadata["journal"]) if "journal" in metadata else journal_path(source.path)
+    try:
+        journal = read_journal(path)
+    except FileNotFoundError:
+        warnings.warn(
+            f"{source.name} was not finished and has no journal {path.name} beside it: steps not yet in a chunk cannot "
+            "be recovered; keep the two files together",
+            UserWarning,
+            stacklevel=6,
+        )
+        return None
+    except (OSError, FormatError) as err:
+        warnings.warn(f"{source.name}: its journal cannot be read ({err})", UserWarning, stacklevel=6)
+        return None
+    # a stale journal of another recording with this name is not ours to merge
+    return journal if journal.info.get("uuid") == metadata["uuid"] else None
+
+
+def _define(found: Scan, journal: JournalContents, source: Source) -> None:
+    for text in journal.info.get("definitions", {}).values():
+        for opcode, _, body in records(bytes.fromhex(text), 0, f"{source.name}: journal"):
+            stream = ReadDataStream(io.BytesIO(body))
+            if opcode == 3:
+                schema = Schema.read(stream)
+                found.schemas.setdefault(schema.id, schema)
+            elif opcode == 4:
+                channel = Channel.read(stream)
+                found.channels.setdefault(channel.id, channel)
+
+
+def _table(found: Scan, memory: list[Rows]) -> np.ndarray[Any, Any]:
+    extra = [
+        (IN_MEMORY + i, 0, len(rows.data), rows.first, len(rows.offsets), 0, 0, rows.channel, 0, 0)
+        for i, rows in enumerate(memory)
+    ]
+    return np.array([*found.chunks, *extra], CHUNK_ROWS)
+
+
+def _salvage(
+    source: Source, found: Scan, journal: JournalContents, layout: StepLayout, steps: list[int], tail: _Tail
+) -> None:
+    """Takes the rows and records the file does not have out of the journal."""
+    store = ChunkStore(source, _table(found, tail.rows), [bytes(r.data) for r in tail.rows], 1 << 24)
+    counts = dict(found.counts)
+    for env, channel in enumerate(steps):
+        first = counts.get(channel, 0)
+        if layout.constant:
+            area = _rows_area(journal, "steps")
+            salvage = Salvage(journal, area, env, layout.step_message.dtype, channel)
+            last = None
+            if first:
+                span = next(iter(store.spans(channel, first - 1, 1)))
+                last = store.rows(span.chunk, layout.step_message.dtype)[span.begin]
+            rows, _ = committed_rows(salvage, first, channel, last)
+            total = first + (0 if rows is None else len(rows.offsets))
+            following = salvage.following(total - 1)
+            if following is not None:
+                tail.pending[env] = following.tobytes()[BODY + 8 : BODY + _state_end(layout)]
+        else:
+            log = _log_area(journal, f"steps/{env}")
+            entries = [e for e in log_records(journal, log, {channel: first}) if e[0] == channel]
+            rows = to_rows(entries)[0] if entries else None
+            total = first + len(entries)
+            state = running_record(journal, log, total - 1, layout)
+            if state is not None:
+                tail.pending[env] = state
+        if rows is not None:
+            tail.rows.append(rows)
+        _salvage_images(found, journal, layout, env, total, tail)
+    for name in ("events", "info"):
+        if name in journal.areas:
+            tail.rows += to_rows(log_records(journal, _log_area(journal, name), counts))
+
+
+def _state_end(layout: StepLayout) -> int:
+    names = {leaf.name for leaf in layout.state}
+    return max((f.offset + f.nbytes for f in layout.step_message.fields if f.name in names), default=8)
+
+
+def _rows_area(journal: JournalContents, name: str) -> RowArea:
+    area = journal.areas.get(name)
+    if not isinstance(area, RowArea):
+        raise FormatError(f"the journal has no rows {name!r}")
+    return area
+
+
+def _log_area(journal: JournalContents, name: str) -> LogArea:
+    area = journal.areas.get(name)
+    if not isinstance(area, LogArea):
+        raise FormatError(f"the journal has no records {name!r}")
+    return area
+
+
+def _salvage_images(
+    found: Scan, journal: JournalContents, layout: StepLayout, env: int, steps: int, tail: _Tail
+) -> None:
+    for leaf in layout.images:
+        topic = next(
+            c.topic for c in found.channels.values() if c.topic.endswith("/step") and c.metadata.get("env") == str(env)
+        )
+        channel = next(
+            c.id for c in found.channels.values() if c.topic == f"{topic.removesuffix('/step')}/image/{leaf.name}"
+        )
+        dtype = layout.image_messages[leaf.name].dtype
+        salvage = Salvage(journal, _rows_area(journal, f"{leaf.name}/{env}"), 0, dtype, channel)
+        rows = image_rows(salvage, found.counts.get(channel, 0), steps, channel)
+        if rows is not None:
+            tail.rows.append(rows)
+        following = salvage.following(steps)
+        pending = salvage.rows[salvage.rows["#sequence"] == steps]
+        if following is None and not len(pending):
+            tail.pending.pop(env, None)
+        elif env in tail.pending and len(pending):
+            tail.pending[env] += pending[-1]["data"].tobytes()
+
+
+class _Episodes:
+    """Starts and ends found so far, and the ends that have to be made."""
+
+    def __init__(self, store: ChunkStore, topics: dict[str, int]) -> None:
+        self.starts: dict[int, tuple[int, int, EpisodeStart]] = {}
+        self.ends: dict[int, tuple[int, int, EpisodeEnd]] = {}
+        self.finals: dict[int, int] = {}
+        for row, (time, body) in enumerate(_messages(store, topics["/episode_start"])):
+            start = EpisodeStart.decode(body)
+            self.starts[start.episode] = (row, time, start)
+        for row, (time, body) in enumerate(_messages(store, topics["/episode_end"])):
+            end = EpisodeEnd.decode(body)
+            self.ends[end.episode] = (row, time, end)
+        for row, (_, body) in enumerate(_messages(store, topics["/final_state"])):
+            self.finals[int.from_bytes(body[:4], "little")] = row
+
+
+def _messages(store: ChunkStore, channel: int) -> Iterator[tuple[int, memoryview]]:
+    for chunk in store.chunks(channel):
+        data = memoryview(store.load(chunk))
+        for start, end in store.messages(chunk):
+            yield int.from_bytes(data[start + 15 : start + 23], "little"), data[start + BODY : end]
+
+
+def _complete(
+    source: Source, found: Scan, layout: StepLayout, steps: list[int], tail: _Tail, contents: Contents
+) -> None:
+    """Makes the missing ends of episodes, and the index."""
+    topics = {c.topic: c.id for c in found.channels.values()}
+    missing = [t for t in ("/episode_start", "/episode_end", "/final_state") if t not in topics]
+    if missing:
+        return
+    store = ChunkStore(source, _table(found, tail.rows), [bytes(r.data) for r in tail.rows], 1 << 26)
+    episodes = _Episodes(store, topics)
+    made: list[tuple[int, int, int, bytes]] = []
+    counts = {c: store.count(c) for c in (topics["/episode_end"], topics["/final_state"])}
+    for number in sorted(set(episodes.starts) - set(episodes.ends)):
+        row, time, start = episodes.starts[number]
+        facts = _rows_of(store, layout, steps, start, number)
+        if facts is None:
+            continue  # a reset without a step is no episode
+        length, total, end, end_time = facts
+        if number not in episodes.finals and start.env in tail.pending and _is_last(store, steps, start, length):
+            channel = topics["/final_state"]
+            body = number.to_bytes(4, "little") + start.env.to_bytes(4, "little") + tail.pending[start.env]
+            made.append((channel, counts[channel], end_time, record(channel, counts[channel], end_time, body)))
+            episodes.finals[number] = counts[channel]
+            counts[channel] += 1
+        channel = topics["/episode_end"]
+        message = EpisodeEnd(number, start.env, start.first_row, length, total, end, number in episodes.finals, "{}")
+        made.append((channel, counts[channel], end_time, record(channel, counts[channel], end_time, message.encode())))
+        episodes.ends[number] = (counts[channel], end_time, message)
+        counts[channel] += 1
+    tail.rows += to_rows(made)
+    contents.memory = [bytes(rows.data) for rows in tail.rows]
+    contents.table = _table(found, tail.rows)
+    contents.tail = tail.rows
+    contents.index = _index(episodes, contents.table)
+
+
+def _index(episodes: _Episodes, table: np.ndarray[Any, Any]) -> EpisodeIndex:
+    builder = IndexBuilder()
+    for number in sorted(episodes.ends):
+        if number not in episodes.starts:
+            continue
+        start_row, start_time, start = episodes.starts[number]
+        end_row, end_time, end = episodes.ends[number]
+        seed = int(start.seed) if start.seed.lstrip("-").isdecimal() else None
+        final = episodes.finals.get(number, -1) if end.has_final_state else -1
+        row = EpisodeRow(
+            end.first_row, end.length, end.episode_return, start_time, end_time, seed, start_row, end_row, final,
+            number, end.env, end.end,
+        )  # fmt: skip
+        builder.add(row, end.metadata)
+    return EpisodeIndex.decode(builder.encode(table.tobytes()), "recovered index")
+
+
+def _is_last(store: ChunkStore, steps: list[int], start: EpisodeStart, length: int) -> bool:
+    return start.first_row + length == store.count(steps[start.env])
+
+
+def _rows_of(
+    store: ChunkStore, layout: StepLayout, steps: list[int], start: EpisodeStart, number: int
+) -> tuple[int, float, int, int] | None:
+    """(length, return, end, time of the last step) of an episode without an end; None if it has no step."""
+    if start.env >= len(steps):
+        return None
+    channel = steps[start.env]
+    count = store.count(channel) - start.first_row
+    if count <= 0:
+        return None
+    total, length, last, time = 0.0, 0, (False, False), 0
+    for episode, reward, flags, at in _step_facts(store, layout, channel, start.first_row, count):
+        if episode != number:
+            break
+        total, length, last, time = total + reward, length + 1, flags, at
+        if any(flags):
+            break
+    if not length:
+        return None
+    return length, total, 0 if last[0] else 1 if last[1] else 2, time
+
+
+def _step_facts(
+    store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int
+) -> Iterator[tuple[int, float, tuple[bool, bool], int]]:
+    names = [leaf.name for leaf in layout.reward]
+    if layout.constant:
+        for span in store.spans(channel, first, count):
+            rows = store.rows(span.chunk, layout.step_message.dtype)[span.begin : span.end]
+            rewards = sum(rows[name].reshape(len(rows), -1).sum(axis=1, dtype=np.float64) for name in names)
+            yield from zip(
+                rows["episode"].tolist(),
+                np.asarray(rewards).tolist(),
+                zip(rows["terminal"].tolist(), rows["timeout"].tolist(), strict=True),
+                rows["#log_time"].tolist(),
+                strict=True,
+            )
+        return
+    from tupli_mcap.messages.decoder import MessageDecoder
+
+    decoder = MessageDecoder(layout)
+    for span in store.spans(channel, first, count):
+        data = memoryview(store.load(span.chunk))
+        for start, end in store.messages(span.chunk)[span.begin : span.end]:
+            values = decoder.step(data[start + BODY : end])
+            reward = float(sum(np.sum(values[name]) for name in names))
+            time = int.from_bytes(data[start + 15 : start + 23], "little")
+            yield values["episode"], reward, (values["terminal"], values["timeout"]), time
