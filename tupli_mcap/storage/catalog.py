@@ -137,14 +137,9 @@ class Catalog:
         """
         columns = [EPISODE.c[name] for name in StoredRow._fields]
         with self._read() as connection:
-            query: Select[Any]
-            if filter is None:
-                query = select(*columns, *_OF_RECORDING).select_from(EPISODE.join(RECORDING, in_order()))
-                query = query.order_by(RECORDING.c.path, EPISODE.c.id)
-            else:
-                query = self._query(connection, filter, *columns, *_OF_RECORDING)
-                # Given the bare column, SQLite may walk all episodes in order, for an index of a few.
-                query = query.order_by(func.coalesce(RECORDING.c.path, ""), EPISODE.c.id)
+            # Given the bare path to sort by, SQLite may walk all episodes in order for the few that match.
+            path = RECORDING.c.path if filter is None else func.coalesce(RECORDING.c.path, "")
+            query = self._query(connection, filter, *columns, *_OF_RECORDING).order_by(path, EPISODE.c.id)
             if limit is not None or offset:
                 query = query.limit(-1 if limit is None else limit).offset(offset)
             width = len(columns)
@@ -192,10 +187,13 @@ class Catalog:
             return list(connection.execute(select(DECLARED.c.key).order_by(DECLARED.c.number)).scalars())
 
     def _query(self, connection: Connection, filter: BaseFilter | None, *columns: Any) -> Select[Any]:
+        query: Select[Any] = select(*columns)
+        if filter is None:
+            return query.select_from(EPISODE.join(RECORDING, in_order()))
         rows = connection.execute(select(DECLARED.c.key, DECLARED.c.number)).all()
         declared = {path[1:]: number for key, number in rows if (path := split_key(key))[0] == "metadata"}
-        query = select(*columns).select_from(EPISODE.join(RECORDING, of_one_recording()))
-        return query.where(compile_filter(filter, SqliteDialect(declared)))
+        condition = compile_filter(filter, SqliteDialect(declared))
+        return query.select_from(EPISODE.join(RECORDING, of_one_recording())).where(condition)
 
     @contextlib.contextmanager
     def _read(self) -> Iterator[Connection]:

@@ -23,6 +23,7 @@ INT64_MAX: Final = 2**63 - 1
 _UNUSUAL: Final = re.compile('[\\\\\x01\ud7ff\ud800-\udfff]|"\\$')
 _TO_ESCAPE: Final = re.compile("[\x00\x01\ud7ff\ud800-\udfff]")
 _ESCAPED: Final = re.compile("\x01[\x01\x02]|\ud7ff[\x01\u0100-\u08ff]")
+_ALL_FIELDS: Final = set(EpisodeHeader.model_fields)
 _SURROGATES_AT: Final = 0x100
 _LONGEST_INT_BITS: Final = 1024  # what a float can hold
 
@@ -104,6 +105,7 @@ def header(row: StoredRow, uuid: str, benchmark_id: str, path: str) -> EpisodeHe
     Built without validation, which would cost more than the rest of a query.
     """
     return EpisodeHeader.model_construct(
+        _ALL_FIELDS,
         id=f"{uuid}-{row.episode}",
         created_by=unescape_text(row.created_by),
         published_in=list(_published_in(row.published_in)),
