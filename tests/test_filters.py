@@ -1,0 +1,600 @@
+"""One filter, one meaning: in memory, in SQLite, through JSON and as text."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from tupli_mcap.errors import FilterError
+from tupli_mcap.messages.jsonvalue import dumps_plain
+from tupli_mcap.schema import (
+    BaseFilter,
+    EpisodeHeader,
+    F,
+    FilterAND,
+    FilterEQ,
+    FilterGEQ,
+    FilterGT,
+    FilterIN,
+    FilterLEQ,
+    FilterLT,
+    FilterNE,
+    FilterNOT,
+    FilterOR,
+    compile_predicate,
+    evaluate_columns,
+    format_filter,
+    join_key,
+    parse_filter,
+    split_key,
+)
+from tupli_mcap.storage.catalog import Catalog, EpisodeRow, RecordingStamp
+
+STAMP = RecordingStamp(1, 2, 3)
+UUID = "0123456789abcdef0123456789abcdef"
+
+# Few names and values, so that filters and items meet; each is there for a reason a database may err on.
+NAMES = [
+    "a",
+    "b",
+    "a.b",
+    "0",
+    "",
+    '"',
+    "'",
+    "\\",
+    "größe",
+    "$float",
+    "$x",
+    "\x00",
+    "\ud7ff",
+    "x y",
+    "\U0001f600",
+]
+NUMBERS = [
+    *(
+        0,
+        1,
+        -1,
+        2**53,
+        2**53 + 1,
+        2**63 - 1,
+        2**63,
+        -(2**63),
+        -(2**63) - 1,
+        2**64,
+        10**30,
+        10**400,
+        -(10**400),
+    ),
+    *(0.0, -0.0, 1.0, 0.1, 0.1 + 0.2, 0.3, 1.5, float(2**53), float(2**63), 1e300, 5e-324, 2.5e-310),
+    *(
+        math.nextafter(1.0, 2.0),
+        math.nextafter(1.0, 0.0),
+        1.7976931348623157e308,
+        math.inf,
+        -math.inf,
+        math.nan,
+    ),
+]
+TEXTS = [
+    "",
+    "a",
+    "b",
+    "ab",
+    "A",
+    "1",
+    "true",
+    "nan",
+    "a\x00",
+    "a\x00b",
+    "a\x01",
+    "\ud7ff",
+    "\ue000",
+    "é",
+    "\U0001f600",
+    "'\"\\",
+]
+numbers = st.sampled_from(NUMBERS) | st.integers(-3, 3) | st.floats() | st.integers()
+texts = st.sampled_from(TEXTS) | st.text(max_size=3)
+scalars = st.none() | st.booleans() | numbers | texts
+surrogates = st.sampled_from(["\ud800", "a\udfff", "\udfff\ud800"])
+names = st.sampled_from(NAMES)
+values = st.recursive(
+    scalars | surrogates,
+    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(names, inner, max_size=3),
+    max_leaves=6,
+)
+items = st.dictionaries(names | surrogates, values, max_size=4)
+metadata_keys = st.lists(names, min_size=1, max_size=3).map(lambda path: join_key(["metadata", *path]))
+HEADER_KEYS = [
+    *(
+        "n_tuples",
+        "env",
+        "episode",
+        "seed",
+        "episode_return",
+        "terminated",
+        "timeout",
+        "end",
+        "id",
+        "created_at",
+    ),
+    *("created_by", "benchmark_id", "recording", "published_in", "metadata", "end.x"),
+]
+keys = metadata_keys | st.sampled_from(HEADER_KEYS)
+own_texts = st.sampled_from(
+    [f"{UUID}-0", f"{UUID}-1", f"{UUID}-", "x-0", "terminal", "timeout", "me", "bench"]
+)
+
+
+@st.composite
+def leaves(draw: st.DrawFn) -> BaseFilter:
+    key, kind = (
+        draw(keys),
+        draw(st.sampled_from([FilterEQ, FilterNE, FilterIN, FilterGT, FilterGEQ, FilterLT, FilterLEQ])),
+    )
+    if kind is FilterIN:
+        return FilterIN(key=key, value=draw(st.lists(scalars | own_texts, max_size=20)))
+    ordered = numbers | texts | own_texts
+    return kind(key=key, value=draw(ordered if kind not in (FilterEQ, FilterNE) else scalars | own_texts))
+
+
+filters = st.recursive(
+    leaves(),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3).map(lambda parts: FilterAND(filters=parts)),
+        st.lists(inner, max_size=3).map(lambda parts: FilterOR(filters=parts)),
+        inner.map(lambda part: FilterNOT(filters=[part])),
+    ),
+    max_leaves=6,
+)
+rows = st.fixed_dictionaries(
+    {
+        "metadata": items,
+        "n_tuples": st.integers(0, 3) | st.just(2**62),
+        "env": st.integers(0, 2),
+        "end": st.sampled_from(["terminal", "timeout", "interrupted"]),
+        "episode_return": st.none() | st.floats() | st.sampled_from([0.0, 1.0, 2.0**63]),
+        "seed": st.none() | st.integers(0, 3) | st.integers(-(2**130), 2**130),
+        "created_by": st.sampled_from(["me", "you", "a\x00", "\ud800"]),
+    }
+)
+
+
+def header_of(number: int, row: dict[str, Any]) -> EpisodeHeader:
+    return EpisodeHeader(
+        id=f"{UUID}-{number}",
+        created_at="2026-01-01",
+        published_in=["me"],
+        benchmark_id="bench",
+        terminated=row["end"] == "terminal",
+        timeout=row["end"] == "timeout",
+        episode=number,
+        recording="r.mcap",
+        **row,
+    )
+
+
+def fill(catalog: Catalog, headers: list[EpisodeHeader]) -> None:
+    rows = [
+        EpisodeRow(
+            episode=h.episode,
+            env=h.env,
+            n_tuples=h.n_tuples,
+            end=h.end,
+            episode_return=h.episode_return,
+            seed=h.seed,
+            created_at=h.created_at,
+            created_by=h.created_by,
+            published_in=json.dumps(h.published_in),
+            metadata=dumps_plain(h.metadata),
+        )
+        for h in headers
+    ]
+    catalog.put_recording("r.mcap", STAMP, uuid=UUID, benchmark_id="bench", rows=rows)
+
+
+@pytest.fixture(scope="module")
+def catalogs() -> Iterator[tuple[Catalog, Catalog]]:
+    """One catalog without declared keys and one with."""
+    with Catalog(None) as plain, Catalog(None) as declared:
+        for key in (
+            "metadata.a",
+            "metadata.a.b",
+            'metadata."a.b"',
+            "metadata.0",
+            "n_tuples",
+            "episode_return",
+            "end",
+        ):
+            declared.declare_key(key)
+        yield plain, declared
+
+
+class TestOneMeaning:
+    @settings(max_examples=400, deadline=None)
+    @given(data=st.lists(rows, min_size=1, max_size=4), filter=filters)
+    def test_memory_and_sqlite_agree(
+        self, catalogs: tuple[Catalog, Catalog], data: list[dict[str, Any]], filter: BaseFilter
+    ) -> None:
+        headers = [header_of(number, row) for number, row in enumerate(data)]
+        predicate = compile_predicate(filter, EpisodeHeader)
+        expected = [header.episode for header in headers if predicate(header)]
+        again = BaseFilter.model_validate_json(filter.model_dump_json())
+        for catalog in catalogs:
+            fill(catalog, headers)
+            assert [header.episode for header in catalog.episodes(filter)] == expected
+            assert [header.episode for header in catalog.episodes(~again)] == [
+                header.episode for header in headers if not predicate(header)
+            ]
+            assert catalog.count(again) == len(expected)
+
+    @settings(max_examples=300, deadline=None)
+    @given(filter=filters)
+    def test_json_restores_a_filter(self, filter: BaseFilter) -> None:
+        again = BaseFilter.model_validate_json(filter.model_dump_json())
+        assert again == filter
+        assert hash(again) == hash(filter)
+        assert BaseFilter.model_validate(filter.to_params_dict()) == filter
+        assert json.loads(json.dumps(filter.to_params_dict(), allow_nan=False)) == filter.to_params_dict()
+
+    @settings(max_examples=300, deadline=None)
+    @given(filter=filters)
+    def test_repr_is_the_expression(self, filter: BaseFilter) -> None:
+        again = eval(repr(filter), {"F": F, "FilterAND": FilterAND, "FilterOR": FilterOR, "float": float})
+        row = header_of(
+            0, {"metadata": {"a": 1, "b": "a"}, "n_tuples": 1, "end": "timeout", "created_by": "me"}
+        )
+        assert compile_predicate(again)(row) == compile_predicate(filter)(row)
+
+    @settings(max_examples=400, deadline=None)
+    @given(filter=filters)
+    def test_text_restores_a_filter(self, filter: BaseFilter) -> None:
+        if has_empty(filter):
+            with pytest.raises(FilterError, match=r"an empty (AND|OR) has no text"):
+                format_filter(filter)
+        else:
+            assert flat(parse_filter(format_filter(filter))) == flat(filter)
+
+    @pytest.mark.parametrize("value", NUMBERS)
+    def test_numbers_compare_exactly_in_sqlite(self, value: float) -> None:
+        with Catalog(None) as catalog:
+            fill(catalog, [header_of(i, base_row({"x": number}, number)) for i, number in enumerate(NUMBERS)])
+            for operation in (FilterEQ, FilterNE, FilterGT, FilterGEQ, FilterLT, FilterLEQ):
+                for key in ("metadata.x", "episode_return"):
+                    asked = operation(key=key, value=value)
+                    expected = [h.episode for h in catalog.episodes() if compile_predicate(asked)(h)]
+                    assert [h.episode for h in catalog.episodes(asked)] == expected, asked
+
+
+def base_row(metadata: dict[str, Any], number: float) -> dict[str, Any]:
+    ret = number if isinstance(number, float) else None
+    return {"metadata": metadata, "n_tuples": 1, "end": "timeout", "created_by": "me", "episode_return": ret}
+
+
+def has_empty(filter: BaseFilter) -> bool:
+    return filter.key is None and (not filter.filters or any(map(has_empty, filter.filters)))
+
+
+def flat(filter: BaseFilter) -> BaseFilter:
+    """Without ANDs and ORs of one, which text does not show."""
+    if filter.key is not None:
+        return filter
+    parts = [flat(part) for part in filter.filters]
+    if len(parts) == 1 and filter.type != "NOT":
+        return parts[0]
+    return BaseFilter(type=filter.type, filters=parts)
+
+
+ITEM = {
+    "metadata": {
+        "n": 1,
+        "f": 1.0,
+        "big": 2**53 + 1,
+        "nan": math.nan,
+        "t": "b",
+        "yes": True,
+        "no": None,
+        "l": [1],
+        "d": {"x": 1},
+    }
+}
+
+
+class TestMeaning:
+    @pytest.mark.parametrize(
+        ("filter", "expected"),
+        [
+            (F("metadata.n") == 1, True),
+            (F("metadata.n") == 1.0, True),
+            (F("metadata.f") == 1, True),
+            (F("metadata.n") == True, False),  # noqa: E712
+            (F("metadata.yes") == 1, False),
+            (F("metadata.yes") != 1, True),
+            (F("metadata.yes") == True, True),  # noqa: E712
+            (F("metadata.big") == float(2**53), False),
+            (F("metadata.big") > float(2**53), True),
+            (F("metadata.missing") == 1, False),
+            (F("metadata.missing") != 1, False),
+            (F("metadata.missing") < 1, False),
+            (~(F("metadata.missing") < 1), True),
+            (~(F("metadata.missing") != 1), True),
+            (F("metadata.no") == None, True),  # noqa: E711
+            (F("metadata.no") != None, False),  # noqa: E711
+            (F("metadata.n") != None, True),  # noqa: E711
+            (F("metadata.missing") == None, False),  # noqa: E711
+            (F("metadata.no") < 1, False),
+            (F("metadata.nan") == math.nan, False),
+            (F("metadata.nan") != math.nan, True),
+            (F("metadata.nan") >= math.nan, False),
+            (F("metadata.nan") < 1, False),
+            (F("metadata.n") != math.nan, True),
+            (F("metadata.t") > "a", True),
+            (F("metadata.t") > "B", True),
+            (F("metadata.t") > 1, False),
+            (F("metadata.t") < 1, False),
+            (F("metadata.n") != "1", True),
+            (F("metadata.l") == 1, False),
+            (F("metadata.l") != 1, True),
+            (F("metadata.l.0") == 1, False),
+            (F("metadata.d") != 1, True),
+            (F("metadata.d.x") == 1, True),
+            (F("metadata.n.x") != 1, False),
+            (F("metadata.n").isin([]), False),
+            (F("metadata.n").isin(["1", 2, 1]), True),
+            (F("metadata.nan").isin([math.nan]), False),
+            (F("metadata.no").isin([None]), True),
+            (FilterAND(filters=[]), True),
+            (FilterOR(filters=[]), False),
+            (~FilterOR(filters=[]), True),
+        ],
+        ids=repr,
+    )
+    def test_each_rule(self, filter: BaseFilter, expected: bool) -> None:
+        assert compile_predicate(filter)(ITEM) is expected
+        row = header_of(0, base_row(ITEM["metadata"], 0))
+        with Catalog(None) as catalog:
+            fill(catalog, [row])
+            assert catalog.count(filter) == expected
+
+    def test_no_filter_is_true_of_everything(self) -> None:
+        assert compile_predicate(None)({})
+
+    def test_numpy_values_are_what_they_hold(self) -> None:
+        item = {"a": np.float32(0.5), "b": np.bool_(True), "c": np.array(3), "d": np.array([3])}
+        assert compile_predicate((F("a") == 0.5) & (F("b") == True) & (F("c") == 3) & (F("d") != 3))(item)  # noqa: E712
+        assert compile_predicate(F("a") == np.float64(0.5))(item)
+
+    def test_tagged_floats_are_floats(self) -> None:
+        predicate = compile_predicate(F("x") > 3)
+        assert predicate({"x": {"$float": "inf"}})
+        assert not predicate({"x": {"$float": "nan"}})
+        assert not compile_predicate(F("x.$float") == "nan")({"x": {"$float": "nan"}})
+
+
+class TestConstruction:
+    def test_combining_never_mutates(self) -> None:
+        a, b, c = F("a") == 1, F("b") == 2, F("c") == 3
+        both = a & b
+        before = both.model_dump_json()
+        assert (both & c) == FilterAND(filters=[a, b, c])
+        assert (c & both) == FilterAND(filters=[c, a, b])
+        assert (a | b | c) == FilterOR(filters=[a, b, c])
+        assert both.apply_prefix("metadata") == (F("metadata.a") == 1) & (F("metadata.b") == 2)
+        assert both.model_dump_json() == before
+        assert ~~a == a
+        with pytest.raises(ValueError, match="frozen"):
+            a.value = 3  # type: ignore[misc]
+
+    def test_lists_of_the_caller_are_copied(self) -> None:
+        values, parts = [1, 2], [F("a") == 1]
+        chosen, either = F("x").isin(values), FilterOR(filters=parts)
+        values.append(3)
+        parts.clear()
+        assert chosen.value == (1, 2)
+        assert len(either.filters) == 1
+
+    def test_from_list(self) -> None:
+        headers = [header_of(n, base_row({}, 0)) for n in range(2)]
+        built = FilterOR.from_list(headers, on_key="benchmark_id", from_key="id")
+        assert built == (F("benchmark_id") == f"{UUID}-0") | (F("benchmark_id") == f"{UUID}-1")
+        assert FilterOR.from_list([], on_key="a", from_key="b") == FilterOR(filters=[])
+
+    @pytest.mark.parametrize(
+        ("make", "message"),
+        [
+            (lambda: FilterEQ(key="a"), "EQ needs a key and a value"),
+            (lambda: FilterEQ(value=1), "EQ needs a key and a value"),
+            (lambda: FilterEQ(key="a", value={}), "'a' can be compared with null, bool, numbers and text"),
+            (lambda: FilterEQ(key="a", value=[1]), "can be compared with"),
+            (lambda: F("a") == object(), "can be compared with"),
+            (lambda: F("a") == 1j, "can be compared with"),
+            (lambda: F("a") == np.datetime64("2020-01-01"), "can be compared with"),
+            (lambda: F("a") > True, "GT on 'a' orders numbers or text, found True"),
+            (lambda: F("a") <= None, "LEQ on 'a' orders numbers or text, found None"),
+            (lambda: F("a") < [1], "can be compared with"),
+            (lambda: FilterIN(key="a", value=3), "IN on 'a' takes a list of values, found 3"),
+            (lambda: FilterIN(key="a", value=[[3]]), r"found \(3,\)|found \[3\]"),
+            (lambda: FilterEQ(type="GT", key="a", value=1), "Input should be"),
+            (lambda: FilterAND(filters=[], key="a"), "takes no key or value"),
+            (lambda: FilterNOT(filters=[]), "NOT takes exactly one filter, found 0"),
+            (lambda: FilterEQ(key="a", value=1, filters=[F("b") == 1]), "takes no filters"),
+            (lambda: FilterEQ(key="a", value="\ud800"), "lone surrogate"),
+            (lambda: F("a..b") == 1, r"'a..b' needs a name at character 2"),
+            (lambda: F("") == 1, "needs a name at character 0"),
+            (lambda: F('a."x') == 1, "needs a name at character 2"),
+            (lambda: F('a."x"y') == 1, "needs a dot or its end at character 5"),
+            (lambda: F(r'a."\x"') == 1, "not a JSON string"),
+            (lambda: nested(101), "nest at most 100 deep"),
+            (lambda: bool(F("a") == 1), "no truth value"),
+            (lambda: 1 < F("a") < 3, "no truth value"),
+        ],
+    )
+    def test_what_has_no_meaning_is_refused(self, make: Any, message: str) -> None:
+        with pytest.raises(FilterError, match=message):
+            make()
+
+    def test_unknown_keys_are_refused_with_the_known_ones(self) -> None:
+        misspelt = (F("metadata.x") == 1) & ~(F("n_tuple") == 1)
+        with pytest.raises(FilterError, match=r"'n_tuple'; the keys are benchmark_id, .*, n_tuples"):
+            compile_predicate(misspelt, EpisodeHeader)
+        with Catalog(None) as catalog, pytest.raises(FilterError, match="'n_tuple'; the keys are"):
+            catalog.episodes(misspelt)
+
+    @given(st.lists(st.text(max_size=4).filter(lambda text: text.isprintable()), min_size=1, max_size=3))
+    @example(["", ".", '"', "a.b", '"a"'])
+    def test_keys_round_trip(self, segments: list[str]) -> None:
+        assert split_key(join_key(segments)) == tuple(segments)
+
+
+def nested(depth: int) -> BaseFilter:
+    inner: BaseFilter = F("a") == 1
+    for _ in range(depth):
+        inner = FilterAND(filters=[inner])
+    return inner
+
+
+class TestParser:
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("metadata.cum_eps_reward > -200", F("metadata.cum_eps_reward") > -200),
+            ("a = 1 and b == 'x' or not c != 2.5", ((F("a") == 1) & (F("b") == "x")) | ~(F("c") != 2.5)),
+            ("a=1 AND (b=2 Or c=TRUE)", (F("a") == 1) & ((F("b") == 2) | (F("c") == True))),  # noqa: E712
+            ("n_tuples in [1, 2.0, 'x', null,]", F("n_tuples").isin([1, 2.0, "x", None])),
+            ("a not in []", ~F("a").isin([])),
+            ('metadata."a.b".c >= 1e-3', F("metadata", "a.b", "c") >= 1e-3),
+            ("metadata.größe.run-1.0 < inf", F("metadata.größe.run-1.0") < math.inf),
+            (r"""a = 'it\'s' and b = "\u00e9" """, (F("a") == "it's") & (F("b") == "é")),
+            ("a = none and android = -inf", (F("a") == None) & (F("android") == -math.inf)),  # noqa: E711
+        ],
+    )
+    def test_texts(self, text: str, expected: BaseFilter) -> None:
+        assert parse_filter(text) == expected
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("", "needs a key such as metadata.score at character 0, found the end"),
+            ("a", "needs one of = == != > >= < <= in at character 1, found the end"),
+            ("a > ", "needs a value .* at character 4, found the end"),
+            ("a > b", "needs a value .* at character 4, found 'b'"),
+            ("a > 3 b", "needs and, or, or the end at character 6, found 'b'"),
+            ("(a > 3", r"needs '\)' at character 6"),
+            ("a in (1)", r"needs '\[' at character 5"),
+            ("a in [1 2]", "needs ',' at character 8"),
+            ("a ; drop", "at character 2, found ';'"),
+            ("a > true", r"orders numbers or text, found True \(at character 0"),
+            ("a..b = 1", "at character 1"),
+            ("and = 1", "needs a key .* at character 0, found 'and'"),
+            ("a = 'x", "at character 4"),
+            ("a = " + "9" * 5000, "a shorter number at character 4"),
+            ("(" * 10_000 + "a = 1" + ")" * 10_000, "nests deeper than 50 at character 51"),
+            ("not " * 10_000 + "a = 1", "nests deeper than 50"),
+        ],
+    )
+    def test_errors_say_where(self, text: str, message: str) -> None:
+        with pytest.raises(FilterError, match=message):
+            parse_filter(text)
+
+    @settings(max_examples=500, deadline=None)
+    @given(st.text(alphabet="ab.\"'()[]<>=!,12e-+ nortu\\", max_size=25))
+    def test_any_text_is_a_filter_or_an_error(self, text: str) -> None:
+        try:
+            parsed = parse_filter(text)
+        except FilterError:
+            return
+        assert flat(parse_filter(format_filter(parsed))) == flat(parsed)
+
+
+COLUMNS = {
+    "reward": np.array([0.1, 1.0, math.nan, -1.0], np.float32),
+    "terminal": np.array([False, False, False, True]),
+    "state": {"pos": np.arange(8, dtype=np.int64).reshape(4, 2), "tag": ["x", "y", None, "x"]},
+    "action": (np.array([0, 1, 2, 3], np.uint8), [{"k": 1}, {}, {"k": [5, 6]}, {"k": True}]),
+}
+
+
+class TestColumns:
+    @pytest.mark.parametrize(
+        ("filter", "expected"),
+        [
+            (F("reward") > 0, [1, 1, 0, 0]),
+            (F("reward") > 0.1, [1, 1, 0, 0]),  # float32(0.1) is greater than 0.1
+            (F("reward") != 1, [1, 0, 1, 1]),
+            (~(F("reward") > 0), [0, 0, 1, 1]),
+            (F("terminal") == True, [0, 0, 0, 1]),  # noqa: E712
+            (F("terminal") == 1, [0, 0, 0, 0]),
+            (F("state.pos.0") < 2.5, [1, 1, 0, 0]),
+            (F("state.pos.1") >= 3, [0, 1, 1, 1]),
+            (F("state.tag") == "x", [1, 0, 0, 1]),
+            (F("state.tag").isin([None, "y"]), [0, 1, 1, 0]),
+            (F("action.0") > 300, [0, 0, 0, 0]),
+            (F("action.0") >= -1, [1, 1, 1, 1]),
+            (F("action.1.k") != 2, [1, 0, 1, 1]),
+            (F("action.1.k.1") == 6, [0, 0, 1, 0]),
+            ((F("reward") > 0) & (F("action.0") > 0), [0, 1, 0, 0]),
+            ((F("reward") < 0) | (F("action.0") == 0), [1, 0, 0, 1]),
+            (FilterAND(filters=[]), [1, 1, 1, 1]),
+            (FilterOR(filters=[]), [0, 0, 0, 0]),
+            (F("reward").isin([]), [0, 0, 0, 0]),
+        ],
+        ids=repr,
+    )
+    def test_masks(self, filter: BaseFilter, expected: list[int]) -> None:
+        mask = evaluate_columns(filter, COLUMNS)
+        assert mask.dtype == np.bool_
+        assert mask.astype(int).tolist() == expected
+
+    @pytest.mark.parametrize(
+        ("filter", "message"),
+        [
+            (F("rewards") > 0, "unknown filter key 'rewards': a step has reward, terminal, state, action"),
+            (F("state.vel") > 0, "unknown filter key 'state.vel': state has pos, tag"),
+            (F("state") > 0, "'state' names several values a step"),
+            (F("state.pos") > 0, r"needs 1 positions for values of shape \(2,\), found 0"),
+            (F("state.pos.2") > 0, "needs a position from 0 to 1, found '2'"),
+            (F("action.2") > 0, "action has 0, 1"),
+            (F("reward.0") > 0, r"needs 0 positions for values of shape \(\), found 1"),
+        ],
+    )
+    def test_errors_say_what_there_is(self, filter: BaseFilter, message: str) -> None:
+        with pytest.raises(FilterError, match=message):
+            evaluate_columns(filter, COLUMNS)
+
+    @settings(max_examples=300, deadline=None)
+    @given(
+        data=st.lists(numbers, min_size=1, max_size=5),
+        dtype=st.sampled_from(["f8", "f4", "f2", "i8", "i1", "u8", "u1", "?"]),
+        operation=st.sampled_from([FilterEQ, FilterNE, FilterGT, FilterGEQ, FilterLT, FilterLEQ]),
+        value=numbers,
+    )
+    def test_arrays_and_scalars_agree(
+        self, data: list[float], dtype: str, operation: Any, value: float
+    ) -> None:
+        array = np.array([fit(number, np.dtype(dtype)) for number in data], dtype)
+        asked = operation(key="x", value=value)
+        predicate = compile_predicate(asked)
+        assert evaluate_columns(asked, {"x": array}).tolist() == [predicate({"x": item}) for item in array]
+
+
+def fit(number: float, dtype: np.dtype[Any]) -> Any:
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        whole = 0 if isinstance(number, float) and not math.isfinite(number) else int(number)
+        return min(max(whole, limits.min), limits.max)
+    if dtype.kind == "b":
+        return number == 1
+    with np.errstate(over="ignore"):
+        try:
+            return dtype.type(float(number))
+        except OverflowError:
+            return dtype.type(math.inf)
