@@ -3,7 +3,7 @@
 from tupli_mcap.environment._build import build
 from tupli_mcap.environment._capture import Snapshot, capture, record_environment
 from tupli_mcap.environment._pickling import rebuild_ezpickled
-from tupli_mcap.environment._record import EnvironmentRecord, canonical_json
+from tupli_mcap.environment._record import EnvironmentRecord, canonical_json, sha256
 
 __all__ = [
     "EnvironmentRecord",
@@ -13,4 +13,5 @@ __all__ = [
     "capture",
     "rebuild_ezpickled",
     "record_environment",
+    "sha256",
 ]

@@ -26,9 +26,9 @@ _MAX_PLAIN_DEPTH = 20
 class InProcessCopy:
     """An environment pickled for this process only.
 
-    Classes are kept as they are, by reference, so that any class can be copied (locally defined ones too) and
-    copies are instances of the very same classes. So are objects that cannot be pickled (open files): `shares`
-    tells whether copies have such objects in common with the original.
+    Classes are kept as they are, by reference, so that any class can be copied (locally defined ones too)
+    and copies are instances of the very same classes. So are objects that cannot be pickled (open files):
+    `shares` tells whether copies have such objects in common with the original.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
