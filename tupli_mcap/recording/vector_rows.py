@@ -71,18 +71,18 @@ class VectorRows:
         view = None if leaf.size == 0 else self._rows[leaf.name]
         return leaf, view, self._layout.dtypes[leaf.name], (len(self._channels), *leaf.shape)
 
-    def _store(self, fields: Sequence[Any], root: Any, row: int) -> None:
+    def _checked(self, fields: Sequence[Any], root: Any) -> list[Any]:
+        values = []
         for leaf, view, dtype, shape in fields:
             value = leaf_value(root, leaf) if leaf.keys else root
-            if not (value.__class__ is np.ndarray and value.dtype == dtype and value.shape == shape):
+            if not (value.__class__ is np.ndarray and value.dtype is dtype and value.shape == shape):
                 value = exact_array(value, dtype, shape, leaf.path)
-            if view is not None:
-                view[self._half, :, row] = value
+            values.append((view, value))
+        return values
 
-    def check(self, state: Any) -> None:
-        """Raises StepError if a batch of states cannot be stored."""
-        for leaf, _, dtype, shape in self._state:
-            exact_array(leaf_value(state, leaf), dtype, shape, leaf.path)
+    def check(self, action: Any, state: Any, reward: Any) -> Any:
+        """A batch as `put` takes it; StepError if it cannot be stored."""
+        return self._checked(self._action, action), self._checked(self._reward, reward), self._checked(self._state, state)
 
     def put_state(self, state: Any, mask: Array | None = None) -> None:
         """The states of a reset: of all sub-environments, or of those in `mask`."""
@@ -95,16 +95,18 @@ class VectorRows:
             else:
                 view[self._half, mask, self._row] = value[mask]
 
-    def put(
-        self, action: Any, state: Any, reward: Any, terminal: Array, timeout: Array, episodes: Array, active: Array | None
-    ) -> None:
-        """Writes a batch; `active` None: every sub-environment took a step, `episodes` numbers theirs."""
+    def put(self, batch: Any, terminal: Array, timeout: Array, episodes: Array, active: Array | None) -> None:
+        """Writes a checked batch; `active` None: every sub-environment took a step, `episodes` numbers theirs."""
         half, row = self._half, self._row
-        self._store(self._action, action, row)
-        self._store(self._reward, reward, row)
+        actions, rewards, states = batch
+        for view, value in (*actions, *rewards):
+            if view is not None:
+                view[half, :, row] = value
         self._flags[0][half, :, row] = terminal
         self._flags[1][half, :, row] = timeout
-        self._store(self._state, state, row + 1)
+        for view, value in states:
+            if view is not None:
+                view[half, :, row + 1] = value
         self._episode[half, :, row] = episodes
         self._time[half, :, row] = time.time_ns()
         if active is None:

@@ -1,0 +1,318 @@
+"""Episodes of a vector environment: one stream a sub-environment, under every autoreset mode.
+
+NEXT_STEP: after an end, the next call resets the sub-environment and ignores its action: a hole, no step.
+SAME_STEP: the call that ends an episode already returns the next one's first state; the final one is in `final_obs`.
+DISABLED: the caller resets, all or by `reset_mask`.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector.utils import batch_space, iterate
+
+from tupli_mcap.errors import StepError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.exact import decide_dtype, leaf_value
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
+from tupli_mcap.recording.infos import InfoRecorder
+from tupli_mcap.recording.logs import leaf_encoders
+from tupli_mcap.recording.single import decide_layout
+from tupli_mcap.recording.vector_rows import VectorRows
+from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
+
+__all__ = ["Autoreset", "VectorRecorder", "info_of"]
+
+Array = np.ndarray[Any, Any]
+Autoreset = Literal["NextStep", "SameStep", "Disabled"]
+
+
+def info_of(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
+    """The info of sub-environment `i`, without what autoreset adds."""
+    found = {}
+    for key, value in infos.items():
+        mask = infos.get(f"_{key}")
+        if key in ("final_obs", "final_info") or not isinstance(mask, np.ndarray) or not mask[i]:
+            continue
+        found[key] = info_of(value, i) if isinstance(value, dict) else value[i]
+    return found
+
+
+class VectorRecorder:
+    """Records the episodes of `num_envs` sub-environments. `spaces` are those of one of them."""
+
+    def __init__(
+        self, writer: RecordingWriter, spaces: StepLayout, num_envs: int, autoreset: Autoreset, infos: InfoRecorder | None
+    ) -> None:
+        self._writer = writer
+        self._spaces = spaces
+        self._n = num_envs
+        self._autoreset = autoreset
+        self._infos = infos
+        self._observations = batch_space(spaces.observation_space, num_envs)
+        self._actions = batch_space(spaces.action_space, num_envs)
+        self._first: Any = None
+        self._facts: list[ResetFacts | None] = [None] * num_envs
+        self._fresh = False
+        self._episodes: list[StartedEpisode | None] = [None] * num_envs
+        self._numbers = np.zeros(num_envs, dtype=np.uint32)
+        self._lengths = np.zeros(num_envs, dtype=np.int64)
+        self._totals: Array = np.zeros(num_envs)
+        self._ended = np.zeros(num_envs, dtype=np.bool_)
+        self._texts = ["{}"] * num_envs
+        self._was_reset = False
+        self._refused = False
+        self._final_bytes: dict[int, bytes] = {}  # final states that are in no row
+
+    # ---- resets
+
+    def reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None = None) -> None:
+        """All sub-environments, or those in `mask`, start over; running episodes end as interrupted.
+
+        Raises:
+            StepError: a state cannot be stored exactly.
+        """
+        chosen = range(self._n) if mask is None else np.flatnonzero(mask)
+        for i in chosen:
+            self._end(int(i), INTERRUPTED)
+            self._facts[int(i)] = facts[int(i)]
+            self._ended[int(i)] = False
+        self._fresh = True
+        self._was_reset = True
+        self._refused = False
+        store = self._writer.vector
+        if store is None:
+            self._first = copy.deepcopy(states)
+            return
+        self._put_states(states, chosen if mask is not None else None)
+
+    def _put_states(self, states: Any, chosen: Iterable[Any] | None) -> None:
+        store = self._writer.vector
+        if isinstance(store, VectorRows):
+            mask = None
+            if chosen is not None:
+                mask = np.zeros(self._n, dtype=np.bool_)
+                mask[list(chosen)] = True
+            store.put_state(states, mask)
+            for sinks, leaf in zip(self._writer.images, self._writer.layout.images, strict=True):  # type: ignore[union-attr]
+                images = leaf_value(states, leaf)
+                for i in range(self._n) if mask is None else np.flatnonzero(mask):
+                    sinks[i].put_first(sinks[i].check(images[i]))
+        elif store is not None:
+            wanted = set(range(self._n) if chosen is None else (int(i) for i in chosen))
+            for i, state in enumerate(self._each(self._observations, states)):
+                if i in wanted:
+                    store[i].begin_episode(0)
+                    store[i].put_state(state)
+
+    def _each(self, space: Any, batch: Any) -> Iterator[Any]:
+        return iter(iterate(space, batch))
+
+    # ---- steps
+
+    def put(self, actions: Any, states: Any, rewards: Any, terminals: Any, timeouts: Any, infos: Mapping[str, Any]) -> Array:
+        """Records a batch; returns which sub-environments took a step (bool, `num_envs`).
+
+        Raises:
+            StepError: something cannot be stored exactly; nothing of this batch is recorded.
+        """
+        if not self._was_reset or self._refused:
+            why = "the step before this one could not be recorded" if self._refused else "there was no reset yet"
+            raise StepError(f"{why}; call env.reset() to go on")
+        rewards = np.asarray(rewards)
+        terminals, timeouts = np.asarray(terminals, dtype=np.bool_), np.asarray(timeouts, dtype=np.bool_)
+        if self._writer.vector is None:
+            self._begin(actions, states, rewards)
+        holes = self._ended if self._autoreset == "NextStep" and self._ended.any() else None
+        active = None if holes is None else ~holes
+        try:
+            finals = self._finals(states, terminals | timeouts, infos)
+            if self._fresh:
+                self._start(active)
+            self._store(actions, states, rewards, terminals, timeouts, active, finals)
+        except StepError:
+            self.refuse()
+            raise
+        stepped = np.ones(self._n, dtype=np.bool_) if active is None else active
+        self._lengths += stepped
+        self._totals += rewards.reshape(self._n, -1).sum(axis=1) * stepped if rewards.ndim > 1 else rewards * stepped
+        if holes is not None:
+            self._note_resets(holes, infos)
+        self._ended = (terminals | timeouts) & stepped
+        return stepped
+
+    def note_metadata(self, texts: Sequence[str]) -> None:
+        """The metadata (JSON texts) of the running episodes, by sub-environment."""
+        self._texts = list(texts)
+
+    def finish(self, terminals: Any) -> None:
+        """Ends the episodes that ended in the batch just put."""
+        if not self._ended.any():
+            return
+        for i in np.flatnonzero(self._ended):
+            self._end(int(i), TERMINAL if terminals[i] else TIMEOUT)
+        if self._autoreset == "SameStep":
+            self._after_same_step()
+
+    def put_infos(self, stepped: Array, entries: Sequence[Mapping[str, Any]]) -> None:
+        """Records infos of the batch just put."""
+        if self._infos is None:
+            return
+        for i in np.flatnonzero(stepped):
+            episode = self._episodes[i]
+            if episode is not None:
+                self._infos.put(self._writer, episode.number, int(self._lengths[i]) - 1, entries[i])
+
+    def _begin(self, actions: Any, states: Any, rewards: Array) -> None:
+        if self._spaces.constant:
+            batches = [self._first, states], [actions], [rewards]
+            layout = self._batch_layout(*batches)
+        else:
+            firsts = [*self._each(self._observations, self._first), *self._each(self._observations, states)]
+            layout = decide_layout(
+                self._spaces, firsts, list(self._each(self._actions, actions)), list(rewards), self._writer.layout
+            )
+        schema = None if self._infos is None else self._infos.schema()
+        self._writer.begin(layout, self._n, vector=True, info_schema=schema)
+        self._put_states(self._first, None)
+        self._first = None
+
+    def _batch_layout(self, states: list[Any], actions: list[Any], rewards: list[Any]) -> StepLayout:
+        """`decide_layout` on whole batches: only dtypes are decided, shapes are checked when a batch is stored."""
+        if self._writer.layout is not None:
+            return self._writer.layout
+        dtypes = {}
+        for leaves, roots in ((self._spaces.state, states), (self._spaces.action, actions), (self._spaces.reward, rewards)):
+            for leaf in leaves:
+                if leaf.dtype is None or leaf.kind == "image":
+                    continue
+                if leaf.name == "reward" and self._spaces.reward_space is None:
+                    continue
+                dtypes[leaf.name] = decide_dtype(leaf, [np.asarray(leaf_value(root, leaf)) for root in roots])
+        return StepLayout(
+            self._spaces.observation_space, self._spaces.action_space, self._spaces.reward_space, dtypes
+        )
+
+    def _finals(self, states: Any, done: Array, infos: Mapping[str, Any]) -> dict[int, Any]:
+        """The final states of a same-step autoreset."""
+        if self._autoreset != "SameStep" or not done.any():
+            return {}
+        given = infos.get("final_obs", infos.get("final_observation"))
+        if given is None:
+            raise StepError("expected infos['final_obs'] for episodes that end under same-step autoreset, found none")
+        return {int(i): given[i] for i in np.flatnonzero(done)}
+
+    def _start(self, active: Array | None) -> None:
+        for i, facts in enumerate(self._facts):
+            if self._episodes[i] is not None or (active is not None and not active[i]):
+                continue
+            if facts is None:  # stepped on after an end, without a reset
+                facts = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
+            episode = self._writer.start_episode(i, self._count(i), facts)
+            self._episodes[i] = episode
+            self._facts[i] = None
+            self._numbers[i] = episode.number
+            self._lengths[i] = 0
+            self._totals[i] = 0.0
+            if isinstance(self._writer.vector, list):
+                self._writer.vector[i].begin_episode(episode.number)
+        self._fresh = any(episode is None for episode in self._episodes)
+
+    def _count(self, i: int) -> int:
+        store = self._writer.vector
+        return int(store.counts[i]) if isinstance(store, VectorRows) else store[i].count  # type: ignore[index]
+
+    def _store(
+        self, actions: Any, states: Any, rewards: Array, terminals: Array, timeouts: Array, active: Array | None, finals: dict[int, Any]
+    ) -> None:
+        store = self._writer.vector
+        self._final_bytes = {i: self._encode_final(state) for i, state in finals.items()}
+        if isinstance(store, VectorRows):
+            images = self._check_images(states)
+            batch = store.check(actions, states, rewards)
+            for sinks, column in images:
+                for i in range(self._n):
+                    if active is None or active[i]:
+                        sinks[i].put(column[i])
+                    else:
+                        sinks[i].put_first(column[i])
+            store.put(batch, terminals, timeouts, self._numbers, active)
+            return
+        each = zip(self._each(self._actions, actions), self._each(self._observations, states), strict=True)
+        for i, (action, state) in enumerate(each):
+            if active is not None and not active[i]:
+                store[i].put_state(state)  # type: ignore[index]
+            else:
+                store[i].put(action, state, rewards[i], terminals[i], timeouts[i])  # type: ignore[index]
+
+    def _check_images(self, states: Any) -> list[tuple[Any, Any]]:
+        found = []
+        for sinks, leaf in zip(self._writer.images, self._writer.layout.images, strict=True):  # type: ignore[union-attr]
+            batch = leaf_value(states, leaf)
+            found.append((sinks, [sinks[i].check(batch[i]) for i in range(self._n)]))
+        return found
+
+    def _encode_final(self, state: Any) -> bytes:
+        """A final state that is in no row, as it follows `episode` and `env` in `/final_state`."""
+        layout = self._writer.layout
+        out = bytearray(8)
+        for leaf, encode in leaf_encoders(layout, layout.final_leaves):  # type: ignore[arg-type, union-attr]
+            encode(leaf_value(state, leaf), out, 0)
+        return bytes(out[8:])
+
+    def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
+        now = time.time_ns()
+        for i in np.flatnonzero(holes):
+            info = info_of(infos, int(i))
+            text = jsonvalue.dumps(info, fallback=repr) if info else "{}"
+            self._facts[i] = ResetFacts(None, None, "", text, now)
+        self._fresh = True
+
+    def _after_same_step(self) -> None:
+        now = time.time_ns()
+        for i in np.flatnonzero(self._ended):
+            self._facts[i] = ResetFacts(None, None, "", "{}", now)
+        self._fresh = True
+        self._ended = np.zeros(self._n, dtype=np.bool_)
+
+    # ---- ends
+
+    def _end(self, i: int, end: int) -> None:
+        episode, self._episodes[i] = self._episodes[i], None
+        text, self._texts[i] = self._texts[i], "{}"
+        if episode is None:
+            return
+        self._fresh = True
+        final = self._final_bytes.pop(i, None)
+        if final is None:
+            store: Any = self._writer.vector
+            final = store.pending_state(i) if isinstance(store, VectorRows) else store[i].pending_state()
+            final += b"".join(sinks[i].pending() for sinks in self._writer.images)
+        total = float(self._totals[i])
+        self._writer.end_episode(episode, end, int(self._lengths[i]), total, final, text)
+
+    def refuse(self) -> None:
+        """After a batch that could not be stored: running episodes end before it, and a reset must follow."""
+        for i in range(self._n):
+            if self._episodes[i] is not None and self._lengths[i]:
+                self._end(i, INTERRUPTED)
+        self._refused = True
+
+    def close(self) -> None:
+        """Ends the running episodes as interrupted and closes the recording."""
+        if self._writer.closed:
+            return
+        try:
+            if self._writer.failed is None:
+                for i in range(self._n):
+                    self._end(i, INTERRUPTED)
+        finally:
+            self._refused = True
+            self._writer.close()
+

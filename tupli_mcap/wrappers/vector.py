@@ -1,0 +1,186 @@
+"""`RecordEpisodes` for `gymnasium.vector` environments: one episode stream a sub-environment, in one file."""
+
+from __future__ import annotations
+
+import copy
+import os
+import time
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector.utils import iterate
+
+from tupli_mcap.errors import RecordingError, SpaceError, StepError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.episode import Step
+from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
+from tupli_mcap.recording.vector import VectorRecorder, info_of
+from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
+from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+
+__all__ = ["RecordEpisodes"]
+
+StepCallback = Callable[[Step], Mapping[str, Any] | None]
+
+
+class RecordEpisodes(gym.vector.VectorWrapper):  # type: ignore[type-arg]
+    """Records every sub-environment of a vector environment (Sync, Async, custom) into the MCAP file `path`.
+
+    Arguments are those of `tupli_mcap.RecordEpisodes`. A metadata callback is copied for each sub-environment.
+    `autoreset_mode` is the environment's own (`env.metadata["autoreset_mode"]`, next-step where it says nothing).
+    """
+
+    def __init__(
+        self,
+        env: gym.vector.VectorEnv[Any, Any, Any],
+        path: str | os.PathLike[str],
+        *,
+        metadata_callback: EpisodeMetadataCallback | None = None,
+        record_info: RecordInfo = False,
+        step_callback: StepCallback | None = None,
+        compression: str = "zstd",
+        mode: Mode = "x",
+        reward_space: gym.Space[Any] | None = None,
+        benchmark_id: str = "",
+        attachments: Mapping[str, tuple[str, bytes]] | None = None,
+        flush_seconds: float | None = None,
+        journal_dir: str | os.PathLike[str] | None = None,
+        chunk_size: int = 512 * 1024,
+        autoreset_mode: str | None = None,
+    ) -> None:
+        super().__init__(env)
+        self.path = Path(path)
+        self._autoreset = _autoreset(env, autoreset_mode)
+        n = env.num_envs
+        self._callbacks = (
+            None if metadata_callback is None else [copy.deepcopy(metadata_callback) for _ in range(n)]
+        )
+        self._step_callback = step_callback
+        wanted = record_info is not False or step_callback is not None
+        self._records_info = record_info is not False
+        infos = InfoRecorder([] if record_info is False else record_info) if wanted else None
+        spaces = StepLayout(env.single_observation_space, env.single_action_space, reward_space)
+        spaces.to_metadata()
+        options = WriterOptions(
+            compression, mode, benchmark_id, attachments, journal_dir, chunk_size, flush_seconds
+        )
+        self._writer = RecordingWriter(path, options)
+        try:
+            self._writer.check_spaces(spaces, n, vector=True)
+        except SpaceError:
+            self._writer.close()
+            raise
+        self._recorder = VectorRecorder(self._writer, spaces, n, self._autoreset, infos)
+        self._texts = ["{}"] * n
+        self._states: list[Any] = []
+        self._watches = wanted or metadata_callback is not None
+        self._finalizer = weakref.finalize(self, self._recorder.close)
+
+    @property
+    def closed(self) -> bool:
+        """True once the recording is finished."""
+        return self._writer.closed
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        result = self.env.step(actions)
+        states, rewards, terminals, timeouts, infos = result
+        if self._writer.closed:
+            raise RecordingError(f"{self.path} is closed; wrap the environment again to record")
+        stepped = self._recorder.put(actions, states, rewards, terminals, timeouts, infos)
+        if self._watches:
+            self._watch(stepped, actions, result)
+        self._recorder.finish(terminals)
+        return result
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        told = "" if options is None else jsonvalue.dumps(options, fallback=repr)
+        mask = None if options is None else options.get("reset_mask")
+        mask = None if mask is None else np.array(mask, dtype=np.bool_)
+        result = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        states, infos = result
+        n, now = self.num_envs, time.time_ns()
+        seeds: list[int | None] = [None] * n
+        if isinstance(seed, int | np.integer):
+            seeds = [int(seed) + i for i in range(n)]
+        elif seed is not None:
+            seeds = list(seed)
+        facts = []
+        for i in range(n):
+            info = info_of(infos, i)
+            facts.append(
+                ResetFacts(seeds[i], None, told, jsonvalue.dumps(info, fallback=repr) if info else "{}", now)
+            )
+        self._recorder.reset(states, facts, mask)
+        if self._watches:
+            self._forget(range(n) if mask is None else np.flatnonzero(mask))
+            self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
+        return result
+
+    def _watch(self, stepped: Any, actions: Any, result: Any) -> None:
+        states, rewards, terminals, timeouts, infos = result
+        after = copy.deepcopy(list(iterate(self.env.observation_space, states)))
+        entries: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        chosen = list(iterate(self.env.action_space, actions))
+        for i in np.flatnonzero(stepped):
+            info = info_of(infos, int(i))
+            if (terminals[i] or timeouts[i]) and self._autoreset == "SameStep":
+                info = info_of(infos.get("final_info", {}), int(i))
+            entries[i] = dict(info) if self._records_info else {}
+            values = (self._states[i], chosen[i], rewards[i], bool(terminals[i]), bool(timeouts[i]))
+            if self._step_callback is not None:
+                entries[i].update(self._step_callback(Step(*values, info)) or {})
+            if self._callbacks is not None:
+                state, action, reward, terminal, timeout = values
+                metadata = self._callbacks[i](
+                    RLTuple.model_construct(
+                        state=state, action=action, reward=float(reward), info=info, terminal=terminal, timeout=timeout
+                    )
+                )
+                self._texts[i] = jsonvalue.dumps_plain(metadata) if metadata else "{}"
+        self._recorder.put_infos(stepped, entries)
+        self._recorder.note_metadata(self._texts)
+        if self._callbacks is not None:
+            self._forget([i for i in np.flatnonzero(stepped) if terminals[i] or timeouts[i]])
+        self._states = after
+
+    def _forget(self, chosen: Any) -> None:
+        for i in chosen:
+            if self._callbacks is not None:
+                self._callbacks[i].reset()
+            self._texts[i] = "{}"
+
+    def flush(self) -> None:
+        """Writes everything recorded so far into chunks; the journal already protects it."""
+        self._writer.flush()
+
+    def close(self, **kwargs: Any) -> None:
+        """Finishes the recording, then closes the environment. Calling it twice is fine."""
+        try:
+            self._finalizer()
+        finally:
+            super().close(**kwargs)
+
+    def __enter__(self) -> RecordEpisodes:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise RecordingError(f"a wrapper that records to {self.path} cannot be pickled or copied")
+
+
+def _autoreset(env: Any, given: str | None) -> Any:
+    mode = given if given is not None else (env.metadata or {}).get("autoreset_mode", "NextStep")
+    text = str(getattr(mode, "value", mode)).replace("_", "").lower()
+    for name in ("NextStep", "SameStep", "Disabled"):
+        if text == name.lower():
+            return name
+    raise StepError(f"autoreset_mode: expected NextStep, SameStep or Disabled, found {mode!r}")
