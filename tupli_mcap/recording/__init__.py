@@ -1,7 +1,21 @@
-"""One recording, one `.mcap` file: written, appended to, read, recovered."""
+"""One recording, one `.mcap` file: written, appended to, read, recovered, rewritten."""
 
+from tupli_mcap.recording.columns import Columns
 from tupli_mcap.recording.episode import Episode, Episodes, Step
+from tupli_mcap.recording.handmade import EpisodeData, write_recording
 from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.recording.reader import RecordedBenchmark, Recording
+from tupli_mcap.recording.rewrite import rewrite_recording
 
-__all__ = ["Episode", "Episodes", "RecordedBenchmark", "Recording", "Step", "journal_path"]
+__all__ = [
+    "Columns",
+    "Episode",
+    "EpisodeData",
+    "Episodes",
+    "RecordedBenchmark",
+    "Recording",
+    "Step",
+    "journal_path",
+    "rewrite_recording",
+    "write_recording",
+]

@@ -78,7 +78,7 @@ class SingleRecorder:
         self._episode = self._writer.start_episode(0, rows.count, facts)
         self.put = rows.put
 
-    def end(self, end: int, metadata: str = "{}") -> None:
+    def end(self, end: int, metadata: str = "{}", *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
         episode, rows = self._episode, self._writer.rows
         self._episode = None
@@ -89,7 +89,9 @@ class SingleRecorder:
             self._writer.drop_start(episode)
             return
         total = rows.cursor.total if hasattr(rows, "cursor") else rows.total
-        final = rows.pending_state() + b"".join(sinks[0].pending() for sinks in self._writer.images)
+        final = None
+        if has_final_state:
+            final = rows.pending_state() + b"".join(sinks[0].pending() for sinks in self._writer.images)
         self._writer.end_episode(episode, end, length, total, final, metadata)
         self.put = self._continue
 

@@ -1,0 +1,95 @@
+"""Recordings made without an environment: episodes given as values."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+
+from tupli_mcap.errors import StepError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.events import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
+from tupli_mcap.recording.infos import InfoRecorder
+from tupli_mcap.recording.single import SingleRecorder
+from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
+
+__all__ = ["EpisodeData", "write_recording"]
+
+
+@dataclass
+class EpisodeData:
+    """An episode as sequences of one value a step.
+
+    `final_state` None: not known, and then the last step has no next state. `end` None: from the last step's flags,
+    "interrupted" if neither is set.
+    """
+
+    states: Sequence[Any]
+    actions: Sequence[Any]
+    rewards: Sequence[Any]
+    terminals: Sequence[Any]
+    timeouts: Sequence[Any]
+    final_state: Any = None
+    seed: int | None = None
+    options: dict[str, Any] | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    infos: Sequence[Mapping[str, Any]] | None = None
+    end: str | None = None
+
+
+def write_recording(
+    path: str | os.PathLike[str],
+    episodes: Iterable[EpisodeData],
+    *,
+    observation_space: gym.Space[Any],
+    action_space: gym.Space[Any],
+    reward_space: gym.Space[Any] | None = None,
+    benchmark_id: str = "",
+    attachments: Mapping[str, tuple[str, bytes]] | None = None,
+    mode: Mode = "x",
+    compression: str = "zstd",
+) -> None:
+    """Records episodes that exist as values; exactness and errors are those of `RecordEpisodes`.
+
+    Raises:
+        StepError: an episode without steps, of unequal columns, or with values that cannot be stored exactly.
+    """
+    spaces = StepLayout(observation_space, action_space, reward_space)
+    options = WriterOptions(compression, mode, benchmark_id, attachments)
+    writer = RecordingWriter(path, options)
+    recorder = SingleRecorder(writer, spaces, InfoRecorder(True))
+    try:
+        writer.check_spaces(spaces, 1, vector=False)
+        for episode in episodes:
+            _write(recorder, episode)
+    finally:
+        recorder.close()
+
+
+def _write(recorder: SingleRecorder, episode: EpisodeData) -> None:
+    n = len(episode.states)
+    columns = (episode.actions, episode.rewards, episode.terminals, episode.timeouts)
+    if n == 0 or any(len(column) != n for column in columns):
+        found = [n, *(len(column) for column in columns)]
+        raise StepError(
+            f"expected as many states, actions, rewards, terminals and timeouts, at least one each, found {found}"
+        )
+    options = "" if episode.options is None else jsonvalue.dumps(episode.options, fallback=repr)
+    recorder.reset(episode.states[0], ResetFacts(episode.seed, None, options, "{}", time.time_ns()))
+    for i in range(n):
+        if i + 1 < n:
+            after = episode.states[i + 1]
+        else:
+            after = episode.states[i] if episode.final_state is None else episode.final_state
+        recorder.put(episode.actions[i], after, episode.rewards[i], episode.terminals[i], episode.timeouts[i])
+        if episode.infos is not None and episode.infos[i]:
+            recorder.put_info(episode.infos[i])
+    flags = TERMINAL if episode.terminals[n - 1] else TIMEOUT if episode.timeouts[n - 1] else INTERRUPTED
+    end = flags if episode.end is None else END_NAMES.index(episode.end)
+    metadata = jsonvalue.dumps_plain(dict(episode.metadata)) if episode.metadata else "{}"
+    recorder.end(end, metadata, has_final_state=episode.final_state is not None)

@@ -1,0 +1,212 @@
+"""A recording written anew: fewer episodes, other attachments. Episode numbers, times and values stay."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.recording.container import Container, Rows
+from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
+from tupli_mcap.recording.logs import group_records
+from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.rows import even_rows
+
+__all__ = ["rewrite_recording"]
+
+_CHUNK = 512 * 1024
+
+
+def rewrite_recording(
+    source: Recording,
+    target: str | os.PathLike[str],
+    *,
+    episodes: Sequence[int] | None = None,
+    attachments: Mapping[str, tuple[str, bytes]] | None = None,
+    benchmark_id: str | None = None,
+    compression: str = "zstd",
+) -> None:
+    """Writes `target` (replaced in one rename) from `source`.
+
+    Args:
+        episodes: numbers of the episodes to keep (all by default).
+        attachments: name -> (media type, bytes), added to the source's or replacing them.
+        benchmark_id: replaces the source's.
+
+    Raises:
+        RecordingError: the target cannot be written.
+        FormatError: the source is damaged.
+    """
+    target = Path(target)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    except OSError as err:
+        raise RecordingError(f"{target} cannot be written: {err.strerror}; choose a writable place") from err
+    try:
+        try:
+            _Rewriter(source, Container(fd, str(target), compression)).run(episodes, attachments or {}, benchmark_id)
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+        temporary.replace(target)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+class _Rewriter:
+    def __init__(self, source: Recording, container: Container) -> None:
+        self._source = source
+        self._container = container
+        self._contents = source._contents
+        self._store = source._store
+        self._topics = source._topics
+        self._index = IndexBuilder()
+
+    def run(
+        self, numbers: Sequence[int] | None, attachments: Mapping[str, tuple[str, bytes]], benchmark_id: str | None
+    ) -> None:
+        container, source = self._container, self._source
+        metadata = {key: value for key, value in source.metadata.items() if key != "journal"}
+        if benchmark_id is not None:
+            metadata["benchmark_id"] = benchmark_id
+        container.start(f"tupli-mcap {version('tupli-mcap')}")
+        container.add_metadata(RECORDING_METADATA, metadata)
+        now = time.time_ns()
+        kept = {name: info for name, info in source.attachments.items() if name not in attachments}
+        for name, info in kept.items():
+            container.add_attachment(name, info.media_type, source.read_attachment(name), now)
+        for name, (media_type, data) in attachments.items():
+            container.add_attachment(name, media_type, data, now)
+        container.schemas = dict(self._contents.schemas)
+        container.channels = dict(self._contents.channels)
+        container.counts = dict.fromkeys(container.channels, 0)
+        rows = source.index
+        if numbers is not None:
+            rows = rows[np.isin(rows["episode"], np.asarray(list(numbers), dtype=np.int64))]
+        if source.num_envs:
+            self._steps(rows)
+        container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, self._index.encode(container.chunk_rows), now)
+        container.finish()
+
+    def _steps(self, rows: Any) -> None:
+        layout = self._source.layout
+        firsts = np.zeros(len(rows), dtype=np.int64)
+        for env, channel in enumerate(self._source._step_channels):
+            mine = np.flatnonzero(rows["env"] == env)
+            mine = mine[np.argsort(rows["first_row"][mine], kind="stable")]
+            lengths = rows["length"][mine].astype(np.int64)
+            firsts[mine] = np.cumsum(lengths) - lengths
+            spans = [(int(rows["first_row"][i]), int(rows["length"][i])) for i in mine]
+            dtype = layout.step_message.dtype if layout.constant else None
+            self._copy(channel, spans, dtype)
+            topic = self._contents.channels[channel].topic.removesuffix("/step")
+            for leaf in layout.images:
+                self._copy(self._topics[f"{topic}/image/{leaf.name}"], spans, layout.image_messages[leaf.name].dtype)
+        self._events(rows, firsts)
+        if "/info" in self._topics:
+            self._infos({int(number) for number in rows["episode"]})
+
+    def _copy(self, channel: int, spans: Sequence[tuple[int, int]], dtype: np.dtype[Any] | None) -> None:
+        """Rows `spans` of a channel, renumbered, in chunks of the usual size."""
+        if dtype is None:
+            self._write(channel, (m for first, count in spans for m in self._messages(channel, first, count)))
+            return
+        batch: list[Any] = []
+        size = written = 0
+        for first, count in _merged(spans):
+            for span in self._store.spans(channel, first, count):
+                part = self._store.rows(span.chunk, dtype, keep=False)[span.begin : span.end]
+                batch.append(part)
+                size += part.nbytes
+                if size >= _CHUNK:
+                    written += self._put(channel, batch, written)
+                    batch, size = [], 0
+        self._put(channel, batch, written)
+
+    def _put(self, channel: int, batch: list[Any], first: int) -> int:
+        if not batch:
+            return 0
+        rows = np.concatenate(batch)
+        rows["#sequence"] = first + np.arange(len(rows))
+        self._container.add_chunk(even_rows(channel, first, rows.view(np.uint8).reshape(-1), rows))
+        return len(rows)
+
+    def _messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
+        """(log_time, body) of messages of a channel."""
+        for span in self._store.spans(channel, first, count):
+            data = memoryview(self._store.load(span.chunk))
+            for start, end in self._store.messages(span.chunk)[span.begin : span.end]:
+                yield int.from_bytes(data[start + 15 : start + 23], "little"), bytes(data[start + BODY : end])
+
+    def _write(self, channel: int, messages: Iterator[tuple[int, bytes]]) -> None:
+        batch = bytearray()
+        for sequence, (log_time, body) in enumerate(messages):
+            batch += record(channel, sequence, log_time, body)
+            if len(batch) >= _CHUNK:
+                self._emit(group_records(memoryview(bytes(batch))))
+                batch.clear()
+        self._emit(group_records(memoryview(bytes(batch))))
+
+    def _emit(self, groups: list[Rows]) -> None:
+        for rows in groups:
+            self._container.add_chunk(rows)
+
+    def _events(self, rows: Any, firsts: Any) -> None:
+        starts, ends, finals = [], [], []
+        for row, first in zip(rows, firsts, strict=True):
+            ((start_time, body),) = self._messages(self._topics["/episode_start"], int(row["start_row"]), 1)
+            starts.append((start_time, EpisodeStart.decode(memoryview(body))._replace(first_row=int(first)).encode()))
+            ((end_time, body),) = self._messages(self._topics["/episode_end"], int(row["end_row"]), 1)
+            end = EpisodeEnd.decode(memoryview(body))._replace(first_row=int(first))
+            final = -1
+            if row["final_row"] >= 0:
+                final = len(finals)
+                finals += self._messages(self._topics["/final_state"], int(row["final_row"]), 1)
+            seed = int(row["seed"]) if row["has_seed"] else None
+            self._index.add(
+                EpisodeRow(
+                    int(first), end.length, end.episode_return, int(row["start_time"]), int(row["end_time"]), seed,
+                    len(ends), len(ends), final, end.episode, end.env, end.end,
+                ),  # fmt: skip
+                end.metadata,
+            )
+            ends.append((end_time, end.encode()))
+        for topic, messages in (("/episode_start", starts), ("/episode_end", ends), ("/final_state", finals)):
+            self._write(self._topics[topic], iter(_in_time(messages)))
+
+    def _infos(self, numbers: set[int]) -> None:
+        channel = self._topics["/info"]
+        everything = self._messages(channel, 0, self._store.count(channel))
+        self._write(channel, (m for m in everything if int.from_bytes(m[1][:4], "little") in numbers))
+
+
+def _in_time(messages: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    """Times that never decrease (episodes of several sub-environments end out of order)."""
+    latest, kept = 0, []
+    for log_time, body in messages:
+        latest = max(latest, log_time)
+        kept.append((latest, body))
+    return kept
+
+
+def _merged(spans: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    merged: list[tuple[int, int]] = []
+    for first, count in spans:
+        if merged and merged[-1][0] + merged[-1][1] == first:
+            merged[-1] = (merged[-1][0], merged[-1][1] + count)
+        else:
+            merged.append((first, count))
+    return merged
