@@ -1,0 +1,130 @@
+"""Record reinforcement-learning episodes as MCAP files, index them into datasets, train on them, hand them on."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tupli_mcap.benchmark import TupliEnvWrapper
+    from tupli_mcap.dataset import TupliDataset
+    from tupli_mcap.errors import (
+        FilterError,
+        FormatError,
+        MissingExtraError,
+        NotFoundError,
+        RecordingError,
+        SpaceError,
+        StepError,
+        StorageError,
+        TupliError,
+        UntrustedError,
+    )
+    from tupli_mcap.recording import (
+        EpisodeData,
+        Recording,
+        Step,
+        journal_path,
+        rewrite_recording,
+        write_recording,
+    )
+    from tupli_mcap.schema import (
+        EpisodeMetadataCallback,
+        F,
+        FilterAND,
+        FilterEQ,
+        FilterGEQ,
+        FilterGT,
+        FilterIN,
+        FilterLEQ,
+        FilterLT,
+        FilterNE,
+        FilterOR,
+        RLTuple,
+    )
+    from tupli_mcap.storage import FileStorage, TupliStorage
+    from tupli_mcap.wrappers import RecordEpisodes
+
+# Where each public name lives; imported on first use, so that `import tupli_mcap` stays quick.
+_HOMES = {
+    "benchmark": ["TupliEnvWrapper"],
+    "dataset": ["TupliDataset"],
+    "errors": [
+        "FilterError",
+        "FormatError",
+        "MissingExtraError",
+        "NotFoundError",
+        "RecordingError",
+        "SpaceError",
+        "StepError",
+        "StorageError",
+        "TupliError",
+        "UntrustedError",
+    ],
+    "recording": ["EpisodeData", "Recording", "Step", "journal_path", "rewrite_recording", "write_recording"],
+    "schema": [
+        "EpisodeMetadataCallback",
+        "F",
+        "FilterAND",
+        "FilterEQ",
+        "FilterGEQ",
+        "FilterGT",
+        "FilterIN",
+        "FilterLEQ",
+        "FilterLT",
+        "FilterNE",
+        "FilterOR",
+        "RLTuple",
+    ],
+    "storage": ["FileStorage", "TupliStorage"],
+    "wrappers": ["RecordEpisodes"],
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "EpisodeData",
+    "EpisodeMetadataCallback",
+    "F",
+    "FileStorage",
+    "FilterAND",
+    "FilterEQ",
+    "FilterError",
+    "FilterGEQ",
+    "FilterGT",
+    "FilterIN",
+    "FilterLEQ",
+    "FilterLT",
+    "FilterNE",
+    "FilterOR",
+    "FormatError",
+    "MissingExtraError",
+    "NotFoundError",
+    "RLTuple",
+    "RecordEpisodes",
+    "Recording",
+    "RecordingError",
+    "SpaceError",
+    "Step",
+    "StepError",
+    "StorageError",
+    "TupliDataset",
+    "TupliEnvWrapper",
+    "TupliError",
+    "TupliStorage",
+    "UntrustedError",
+    "journal_path",
+    "rewrite_recording",
+    "write_recording",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__
