@@ -17,6 +17,7 @@ from pathlib import Path
 from benchmarks import catalog, reading, recording
 from benchmarks.measure import Line, Run
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 CASES: dict[str, Callable[[Run], Iterator[Line]]] = {
@@ -68,7 +69,9 @@ def _table(lines: list[Line]) -> Table:
         else:
             figures = (line.note, "", "")
         met = {None: "", True: "[green]yes[/]", False: "[red]no[/]"}[line.met]
-        table.add_row(line.case, line.side, line.does, *figures, line.target, met, end_section=last)
+        table.add_row(
+            line.case, line.side, escape(line.does), *map(escape, figures), line.target, met, end_section=last
+        )
     return table
 
 

@@ -17,9 +17,8 @@ MATCHES = 1000
 
 def filter_catalog(run: Run) -> Iterator[Line]:
     """A range of a declared metadata key that matches 1,000 of all catalogued episodes."""
-    from tupli_mcap.storage.catalog import Catalog, EpisodeRow, RecordingStamp
-
     from tupli_mcap.schema import FilterGEQ
+    from tupli_mcap.storage.catalog import Catalog, EpisodeRow, RecordingStamp
 
     total = run.catalogued
     scores = np.random.default_rng(SEED).permutation(total)
@@ -57,5 +56,5 @@ def filter_catalog(run: Run) -> Iterator[Line]:
     catalog.close()
     median = statistics.median(values)
     does = f"Catalog.episodes(score >= …), {MATCHES:,} of {total:,}; the plan uses an index"
-    yield Line("filter", OURS, does, "ms", values, median, "median <= 50 ms", median <= 50)
+    yield Line("filter", OURS, does, "ms", values, None, "median <= 50 ms", median <= 50)
     yield Line("filter", f"{OURS}, count", "Catalog.count of the same", "ms", counts)

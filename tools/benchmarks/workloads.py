@@ -6,6 +6,7 @@ the same steps and the policy's own time is left out.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -135,14 +136,26 @@ class Log(gym.Wrapper[Any, Any, Any, Any]):
 
 
 class TableEnv(gym.Env[Any, Any]):
-    """Returns the rows of a prepared table in turn; every episode has the same length."""
+    """Returns the rows of a prepared table in turn; every episode has the same length.
 
-    def __init__(self, states: NDArray[Any], action_space: gym.Space[Any], length: int) -> None:
+    Args:
+        table: a function of this module that makes the rows.
+        action_space: any space.
+        length: steps of an episode.
+    """
+
+    def __init__(self, table: Callable[[], NDArray[Any]], action_space: gym.Space[Any], length: int) -> None:
+        states = table()
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, states.shape[1:], states.dtype.type)
         self.action_space = action_space
+        self._table = table
         self._rows = itertools.cycle(list(states)).__next__
         self._length = length
         self._left = 0
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A recorder that keeps the environment need not keep the table: real environments are small, too.
+        return TableEnv, (self._table, self.action_space, self._length)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -156,13 +169,32 @@ class TableEnv(gym.Env[Any, Any]):
         return self._rows(), 1.0, False, self._left == 0, {}
 
 
+@functools.cache
+def walk17() -> NDArray[np.float64]:
+    """Rows of 17 float64: a random walk, so about as compressible as joint angles are."""
+    return np.cumsum(np.random.default_rng(SEED).normal(0, 0.01, (TABLE_ROWS, 17)), axis=0)
+
+
+@functools.cache
+def noise4_batches(num_envs: int) -> NDArray[np.float32]:
+    """The same for a vector environment."""
+    return np.random.default_rng(SEED).normal(size=(TABLE_ROWS, num_envs, 4)).astype(np.float32)
+
+
+@functools.cache
+def noise4() -> NDArray[np.float32]:
+    """Rows of CartPole's four float32."""
+    return np.random.default_rng(SEED).normal(size=(TABLE_ROWS, 4)).astype(np.float32)
+
+
 class TableVectorEnv(VectorEnv[Any, Any, Any]):
     """The vector counterpart of TableEnv: NEXT_STEP autoreset, episodes of the sub-environments staggered.
 
     The step after an episode's end is the reset of that sub-environment and no step of an episode.
     """
 
-    def __init__(self, num_envs: int, states: NDArray[Any], length: int) -> None:
+    def __init__(self, num_envs: int, length: int) -> None:
+        states = noise4_batches(num_envs)
         self.num_envs = num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, states.shape[2:], states.dtype.type)
@@ -179,6 +211,9 @@ class TableVectorEnv(VectorEnv[Any, Any, Any]):
         self._no_ends = np.zeros(num_envs, bool)
         self._rewards = [np.where(reset, 0.0, 1.0) for reset in self.resets]
         self._step = 0
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return TableVectorEnv, (self.num_envs, self._length)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._step = 0
@@ -197,25 +232,19 @@ def cartpole(steps: int) -> Workload:
 
 
 def floats(length: int = 1000) -> Workload:
-    """17 float64 in, 6 float32 out (a random walk, so about as compressible as joint angles are)."""
-    rng = np.random.default_rng(SEED)
-    states = np.cumsum(rng.normal(0, 0.01, (TABLE_ROWS, 17)), axis=0)
-    actions = list(rng.uniform(-1, 1, (TABLE_ROWS, 6)).astype(np.float32))
+    """17 float64 in, 6 float32 out."""
+    actions = list(np.random.default_rng(SEED).uniform(-1, 1, (TABLE_ROWS, 6)).astype(np.float32))
     space = gym.spaces.Box(-1, 1, (6,), np.float32)
-    return Workload("floats", lambda: TableEnv(states, space, length), actions)
+    return Workload("floats", lambda: TableEnv(walk17, space, length), actions)
 
 
 def small(length: int) -> Workload:
     """CartPole's layout from a table, with episodes of exactly `length` steps."""
-    rng = np.random.default_rng(SEED)
-    states = rng.normal(size=(TABLE_ROWS, 4)).astype(np.float32)
-    actions = list(rng.integers(0, 2, TABLE_ROWS))
-    return Workload(f"small-{length}", lambda: TableEnv(states, gym.spaces.Discrete(2), length), actions)
+    actions = list(np.random.default_rng(SEED).integers(0, 2, TABLE_ROWS))
+    return Workload(f"small-{length}", lambda: TableEnv(noise4, gym.spaces.Discrete(2), length), actions)
 
 
 def small_vector(length: int, num_envs: int) -> tuple[Callable[[], TableVectorEnv], list[NDArray[np.int64]]]:
     """The same for `num_envs` sub-environments: a factory, and the batches of actions to repeat."""
-    rng = np.random.default_rng(SEED)
-    states = rng.normal(size=(TABLE_ROWS, num_envs, 4)).astype(np.float32)
-    actions = list(rng.integers(0, 2, (TABLE_ROWS, num_envs)))
-    return lambda: TableVectorEnv(num_envs, states, length), actions
+    actions = list(np.random.default_rng(SEED).integers(0, 2, (TABLE_ROWS, num_envs)))
+    return lambda: TableVectorEnv(num_envs, length), actions
