@@ -1,0 +1,642 @@
+"""What every storage promises (`StorageContract`), and what the one in a directory promises beyond that."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from tupli_mcap.environment import capture
+from tupli_mcap.errors import (
+    FilterError,
+    FormatError,
+    NotFoundError,
+    SpaceError,
+    StorageError,
+    UntrustedError,
+)
+from tupli_mcap.recording import Recording
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    BenchmarkMetadata,
+    BenchmarkQuery,
+    Episode,
+    F,
+    FilterEQ,
+    FilterIN,
+    RLTuple,
+)
+from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError
+from tupli_mcap.storage.document import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
+from tupli_mcap.storage.handmade import conform, infer_space
+from tupli_mcap.wrappers import RecordEpisodes
+
+BAD_IDS = [
+    "",
+    "no-such-thing",
+    "../../etc/passwd",
+    "/etc/passwd",
+    "a/b",
+    "..",
+    ".",
+    "\0",
+    "x" * 5000,
+    "0" * 64,
+    "A" * 64,
+]
+
+
+@pytest.fixture(autouse=True)
+def _config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "config"))
+
+
+def query(
+    name: str = "cart", env: gym.Env[Any, Any] | None = None, artifacts: tuple[str, ...] = ()
+) -> BenchmarkQuery:
+    record = capture(env or gym.make("CartPole-v1"))
+    metadata = BenchmarkMetadata(
+        name=name, description="a pole", extra={"level": np.int64(3), "limits": (1, 2)}
+    )
+    content = BenchmarkContent(record, artifacts)
+    return BenchmarkQuery(
+        hash=benchmark_hash(content, metadata), serialized=pack(record, artifacts), metadata=metadata
+    )
+
+
+def episode(benchmark_id: str, length: int = 3, score: float = 1.0) -> Episode:
+    tuples = [
+        RLTuple(
+            state=[0.5 * i, -1.0],
+            action=i % 2,
+            reward=score,
+            info={"step": i},
+            terminal=i == length - 1,
+        )
+        for i in range(length)
+    ]
+    return Episode(benchmark_id=benchmark_id, metadata={"score": score}, tuples=tuples)
+
+
+class StorageContract:
+    """Subclasses have a fixture `storage` that gives an empty TupliStorage."""
+
+    # --- benchmarks ---
+
+    def test_benchmark_round_trip(self, storage: TupliStorage) -> None:
+        told = query()
+        header = storage.store_benchmark(told)
+        assert header.id == header.hash == told.hash
+        assert header.metadata.extra == {"level": 3, "limits": [1, 2]}
+        loaded = storage.load_benchmark(header.id)
+        assert loaded.metadata == header.metadata
+        assert unpack(loaded.serialized).record.digest == unpack(told.serialized).record.digest
+        assert storage.list_benchmarks() == [header]
+
+    def test_same_content_has_one_id(self, storage: TupliStorage) -> None:
+        first = storage.store_benchmark(query())
+        assert storage.store_benchmark(query()) == first
+        other = storage.store_benchmark(query("another name"))
+        assert other.id != first.id
+        changed = gym.make("CartPole-v1")
+        changed.unwrapped.gravity = 1.0  # type: ignore[attr-defined]
+        assert storage.store_benchmark(query(env=changed)).id not in (first.id, other.id)
+        assert len(storage.list_benchmarks()) == 3
+
+    def test_a_wrong_hash_is_refused(self, storage: TupliStorage) -> None:
+        told = query()
+        with pytest.raises(StorageError, match=f"expected the hash {told.hash} of the benchmark's content"):
+            storage.store_benchmark(told.model_copy(update={"hash": "0" * 64}))
+
+    def test_text_of_somebody_else_is_kept_as_it_is(self, storage: TupliStorage) -> None:
+        told = BenchmarkQuery(
+            hash="anything", serialized='{"py/object": "evil"}', metadata=BenchmarkMetadata(name="x")
+        )
+        header = storage.store_benchmark(told)
+        assert storage.load_benchmark(header.id).serialized == told.serialized
+        assert header.hash == "anything"
+
+    def test_list_benchmarks_filters(self, storage: TupliStorage) -> None:
+        first, second = storage.store_benchmark(query("one")), storage.store_benchmark(query("two"))
+        assert storage.list_benchmarks(FilterEQ(key="id", value=first.id)) == [first]
+        assert storage.list_benchmarks(FilterEQ(key="metadata.name", value="two")) == [second]
+        assert storage.list_benchmarks(F("metadata.extra.level") > 3) == []
+        with pytest.raises(FilterError, match="unknown filter key 'nonsense'"):
+            storage.list_benchmarks(FilterEQ(key="nonsense", value=1))
+
+    def test_delete_and_publish_benchmark(self, storage: TupliStorage) -> None:
+        header = storage.store_benchmark(query())
+        storage.publish_benchmark(header.id)
+        storage.publish_benchmark(header.id, "lab")
+        storage.publish_benchmark(header.id, "lab")
+        assert storage.list_benchmarks()[0].published_in == [*header.published_in, "global", "lab"]
+        assert storage.load_benchmark(header.id).published_in[-1] == "lab"
+        storage.delete_benchmark(header.id)
+        assert storage.list_benchmarks() == []
+        with pytest.raises(NotFoundError, match=header.id):
+            storage.delete_benchmark(header.id)
+
+    def test_metadata_that_is_no_json_is_refused(self, storage: TupliStorage) -> None:
+        told = query()
+        told.metadata.extra["what"] = object()
+        with pytest.raises(
+            StorageError, match=r"BenchmarkMetadata: expected values that JSON can hold: .*what"
+        ):
+            storage.store_benchmark(told)
+
+    # --- artifacts ---
+
+    def test_artifact_round_trip(self, storage: TupliStorage) -> None:
+        data = bytes(range(256)) * 10
+        item = storage.store_artifact(data, ArtifactMetadata(name="wind", extra={"rows": np.int32(5)}))
+        assert storage.load_artifact(item.id) == data
+        assert item.hash == item.id
+        assert item.extra == {"rows": 5}
+        assert storage.list_artifacts() == [item]
+        assert storage.list_artifacts(FilterEQ(key="name", value="sun")) == []
+
+    def test_artifacts_are_deduplicated(self, storage: TupliStorage) -> None:
+        item = storage.store_artifact(b"abc", ArtifactMetadata(name="first"))
+        assert storage.store_artifact(b"abc", ArtifactMetadata(name="second")) == item
+        assert storage.store_artifact(b"", ArtifactMetadata(name="empty")).id != item.id
+        assert len(storage.list_artifacts()) == 2
+
+    def test_delete_and_publish_artifact(self, storage: TupliStorage) -> None:
+        item = storage.store_artifact(b"abc", ArtifactMetadata(name="first"))
+        storage.publish_artifact(item.id, "lab")
+        assert storage.list_artifacts()[0].published_in[-1] == "lab"
+        storage.delete_artifact(item.id)
+        assert storage.list_artifacts() == []
+        with pytest.raises(NotFoundError, match="there is no artifact"):
+            storage.load_artifact(item.id)
+
+    def test_an_artifact_in_use_is_not_deleted(self, storage: TupliStorage) -> None:
+        item = storage.store_artifact(b"abc", ArtifactMetadata(name="wind"))
+        header = storage.store_benchmark(query(artifacts=(item.id,)))
+        assert storage.artifact_users(item.id) == [header.id]
+        with pytest.raises(StorageError, match=f"artifact {item.id} is needed by benchmark {header.id}"):
+            storage.delete_artifact(item.id)
+        storage.delete_artifact(item.id, force=True)
+        assert storage.list_artifacts() == []
+
+    def test_an_artifact_is_bytes(self, storage: TupliStorage) -> None:
+        with pytest.raises(StorageError, match="expected the bytes of an artifact, found str"):
+            storage.store_artifact("text", ArtifactMetadata(name="x"))  # type: ignore[arg-type]
+
+    # --- episodes ---
+
+    def test_episode_round_trip(self, storage: TupliStorage) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        header = storage.record_episode(episode(benchmark, 4, score=2.5))
+        assert header.benchmark_id == benchmark
+        assert header.metadata == {"score": 2.5}
+        assert (header.n_tuples, header.terminated, header.timeout) == (4, True, False)
+        assert header.episode_return == 10.0
+        (item,) = storage.list_episodes(include_tuples=True)
+        assert item.id == header.id
+        assert [t.action for t in item.tuples] == [0, 1, 0, 1]  # type: ignore[union-attr]
+        np.testing.assert_array_equal([t.state for t in item.tuples], [[0.5 * i, -1.0] for i in range(4)])  # type: ignore[union-attr]
+        assert [t.info for t in item.tuples] == [{"step": i} for i in range(4)]  # type: ignore[union-attr]
+        assert item.tuples[-1].terminal  # type: ignore[union-attr]
+
+    def test_many_episodes_keep_their_order(self, storage: TupliStorage) -> None:
+        first, second = (storage.store_benchmark(query(name)).id for name in ("one", "two"))
+        given = [episode([first, second][i % 2], 2 + i, score=float(i)) for i in range(6)]
+        headers = storage.record_episodes(given)
+        assert [h.metadata["score"] for h in headers] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+        assert [h.n_tuples for h in headers] == [2, 3, 4, 5, 6, 7]
+        assert {h.benchmark_id for h in headers[::2]} == {first}
+        assert storage.count_episodes() == 6
+
+    def test_episodes_filter_and_page(self, storage: TupliStorage) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        storage.declare_key("metadata.score")
+        storage.record_episodes([episode(benchmark, score=float(i)) for i in range(5)])
+        everything = storage.list_episodes()
+        assert [h.metadata["score"] for h in storage.list_episodes(F("metadata.score") >= 3)] == [3.0, 4.0]
+        assert storage.count_episodes(F("metadata.score") < 1) == 1
+        assert storage.list_episodes(limit=2, offset=1) == everything[1:3]
+        ids = [h.id for h in everything[:2]]
+        assert storage.list_episodes(FilterIN(key="id", value=ids)) == everything[:2]
+        with pytest.raises(FilterError, match="unknown filter key 'score'"):
+            storage.list_episodes(FilterEQ(key="score", value=1))
+
+    def test_delete_episodes(self, storage: TupliStorage) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        headers = storage.record_episodes([episode(benchmark, score=float(i)) for i in range(5)])
+        storage.delete_episode(headers[1].id)
+        assert [h.metadata["score"] for h in storage.list_episodes()] == [0.0, 2.0, 3.0, 4.0]
+        assert storage.delete_episodes(F("metadata.score") >= 3) == 2
+        assert [h.id for h in storage.list_episodes()] == [headers[0].id, headers[2].id]
+        with pytest.raises(NotFoundError, match="there is no episode with id"):
+            storage.delete_episode(headers[1].id)
+        assert storage.delete_episodes(FilterEQ(key="benchmark_id", value=benchmark)) == 2
+        assert storage.list_episodes() == []
+
+    def test_publish_episode(self, storage: TupliStorage) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        headers = storage.record_episodes([episode(benchmark), episode(benchmark)])
+        storage.publish_episode(headers[1].id, "lab")
+        assert [h.published_in[-1] == "lab" for h in storage.list_episodes()] == [False, True]
+
+    def test_an_episode_needs_a_benchmark_and_tuples(self, storage: TupliStorage) -> None:
+        with pytest.raises(NotFoundError, match="there is no benchmark"):
+            storage.record_episode(episode("0" * 64))
+        benchmark = storage.store_benchmark(query()).id
+        with pytest.raises(StorageError, match="at least one tuple"):
+            storage.record_episode(Episode(benchmark_id=benchmark, metadata={}, tuples=[]))
+
+    def test_structured_values(self, storage: TupliStorage) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        tuples = [
+            RLTuple(
+                state={
+                    "pos": np.array([i, 2.5], np.float32),
+                    "mode": "left" if i else "right",
+                    "on": bool(i),
+                },
+                action=(np.int16(i), [1, 2, 3]),
+                reward=np.float32(0.5),
+                timeout=i == 1,
+            )
+            for i in range(2)
+        ]
+        storage.record_episode(Episode(benchmark_id=benchmark, metadata={}, tuples=tuples))
+        (item,) = storage.list_episodes(include_tuples=True)
+        state = item.tuples[1].state  # type: ignore[union-attr]
+        assert state["mode"] == "left"
+        assert state["pos"].dtype == np.float32
+        assert state["pos"].tolist() == [1.0, 2.5]
+        assert bool(state["on"]) is True
+        assert item.tuples[1].action[0] == 1  # type: ignore[union-attr]
+        assert item.end == "timeout"
+
+    # --- ids ---
+
+    @pytest.mark.parametrize("uri", BAD_IDS)
+    def test_ids_are_no_paths(self, storage: TupliStorage, uri: str) -> None:
+        calls: list[Callable[[str], Any]] = [
+            storage.load_benchmark,
+            storage.delete_benchmark,
+            storage.publish_benchmark,
+            storage.new_recording_path,
+            storage.load_artifact,
+            storage.delete_artifact,
+            storage.publish_artifact,
+            storage.delete_episode,
+            storage.publish_episode,
+            storage.open_recording,
+        ]
+        for call in calls:
+            with pytest.raises(NotFoundError, match="there is no"):
+                call(uri)
+
+
+class TestFileStorage(StorageContract):
+    @pytest.fixture
+    def storage(self, tmp_path: Path) -> Iterator[FileStorage]:
+        with FileStorage(tmp_path / "lab") as storage:
+            yield storage
+
+    def test_layout_on_disk(self, storage: FileStorage) -> None:
+        item = storage.store_artifact(b"abc", ArtifactMetadata(name="wind"))
+        header = storage.store_benchmark(query(artifacts=(item.id,)))
+        recorded = storage.record_episode(episode(header.id))
+        files = {p.relative_to(storage.root).as_posix() for p in storage.root.rglob("*") if p.is_file()}
+        assert {name for name in files if not name.startswith("catalog.sqlite")} == {
+            ".lock",
+            f"benchmarks/{header.id}.json",
+            f"artifacts/{item.id}",
+            f"artifacts/{item.id}.json",
+            recorded.recording,
+        }
+        assert recorded.recording.startswith(f"recordings/{header.id}/")
+        document = json.loads((storage.root / "benchmarks" / f"{header.id}.json").read_text())
+        assert document["environment"]["name"] == "CartPole-v1"
+        assert document["benchmark"]["metadata"]["name"] == "cart"
+
+    def test_everything_is_there_for_the_next_one(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        storage.declare_key("metadata.score")
+        storage.record_episodes([episode(header.id, score=float(i)) for i in range(3)])
+        expected = storage.list_episodes()
+        with FileStorage(storage.root) as other:
+            assert other.list_benchmarks() == [header]
+            assert other.list_episodes() == expected
+            assert other.declared_keys() == ["metadata.score"]
+
+    @pytest.mark.parametrize("damage", ["deleted", "overwritten", "reindexed"])
+    def test_the_catalog_is_rebuilt(self, storage: FileStorage, damage: str) -> None:
+        header = storage.store_benchmark(query())
+        storage.declare_key("metadata.score")
+        made = storage.record_episodes([episode(header.id, score=float(i)) for i in range(3)])
+        storage.delete_episode(made[0].id)
+        storage.publish_episode(made[1].id, "lab")
+        expected = storage.list_episodes()
+        storage.close()
+        catalog = storage.root / "catalog.sqlite"
+        if damage == "reindexed":
+            storage.reindex()
+        else:
+            for path in storage.root.glob("catalog.sqlite*"):
+                path.unlink()
+            if damage == "overwritten":
+                catalog.write_bytes(b"not a database at all" * 100)
+        with FileStorage(storage.root) as other:
+            assert other.list_episodes() == expected
+            assert other.declared_keys() == ["metadata.score"]
+
+    def test_dropped_and_removed_files_are_noticed(self, storage: FileStorage, tmp_path: Path) -> None:
+        header = storage.store_benchmark(query())
+        recorded = storage.record_episode(episode(header.id))
+        path = storage.root / recorded.recording
+        moved = tmp_path / "elsewhere.mcap"
+        path.rename(moved)
+        assert storage.list_episodes() == []
+        moved.rename(storage.root / "dropped.mcap")
+        (found,) = storage.list_episodes()
+        assert (found.id, found.recording) == (recorded.id, "dropped.mcap")
+
+    def test_damaged_files_are_skipped_with_a_warning(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        storage.record_episode(episode(header.id))
+        (storage.root / "bad.mcap").write_bytes(b"no recording")
+        (storage.root / "benchmarks" / f"{'1' * 64}.json").write_text("{")
+        (storage.root / "artifacts").mkdir(exist_ok=True)
+        (storage.root / "artifacts" / f"{'2' * 64}.json").write_text("{}")
+        with pytest.warns(UserWarning, match=r"skipped a recording: .*bad\.mcap"):
+            assert len(storage.list_episodes()) == 1
+        assert len(storage.list_episodes()) == 1  # said once
+        with pytest.warns(UserWarning, match="skipped a benchmark: .*1111"):
+            assert storage.list_benchmarks() == [header]
+        with pytest.warns(UserWarning, match="skipped an artifact: .*2222"):
+            assert storage.list_artifacts() == []
+
+    def test_damaged_contents_are_format_errors(self, storage: FileStorage) -> None:
+        item = storage.store_artifact(b"abc", ArtifactMetadata(name="wind"))
+        (storage.root / "artifacts" / item.id).write_bytes(b"abd")
+        with pytest.raises(FormatError, match=f"expected bytes with SHA-256 {item.id}"):
+            storage.load_artifact(item.id)
+        header = storage.store_benchmark(query())
+        path = storage.root / "benchmarks" / f"{header.id}.json"
+        path.write_text(path.read_text().replace('"cart"', '"tart"'))
+        with pytest.raises(FormatError, match=f"expected the content of benchmark {header.id}"):
+            storage.load_benchmark(header.id)
+
+    def test_an_unusable_directory_is_one_error(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("")
+        with pytest.raises(StorageError, match="cannot make the storage"):
+            FileStorage(tmp_path / "file" / "lab")
+
+    def test_compact_rewrites_what_holds_deleted_episodes(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        made = storage.record_episodes([episode(header.id, 200, score=float(i)) for i in range(5)])
+        storage.delete_episode(made[0].id)
+        storage.delete_episode(made[2].id)
+        storage.publish_episode(made[3].id, "lab")
+        path = storage.root / made[0].recording
+        before = path.stat().st_size
+        assert storage.compact() == before - path.stat().st_size > 0
+        assert storage.compact() == 0
+        with Recording(path) as recording:
+            assert len(recording.episodes) == 3
+        left = storage.list_episodes(include_tuples=True)
+        assert [item.metadata["score"] for item in left] == [1.0, 3.0, 4.0]
+        assert [item.published_in[-1] == "lab" for item in left] == [False, True, False]
+        assert [item.id for item in left] == [made[i].id for i in (1, 3, 4)]
+        storage.delete_episode(made[3].id)
+        storage.compact()
+        assert list(path.parent.iterdir()) == [path]
+
+    def test_a_copy_of_a_recording_is_not_listed_twice(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        (made,) = storage.record_episodes([episode(header.id)])
+        path = storage.root / made.recording
+        shutil.copy(path, storage.root / "a copy.mcap")
+        with pytest.warns(UserWarning, match=r"a copy\.mcap holds episodes of recordings/.* again"):
+            assert storage.count_episodes() == 1
+        path.unlink()
+        assert [h.recording for h in storage.list_episodes()] == ["a copy.mcap"]
+
+    def test_deleting_the_last_episode_removes_the_file(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        made = storage.record_episodes([episode(header.id), episode(header.id)])
+        for one in made:
+            storage.delete_episode(one.id)
+        assert not (storage.root / made[0].recording).exists()
+        assert list((storage.root / "recordings").iterdir()) == []
+
+    def test_a_plain_recording_can_be_dropped_in(self, storage: FileStorage) -> None:
+        with RecordEpisodes(gym.make("CartPole-v1"), storage.root / "plain.mcap") as env:
+            env.reset(seed=1)
+            while not any(env.step(env.action_space.sample())[2:4]):
+                pass
+        (header,) = storage.list_episodes()
+        assert header.benchmark_id == ""
+        assert header.seed == 1
+        assert header.terminated
+
+    def test_explain_names_the_index(self, storage: FileStorage) -> None:
+        storage.declare_key("metadata.score")
+        assert "USING INDEX" in storage.explain(F("metadata.score") > 3)
+
+    def test_several_processes_at_once(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        context = multiprocessing.get_context("spawn")
+        workers = [context.Process(target=_work, args=(storage, header.id, i)) for i in range(3)]
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+            assert worker.exitcode == 0
+        assert storage.count_episodes() == 12
+        assert len(storage.list_artifacts()) == 1
+        assert sorted(h.metadata["score"] for h in storage.list_episodes()) == sorted(
+            [0.0, 1.0, 2.0, 3.0] * 3
+        )
+
+    # --- bundles ---
+
+    def bundle(self, storage: FileStorage, target: Path) -> tuple[str, str]:
+        item = storage.store_artifact(b"gusts", ArtifactMetadata(name="wind", extra={"rows": 7}))
+        env = gym.make("CartPole-v1")
+        env.unwrapped.gravity = 2.0  # type: ignore[attr-defined]
+        header = storage.store_benchmark(query(env=env, artifacts=(item.id,)))
+        storage.record_episodes([episode(header.id, score=1.0), episode(header.id, score=2.0)])
+        storage.record_episode(episode(header.id, score=3.0))
+        assert storage.bundle(header.id, target) == target
+        return header.id, item.id
+
+    def test_a_bundle_is_all_another_storage_needs(self, storage: FileStorage, tmp_path: Path) -> None:
+        benchmark, artifact = self.bundle(storage, tmp_path / "all.mcap")
+        with FileStorage(tmp_path / "other") as other:
+            assert other.import_bundle(tmp_path / "all.mcap") == benchmark
+            assert other.import_bundle(tmp_path / "all.mcap") == benchmark
+            assert other.load_artifact(artifact) == b"gusts"
+            assert other.list_artifacts()[0].name == "wind"
+            assert other.list_artifacts()[0].extra == {"rows": 7}
+            items = other.list_episodes(include_tuples=True)
+            assert sorted(item.metadata["score"] for item in items) == [1.0, 2.0, 3.0]
+            assert {item.benchmark_id for item in items} == {benchmark}
+            assert other.load_benchmark(benchmark).metadata.name == "cart"
+
+    def test_a_bundle_of_one_recording(self, storage: FileStorage, tmp_path: Path) -> None:
+        header = storage.store_benchmark(query())
+        made = storage.record_episodes([episode(header.id, score=float(i)) for i in range(3)])
+        storage.delete_episode(made[1].id)
+        storage.bundle(header.id, tmp_path / "b.mcap")
+        with Recording(tmp_path / "b.mcap") as recording:
+            assert [e.metadata["score"] for e in recording.episodes] == [0.0, 2.0]
+            assert recording.benchmark.id == header.id
+
+    def test_an_imported_environment_is_not_trusted(
+        self, storage: FileStorage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        self.bundle(storage, tmp_path / "all.mcap")
+        monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "somebody else"))
+        with Recording(tmp_path / "all.mcap") as recording, pytest.raises(UntrustedError, match="would run"):
+            recording.benchmark.make_env()
+        with FileStorage(tmp_path / "other") as other:
+            other.import_bundle(tmp_path / "all.mcap", trust=True)
+        with Recording(tmp_path / "all.mcap") as recording:
+            assert recording.benchmark.make_env().unwrapped.gravity == 2.0  # type: ignore[attr-defined]
+
+    def test_bundles_refuse_what_is_not_there(self, storage: FileStorage, tmp_path: Path) -> None:
+        benchmark, artifact = self.bundle(storage, tmp_path / "all.mcap")
+        with pytest.raises(StorageError, match="exists and is not overwritten"):
+            storage.bundle(benchmark, tmp_path / "all.mcap")
+        with pytest.raises(NotFoundError, match="there is no benchmark"):
+            storage.bundle("0" * 64, tmp_path / "none.mcap")
+        storage.delete_artifact(artifact, force=True)
+        with pytest.raises(NotFoundError, match="there is no artifact"):
+            storage.bundle(benchmark, tmp_path / "none.mcap")
+        assert sorted(p.name for p in tmp_path.iterdir() if p.is_file()) == ["all.mcap"]
+        with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "plain.mcap") as env:
+            env.reset()
+            env.step(0)
+        with pytest.raises(StorageError, match="recorded outside a storage"):
+            storage.import_bundle(tmp_path / "plain.mcap")
+
+    def test_importing_at_home_changes_nothing(self, storage: FileStorage, tmp_path: Path) -> None:
+        header = storage.store_benchmark(query())
+        made = storage.record_episodes([episode(header.id, score=float(i)) for i in range(3)])
+        storage.bundle(header.id, tmp_path / "b.mcap", F("metadata.score") > 0)
+        storage.import_bundle(tmp_path / "b.mcap")
+        assert [h.id for h in storage.list_episodes()] == [h.id for h in made]
+        storage.delete_episode(made[1].id)
+        storage.import_bundle(tmp_path / "b.mcap")  # which brings it back
+        assert {h.id for h in storage.list_episodes()} == {h.id for h in made}
+
+    def test_a_bundle_without_episodes(self, storage: FileStorage, tmp_path: Path) -> None:
+        env = gym.make("CartPole-v1")
+        told = query()
+        record = capture(env)
+        told = told.model_copy(update={"serialized": pack(record, (), facts_about(env))})
+        header = storage.store_benchmark(told)
+        storage.bundle(header.id, tmp_path / "b.mcap")
+        with FileStorage(tmp_path / "other") as other:
+            assert other.import_bundle(tmp_path / "b.mcap") == header.id
+            assert other.list_episodes() == []
+
+    def test_export(self, storage: FileStorage, tmp_path: Path) -> None:
+        first, second = (storage.store_benchmark(query(name)).id for name in ("one", "two"))
+        for benchmark in (first, second):
+            storage.record_episodes([episode(benchmark, score=float(i)) for i in range(3)])
+        storage.record_episode(episode(first, score=7.0))
+        of_first = FilterEQ(key="benchmark_id", value=first)
+        storage.export(tmp_path / "e.mcap", of_first & (F("metadata.score") > 1))
+        with Recording(tmp_path / "e.mcap") as recording:
+            assert recording.benchmark_id == first
+            assert sorted(e.metadata["score"] for e in recording.episodes) == [2.0, 7.0]
+            assert recording.benchmark.record.name == "CartPole-v1"
+        with pytest.raises(StorageError, match="found 7 episodes of 2"):
+            storage.export(tmp_path / "f.mcap")
+        with pytest.raises(StorageError, match="nothing matches"):
+            storage.export(tmp_path / "f.mcap", F("metadata.score") > 100)
+        with pytest.raises(StorageError, match="exists and is not overwritten"):
+            storage.export(tmp_path / "e.mcap", of_first)
+
+    def test_a_recording_from_a_storage_lacks_its_artifacts(
+        self, storage: FileStorage, tmp_path: Path
+    ) -> None:
+        benchmark, artifact = self.bundle(storage, tmp_path / "all.mcap")
+        (header, *_) = storage.list_episodes()
+        shutil.copy(storage.root / header.recording, tmp_path / "one.mcap")
+        with FileStorage(tmp_path / "other") as other:
+            with pytest.raises(StorageError, match=f"lacks the artifact {artifact}"):
+                other.import_bundle(tmp_path / "one.mcap")
+            other.store_artifact(b"gusts", ArtifactMetadata(name="wind"))
+            assert other.import_bundle(tmp_path / "one.mcap") == benchmark
+
+
+def _work(storage: FileStorage, benchmark_id: str, worker: int) -> None:
+    storage.store_artifact(b"shared", ArtifactMetadata(name=f"from {worker}"))
+    for i in range(4):
+        storage.record_episode(episode(benchmark_id, score=float(i)))
+        storage.list_episodes()
+
+
+def test_pytupli_s_error_name() -> None:
+    assert TupliStorageError is StorageError
+
+
+# --- spaces from values ---
+
+BOX_3 = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+
+@pytest.mark.parametrize(
+    ("values", "space"),
+    [
+        ([1, 2], gym.spaces.Box(-(2**63), 2**63 - 1, (), np.int64)),
+        ([1, 2.5], gym.spaces.Box(-np.inf, np.inf, (), np.float64)),
+        ([True, False], gym.spaces.Box(0, 1, (), np.bool_)),
+        ([[1.0, 2.0], [3.0, 4.0]], gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)),
+        ([np.zeros((2, 3), np.uint8)], gym.spaces.Box(0, 255, (2, 3), np.uint8)),
+        ([np.float32(1)], gym.spaces.Box(-np.inf, np.inf, (), np.float32)),
+        (["ab", "b"], gym.spaces.Text(2, min_length=0, charset="ab")),
+        ([{"b": 1, "a": 2.0}], None),
+        ([(1, 2.0)], None),
+        ([np.zeros((2, 3)), np.zeros((0, 3))], gym.spaces.Sequence(BOX_3, stack=True)),
+    ],
+)  # fmt: skip
+def test_inferred_spaces(values: list[Any], space: gym.Space[Any] | None) -> None:
+    found = infer_space(values)
+    if space is not None:
+        assert found == space
+    for value in values:
+        assert found.contains(conform(value, found))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([], "expected at least one value"),
+        ([None], "expected numbers, flags, texts, arrays, dicts or tuples, found builtins.NoneType"),
+        ([[1.0], [1.0, [2.0]]], "expected a list with items of one shape"),
+        ([np.zeros(2), np.zeros((2, 2))], r"expected values of one shape, found shapes"),
+        ([{"a": 1}, {"b": 1}], r"expected every step to be like the first .*, step 1 has"),
+        ([(1, 2), (1,)], "step 1 has"),
+        (["a", 1], "step 1 has 1"),
+        ([{"a": {"b": object()}}], r"state\['a'\]\['b'\]: expected numbers"),
+    ],
+)
+def test_values_without_a_space(values: list[Any], message: str) -> None:
+    with pytest.raises(SpaceError, match=message):
+        infer_space(values, "state")
+
+
+def test_conform_changes_nothing() -> None:
+    box = gym.spaces.Box(-1, 1, (), np.float32)
+    with pytest.raises(SpaceError, match="expected a value of Box"):
+        conform(0.1, box)
+    assert conform(0.5, box) == 0.5
+    with pytest.raises(SpaceError, match="expected a value of Discrete"):
+        conform(1.5, gym.spaces.Discrete(3))

@@ -1,0 +1,63 @@
+"""What lies between an environment and its recorder."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+
+from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+
+__all__ = ["PendingReset", "Retyped", "Tap"]
+
+
+class PendingReset(NamedTuple):
+    """A reset that no recorder has seen, and no step has followed."""
+
+    result: tuple[Any, dict[str, Any]]
+    seed: int | None
+    options: dict[str, Any] | None
+
+
+class Tap(gym.Wrapper[Any, Any, Any, Any]):
+    """Hands a recorder a reset that has already happened, and outlives the recorder: closing it closes
+    nothing."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.pending: PendingReset | None = None
+        self.step = env.step  # type: ignore[method-assign]  # one call less in each step
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        return self.env.spec
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        if self.pending is not None:
+            result, self.pending = self.pending.result, None
+            return result
+        return self.env.reset(seed=seed, options=options)
+
+    def close(self) -> None:
+        pass
+
+
+class Retyped(EpisodeMetadataCallback):
+    """A callback that is given tuples of another class."""
+
+    def __init__(self, callback: EpisodeMetadataCallback, tuple_class: type[RLTuple]) -> None:
+        self._callback = callback
+        self._tuple_class = tuple_class
+
+    def reset(self) -> None:
+        self._callback.reset()
+
+    def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+        return self._callback(
+            self._tuple_class.from_env_step(
+                tuple.state, tuple.action, tuple.reward, tuple.terminal, tuple.timeout, tuple.info
+            )
+        )

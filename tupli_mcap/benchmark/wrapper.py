@@ -1,0 +1,312 @@
+"""`TupliEnvWrapper`: an environment with a place in a storage, where it and its episodes are kept."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple, Self, SupportsFloat
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+
+from tupli_mcap import trust as _trust
+from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
+from tupli_mcap.environment import Snapshot, build, record_environment
+from tupli_mcap.errors import NotFoundError, StorageError, TupliError
+from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, FilterEQ, RLTuple
+from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage.document import benchmark_hash, facts_about, pack, recording_attachments, unpack
+from tupli_mcap.wrappers import RecordEpisodes
+
+__all__ = ["DeletedBenchmark", "TupliEnvWrapper"]
+
+
+class DeletedBenchmark(NamedTuple):
+    """What `TupliEnvWrapper.delete` did.
+
+    kept maps each artifact that stays, although it should have gone, to the benchmarks that need it.
+    """
+
+    id: str
+    episodes: int
+    artifacts: tuple[str, ...]
+    kept: Mapping[str, tuple[str, ...]]
+
+
+class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
+    """Stores an environment as a benchmark and records what happens in it.
+
+    The environment is captured as it is when it is wrapped: stepping it changes neither what is stored nor
+    its id. Once the benchmark has an id, every episode is recorded into one file of the storage, opened at
+    the first reset or step; finished episodes are listed by the storage at once. Recording can be switched
+    off and on.
+
+    Args:
+        env: the environment; the wrapper never changes it.
+        storage: where the benchmark is kept.
+        benchmark_id: the id of the benchmark that `env` was loaded from.
+        metadata_callback: called with every recorded step; its last result becomes the episode's metadata.
+        rl_tuple_cls: the class of the tuples that the callback is given. Recorded are the values themselves.
+
+    Subclasses that keep data outside of the environment override `_serialize` and `_deserialize`.
+    Not thread-safe.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        storage: TupliStorage,
+        benchmark_id: str | None = None,
+        metadata_callback: EpisodeMetadataCallback | None = None,
+        rl_tuple_cls: type[RLTuple] = RLTuple,
+    ) -> None:
+        super().__init__(env)
+        self.storage = storage
+        self.id = benchmark_id
+        self.metadata_callback = metadata_callback
+        self.rl_tuple_cls = rl_tuple_cls
+        self._snapshot = Snapshot(env)
+        self._tap = Tap(env)
+        self._recording = True
+        self._recorder: RecordEpisodes | None = None
+        self._path: Path | None = None
+        self._pending: PendingReset | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """The inner environment's: where it is kept is no part of what an environment is."""
+        return self.env.spec
+
+    # --- stepping ---
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment; while recording, a running episode ends as interrupted."""
+        if self._recorder is None and self._recording and self.id is not None:
+            self._recorder = self._open()
+        if self._recorder is not None:
+            return self._recorder.reset(seed=seed, options=options)
+        unseeded = seed is None and getattr(self.env.unwrapped, "_np_random", 0) is None
+        result = self.env.reset(seed=seed, options=options)
+        if unseeded:
+            drawn = getattr(self.env.unwrapped, "_np_random_seed", None)
+            seed = drawn if isinstance(drawn, int) and drawn >= 0 else None
+        self._pending = PendingReset(result, seed, options)
+        return result
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Take a step, and record it unless recording is off.
+
+        Raises:
+            StorageError: Recording is on, but the benchmark has not been stored.
+            StepError: The step cannot be recorded exactly; what was recorded before is safe.
+        """
+        if self._recorder is not None:
+            return self._recorder.step(action)
+        if self._recording:
+            return self._first_step(action)
+        self._pending = None
+        return self.env.step(action)
+
+    def _first_step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        if self.id is None:
+            raise StorageError(
+                "this environment is not stored yet, so its steps cannot be recorded: call store(name=...) "
+                "first, or deactivate_recording()"
+            )
+        pending, self._pending = self._pending, None
+        if pending is None:  # in the middle of an episode that began unrecorded; the next one is recorded
+            return self.env.step(action)
+        recorder = self._open()
+        self._tap.pending = pending
+        recorder.reset(seed=pending.seed, options=pending.options)
+        self._recorder = recorder
+        return recorder.step(action)
+
+    def activate_recording(self) -> None:
+        """Record from the next reset on (from the running episode on, if it has no step yet)."""
+        self._recording = True
+
+    def deactivate_recording(self) -> None:
+        """Stop recording: the running episode ends as interrupted, and the file is finished."""
+        self._recording = False
+        self._pending = None
+        self._finish()
+
+    @property
+    def recording_path(self) -> Path | None:
+        """The file that is, or was last, recorded to; None before the first step."""
+        return self._path
+
+    def close(self) -> None:
+        """Finish the recording, then close the environment. Calling it twice is fine."""
+        try:
+            self._finish()
+        finally:
+            super().close()
+
+    def _open(self) -> RecordEpisodes:
+        if self.id is None:
+            raise StorageError("this environment is not stored yet: call store(name=...) first")
+        callback = self.metadata_callback
+        if callback is not None and self.rl_tuple_cls is not RLTuple:
+            callback = Retyped(callback, self.rl_tuple_cls)
+        if self._path is not None and self._path.exists():
+            return RecordEpisodes(self._tap, self._path, metadata_callback=callback, mode="a", attachments={})
+        benchmark = self.storage.load_benchmark(self.id)
+        self._path = self.storage.new_recording_path(self.id)
+        return RecordEpisodes(
+            self._tap,
+            self._path,
+            metadata_callback=callback,
+            benchmark_id=self.id,
+            attachments=recording_attachments(benchmark.serialized),
+        )
+
+    def _finish(self) -> None:
+        recorder, self._recorder = self._recorder, None
+        if recorder is None or self._path is None:
+            return
+        recorder.close()
+        self.storage.ingest(self._path)
+
+    # --- the benchmark ---
+
+    def store(
+        self,
+        name: str,
+        description: str = "",
+        difficulty: str | None = None,
+        version: str | None = None,
+        metadata: dict[str, Any] | None = None,
+        *,
+        by_reference: bool = False,
+    ) -> str:
+        """Store the environment, as it was when it was wrapped, as a benchmark; returns its id.
+
+        The id is a hash of the environment, its artifacts and the arguments: storing the same again changes
+        nothing. The user's own classes are stored with their code, unless `by_reference` leaves it out: then
+        those who load the benchmark need the same modules. The environment is signed as this user's own.
+
+        Raises:
+            TupliError: The environment cannot be pickled.
+            StorageError: The storage refuses, or the metadata is no JSON.
+        """
+        told = BenchmarkMetadata(
+            name=name, description=description, difficulty=difficulty, version=version, extra=metadata or {}
+        )
+        serialized = self.serialize_env(self.env, by_reference=by_reference)
+        content = unpack(serialized)
+        query = BenchmarkQuery(hash=benchmark_hash(content, told), serialized=serialized, metadata=told)
+        stored = self.storage.store_benchmark(query)
+        try:
+            _trust.trust(content.record.digest)
+        except TupliError as err:
+            warnings.warn(f"stored, but loading it will need trust=True: {err}", stacklevel=2)
+        if self.id is not None and self.id != stored.id:
+            self._finish()
+            self._path = None
+        self.id = stored.id
+        return stored.id
+
+    @classmethod
+    def load(
+        cls,
+        storage: TupliStorage,
+        benchmark_id: str | None = None,
+        metadata_callback: EpisodeMetadataCallback | None = None,
+        rl_tuple_cls: type[RLTuple] = RLTuple,
+        *,
+        trust: bool = False,
+    ) -> Self:
+        """Rebuild a benchmark's environment and wrap it.
+
+        Raises:
+            NotFoundError: There is no such benchmark.
+            UntrustedError: It would run code that neither this user nor `trust=True` vouches for.
+        """
+        if benchmark_id is None:
+            raise NotFoundError(
+                "which benchmark? pass benchmark_id; storage.list_benchmarks() names them all"
+            )
+        serialized = storage.load_benchmark(benchmark_id).serialized
+        env = cls.deserialize_env(serialized, storage, trust=trust)
+        return cls(env, storage, benchmark_id, metadata_callback, rl_tuple_cls)
+
+    def publish(self, publish_in: str = "global") -> None:
+        """Note that a group may see the benchmark."""
+        self.storage.publish_benchmark(self._stored_id(), publish_in)
+
+    def delete(self, delete_artifacts: bool = False, delete_episodes: bool = True) -> DeletedBenchmark:
+        """Delete the benchmark from the storage, with its episodes, and its artifacts where nobody else
+        needs them.
+
+        The environment goes on to work, unrecorded until it is stored again.
+
+        Raises:
+            NotFoundError: The benchmark is not stored.
+        """
+        uri = self._stored_id()
+        artifacts = unpack(self.storage.load_benchmark(uri).serialized).artifacts
+        self._finish()
+        self._path = None
+        episodes = 0
+        if delete_episodes:
+            episodes = self.storage.delete_episodes(FilterEQ(key="benchmark_id", value=uri))
+        self.storage.delete_benchmark(uri)
+        self.id = None
+        gone: list[str] = []
+        kept: dict[str, tuple[str, ...]] = {}
+        for artifact in artifacts if delete_artifacts else ():
+            users = tuple(self.storage.artifact_users(artifact))
+            if users:
+                kept[artifact] = users
+                continue
+            self.storage.delete_artifact(artifact)
+            gone.append(artifact)
+        return DeletedBenchmark(uri, episodes, tuple(gone), MappingProxyType(kept))
+
+    def _stored_id(self) -> str:
+        if self.id is None:
+            raise StorageError("this environment is not stored yet: call store(name=...) first")
+        return self.id
+
+    # --- environments as text ---
+
+    def serialize_env(self, env: gym.Env[Any, Any], *, by_reference: bool = False) -> str:
+        """An environment as text. `self.env` is taken as it was when it was wrapped; neither is changed."""
+        snapshot = self._snapshot if env is self.env else Snapshot(env)
+        copy = snapshot.restore()
+        try:
+            changed, artifacts = self._serialize(copy)
+            record = record_environment(changed, by_reference=by_reference)
+        finally:
+            snapshot.discard(copy)
+        return pack(record, artifacts, facts_about(env))
+
+    @classmethod
+    def deserialize_env(
+        cls, serialized: str, storage: TupliStorage, *, trust: bool = False
+    ) -> gym.Env[Any, Any]:
+        """The environment that `serialize_env` made a text of. Raises as `load` does."""
+        return cls._deserialize(build(unpack(serialized).record, trust=trust), storage)
+
+    def _serialize(self, env: gym.Env[Any, Any]) -> tuple[gym.Env[Any, Any], list[str]]:
+        """To be overridden: move data out of an environment before it is stored.
+
+        Args:
+            env: a copy of the environment, to be changed at will (`env.unwrapped.data = artifact.id`).
+
+        Returns:
+            The environment to store, and the ids of the artifacts it needs.
+        """
+        return env, []
+
+    @classmethod
+    def _deserialize(cls, env: gym.Env[Any, Any], storage: TupliStorage) -> gym.Env[Any, Any]:
+        """To be overridden: put the data back (`env.unwrapped.data =
+        storage.load_artifact(env.unwrapped.data)`)."""
+        return env

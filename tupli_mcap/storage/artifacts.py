@@ -1,0 +1,107 @@
+"""Artifacts in a directory: `<sha256>` holds the bytes, `<sha256>.json` what is known about them."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from tupli_mcap.environment import sha256
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError
+from tupli_mcap.schema import ArtifactMetadata, ArtifactMetadataItem, BaseFilter, compile_predicate
+from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
+from tupli_mcap.storage.common import LOCAL_USER, first_defect, is_hash, published_in, to_json
+from tupli_mcap.storage.document import plain
+
+__all__ = ["ArtifactFiles"]
+
+
+class ArtifactFiles:
+    """The artifacts of a directory. Several processes may use it at once."""
+
+    def __init__(self, directory: Path, lock: Lock) -> None:
+        self._directory = directory
+        self._lock = lock
+
+    def store(self, artifact: bytes, metadata: ArtifactMetadata) -> ArtifactMetadataItem:
+        if not isinstance(artifact, bytes | bytearray | memoryview):
+            raise StorageError(f"expected the bytes of an artifact, found {type(artifact).__name__}")
+        data = bytes(artifact)
+        uri = sha256(data)
+        sidecar = self._sidecar(uri)
+        with self._lock, os_errors("cannot store the artifact", sidecar):
+            if sidecar.exists() and (self._directory / uri).exists():
+                return self._read(sidecar)
+            item = ArtifactMetadataItem.create_new(
+                **{**plain(metadata), "id": uri, "hash": uri, "created_by": LOCAL_USER}
+            )
+            # The bytes first: a crash in between leaves bytes that nothing names.
+            write_bytes(self._directory / uri, data)
+            self._write(sidecar, item)
+        return item
+
+    def load(self, uri: str) -> bytes:
+        path = self._find(uri)
+        with os_errors("cannot read the artifact", path):
+            data = path.read_bytes()
+        if sha256(data) != uri:
+            raise FormatError(
+                f"{path}: expected bytes with SHA-256 {uri}, found {sha256(data)}: the file is damaged"
+            )
+        return data
+
+    def item(self, uri: str) -> ArtifactMetadataItem:
+        self._find(uri)
+        return self._read(self._sidecar(uri))
+
+    def list(self, filter: BaseFilter | None) -> list[ArtifactMetadataItem]:
+        matches = compile_predicate(filter, ArtifactMetadataItem)
+        items = []
+        for sidecar in sorted(self._directory.glob("*.json")):
+            try:
+                items.append(self._read(sidecar))
+            except (FormatError, StorageError) as err:
+                warnings.warn(f"skipped an artifact: {err}", stacklevel=3)
+        return sorted((item for item in items if matches(item)), key=lambda item: (item.created_at, item.id))
+
+    def delete(self, uri: str) -> None:
+        with self._lock:
+            path = self._find(uri)
+            with os_errors("cannot delete the artifact", path):
+                self._sidecar(uri).unlink(missing_ok=True)
+                path.unlink(missing_ok=True)
+
+    def publish(self, uri: str, publish_in: str) -> None:
+        with self._lock:
+            item = self.item(uri)
+            groups = published_in(item.published_in, publish_in)
+            with os_errors("cannot publish the artifact", self._sidecar(uri)):
+                self._write(self._sidecar(uri), item.model_copy(update={"published_in": groups}))
+
+    def _find(self, uri: str) -> Path:
+        path = self._directory / uri if is_hash(uri) else None
+        if path is None or not path.is_file():
+            raise NotFoundError(
+                f"there is no artifact with id {str(uri)[:80]!r}; list_artifacts() names them all"
+            )
+        return path
+
+    def _sidecar(self, uri: str) -> Path:
+        return self._directory / f"{uri}.json"
+
+    def _read(self, sidecar: Path) -> ArtifactMetadataItem:
+        with os_errors("cannot read the artifact", sidecar):
+            text = sidecar.read_bytes()
+        try:
+            item = ArtifactMetadataItem.model_validate_json(text)
+        except ValidationError as err:
+            raise FormatError(f"{sidecar}: expected an artifact's metadata: {first_defect(err)}") from err
+        if item.id != sidecar.stem:
+            raise FormatError(
+                f"{sidecar}: expected the metadata of artifact {sidecar.stem}, found {item.id[:80]!r}"
+            )
+        return item
+
+    def _write(self, sidecar: Path, item: ArtifactMetadataItem) -> None:
+        write_bytes(sidecar, to_json(plain(item)))

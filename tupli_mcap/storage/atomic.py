@@ -1,0 +1,111 @@
+"""Files that are there as a whole or not at all, and a lock between the processes that write them."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from tupli_mcap.errors import StorageError
+
+__all__ = ["Lock", "fill", "os_errors", "write_bytes"]
+
+
+def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
+    """Write a file as a whole: a crash leaves the old file, or none.
+
+    Raises:
+        FileExistsError: The file exists and `replace` is false.
+        OSError: The directory cannot be written to, the disk is full, ...
+    """
+    with fill(path, replace=replace) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextlib.contextmanager
+def fill(path: Path, *, replace: bool = False) -> Iterator[Path]:
+    """Gives the path of an empty file beside `path`, which becomes `path` when the block ends without an
+    error."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fd, name = tempfile.mkstemp(prefix=".", suffix=".tmp", dir=path.parent)
+    os.close(fd)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            # mkstemp's files are private; a storage is shared the way its directory is.
+            os.fchmod(file.fileno(), 0o666 & ~_umask())
+            os.fsync(file.fileno())
+        if replace:
+            temporary.replace(path)
+        else:
+            os.link(temporary, path)
+        _sync_directory(path.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def os_errors(what: str, path: Path) -> Iterator[None]:
+    """Turns an OSError of the block into a StorageError: `<what> '<path>': <reason>`."""
+    try:
+        yield
+    except OSError as err:
+        raise StorageError(f"{what} {str(path)!r}: {err.strerror or err}") from err
+
+
+class Lock:
+    """Keeps the other processes and threads out while a block reads, changes and writes. Reentrant in a
+    thread."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._thread_lock = threading.RLock()
+        self._depth = 0
+        self._fd = -1
+
+    def __enter__(self) -> Self:
+        self._thread_lock.acquire()
+        try:
+            if self._depth == 0:
+                with os_errors("cannot lock the storage with", self._path):
+                    self._path.parent.mkdir(parents=True, exist_ok=True)
+                    self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+                    fcntl.flock(self._fd, fcntl.LOCK_EX)
+            self._depth += 1
+        except BaseException:
+            self._thread_lock.release()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            os.close(self._fd)  # which unlocks it
+        self._thread_lock.release()
+
+
+def _umask() -> int:
+    # There is no way to read it without setting it; Linux says it in /proc.
+    with contextlib.suppress(OSError, ValueError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("Umask:"):
+                return int(line.split()[1], 8)
+    return 0o022
+
+
+def _sync_directory(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # not every file system can
+            os.fsync(fd)
+    finally:
+        os.close(fd)

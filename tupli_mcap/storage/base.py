@@ -1,0 +1,154 @@
+"""The contract of a storage: where benchmarks, artifacts and episodes live, whatever is behind it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from tupli_mcap.errors import StorageError
+from tupli_mcap.recording import Recording
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    ArtifactMetadataItem,
+    BaseFilter,
+    Benchmark,
+    BenchmarkHeader,
+    BenchmarkQuery,
+    Episode,
+    EpisodeHeader,
+    EpisodeItem,
+)
+
+__all__ = ["TupliStorage", "TupliStorageError"]
+
+TupliStorageError = StorageError
+"""The name this error has in PyTupli."""
+
+
+class TupliStorage(ABC):
+    """Stores benchmarks, artifacts and episodes and finds them again.
+
+    An id (`uri`) that nothing is stored under raises NotFoundError, whatever its form; ids are compared,
+    never used as paths. Filters see the fields of the listed headers (`id`, `metadata.score`); None lists
+    everything. Every other failure is a StorageError.
+    """
+
+    # --- benchmarks ---
+
+    @abstractmethod
+    def store_benchmark(self, benchmark_query: BenchmarkQuery) -> BenchmarkHeader:
+        """Store a benchmark. Its id is its hash: storing the same content again returns what is there."""
+
+    @abstractmethod
+    def load_benchmark(self, uri: str) -> Benchmark:
+        """A stored benchmark with its environment as text; nothing of it is executed."""
+
+    @abstractmethod
+    def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
+        """The benchmarks a filter is true of, oldest first."""
+
+    @abstractmethod
+    def delete_benchmark(self, uri: str) -> None:
+        """Delete a benchmark; its episodes and artifacts stay."""
+
+    @abstractmethod
+    def publish_benchmark(self, uri: str, publish_in: str = "global") -> None:
+        """Note that a group may see a benchmark."""
+
+    # --- artifacts ---
+
+    @abstractmethod
+    def store_artifact(self, artifact: bytes, metadata: ArtifactMetadata) -> ArtifactMetadataItem:
+        """Store bytes. Their id is their SHA-256: storing the same bytes again returns what is there."""
+
+    @abstractmethod
+    def load_artifact(self, uri: str, **kwargs: Any) -> bytes:
+        """The bytes of an artifact, checked against their hash. `kwargs` are for other storages."""
+
+    @abstractmethod
+    def list_artifacts(self, filter: BaseFilter | None = None) -> list[ArtifactMetadataItem]:
+        """The artifacts a filter is true of, oldest first."""
+
+    @abstractmethod
+    def artifact_users(self, uri: str) -> list[str]:
+        """The ids of the benchmarks that need an artifact."""
+
+    @abstractmethod
+    def delete_artifact(self, uri: str, *, force: bool = False) -> None:
+        """Delete an artifact.
+
+        Raises:
+            StorageError: A benchmark needs it and `force` is not given.
+        """
+
+    @abstractmethod
+    def publish_artifact(self, uri: str, publish_in: str = "global") -> None:
+        """Note that a group may see an artifact."""
+
+    # --- episodes ---
+
+    @abstractmethod
+    def record_episode(self, episode: Episode) -> EpisodeHeader:
+        """Store an episode that was built by hand, see `record_episodes`."""
+
+    @abstractmethod
+    def record_episodes(self, episodes: Iterable[Episode]) -> list[EpisodeHeader]:
+        """Store episodes that were built by hand (historic data, no environment).
+
+        States, actions and rewards may be arrays, numbers, flags, texts, lists, or dicts and tuples of them;
+        spaces are inferred from the values. Each benchmark must be stored.
+
+        Raises:
+            SpaceError: Values of one kind differ in structure from step to step, or have no space.
+        """
+
+    @abstractmethod
+    def list_episodes(
+        self,
+        filter: BaseFilter | None = None,
+        include_tuples: bool = False,
+        *,
+        limit: int | None = None,
+        offset: int = 0,
+    ) -> list[EpisodeHeader] | list[EpisodeItem]:
+        """The episodes a filter is true of, in the order of their recordings; EpisodeItems with tuples if
+        asked."""
+
+    @abstractmethod
+    def count_episodes(self, filter: BaseFilter | None = None) -> int:
+        """How many episodes a filter is true of."""
+
+    @abstractmethod
+    def delete_episode(self, uri: str) -> None:
+        """Delete one episode."""
+
+    @abstractmethod
+    def delete_episodes(self, filter: BaseFilter) -> int:
+        """Delete every episode a filter is true of; returns how many."""
+
+    @abstractmethod
+    def publish_episode(self, uri: str, publish_in: str = "global") -> None:
+        """Note that a group may see an episode."""
+
+    # --- recordings ---
+
+    @abstractmethod
+    def new_recording_path(self, benchmark_id: str) -> Path:
+        """Where a new recording of a stored benchmark may be written; nothing is there yet."""
+
+    @abstractmethod
+    def ingest(self, path: Path) -> None:
+        """Take note of a recording that was written to `new_recording_path`, or has grown.
+
+        A finished one without episodes is removed.
+        """
+
+    @abstractmethod
+    def open_recording(self, recording: str) -> Recording:
+        """The recording of an `EpisodeHeader.recording`; the caller closes it."""
+
+    @abstractmethod
+    def declare_key(self, key: str) -> None:
+        """Index an episode metadata key (`metadata.score`), so that filters on it stay fast."""

@@ -1,0 +1,267 @@
+"""Bundles: one recording that carries its benchmark and all artifacts, so that nothing else is needed."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import ValidationError
+
+from tupli_mcap import trust as _trust
+from tupli_mcap.environment import EnvironmentRecord, sha256
+from tupli_mcap.errors import FormatError, StepError, StorageError
+from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    BaseFilter,
+    BenchmarkHeader,
+    BenchmarkQuery,
+    EpisodeHeader,
+    FilterEQ,
+    FilterIN,
+)
+from tupli_mcap.storage.atomic import fill, os_errors
+from tupli_mcap.storage.common import first_defect
+from tupli_mcap.storage.document import (
+    ARTIFACT_PREFIX,
+    DOCUMENT_NAME,
+    PICKLE_NAME,
+    artifacts_of,
+    benchmark_hash,
+    declared_spaces,
+    pack,
+    plain,
+    unpack,
+)
+from tupli_mcap.storage.recordings import episode_id
+
+if TYPE_CHECKING:
+    from tupli_mcap.storage.files import FileStorage
+
+__all__ = ["export", "read", "write"]
+
+Attachments = dict[str, tuple[str, bytes]]
+
+
+def write(storage: FileStorage, benchmark_id: str, target: Path, filter: BaseFilter | None = None) -> Path:
+    """Write a benchmark with its artifacts and its episodes (those a filter is true of) into a new file.
+
+    Raises:
+        NotFoundError: There is no such benchmark, or one of its artifacts is gone.
+        StorageError: The file exists or cannot be written, or the episodes do not fit into one file.
+    """
+    _refuse_existing(target)
+    attachments = _attachments(storage, benchmark_id)
+    of_benchmark: BaseFilter = FilterEQ(key="benchmark_id", value=benchmark_id)
+    headers = storage.list_episodes(of_benchmark if filter is None else of_benchmark & filter)
+    with os_errors("cannot write the bundle", target), fill(target) as temporary:
+        temporary.unlink()
+        _write_episodes(storage, benchmark_id, headers, temporary, attachments)
+    return target
+
+
+def export(storage: FileStorage, target: Path, filter: BaseFilter | None = None) -> Path:
+    """Write the episodes a filter is true of into the new recording `target`, without artifacts.
+
+    Raises:
+        StorageError: There are none, they are of several benchmarks, or the file exists or cannot be written.
+    """
+    _refuse_existing(target)
+    headers = storage.list_episodes(filter)
+    benchmarks = sorted({header.benchmark_id for header in headers})
+    if len(benchmarks) != 1:
+        raise StorageError(
+            "expected episodes of one benchmark to export, "
+            f"found {len(headers)} episodes of {len(benchmarks)}: "
+            f"{', '.join(benchmarks)[:300] or 'nothing matches'}"
+        )
+    with os_errors("cannot export", target), fill(target) as temporary:
+        temporary.unlink()
+        _write_episodes(storage, benchmarks[0], headers, temporary, None)
+    return target
+
+
+def read(storage: FileStorage, path: Path, *, trust: bool = False) -> str:
+    """Take a recording with its benchmark and artifacts into a storage; returns the benchmark's id.
+
+    Nothing in the file is executed. Its environment can be rebuilt afterwards if this user made it, if it
+    needs no trust, or with `trust=True`, which signs it. Importing a file twice changes nothing.
+
+    Raises:
+        FormatError: The file is damaged, or its contents are not what its benchmark says.
+        StorageError: It carries no benchmark, or lacks an artifact.
+    """
+    with Recording(path) as recording:
+        record = _environment(recording, path)
+        header = _header(record, path)
+        query = BenchmarkQuery(
+            hash=header.hash,
+            serialized=pack(record, artifacts_of(record, str(path)), record.benchmark),
+            metadata=header.metadata,
+        )
+        if benchmark_hash(unpack(query.serialized), header.metadata) != header.id:
+            raise FormatError(f"{path}: expected the content of benchmark {header.id}, found something else")
+        _read_artifacts(storage, recording, record, path)
+        if trust:
+            _trust.trust(record.digest)
+        storage.store_benchmark(query)
+        _copy(storage, recording, path, header.id)
+    return header.id
+
+
+def _attachments(storage: FileStorage, benchmark_id: str) -> Attachments:
+    benchmark = storage.load_benchmark(benchmark_id)
+    try:
+        content = unpack(benchmark.serialized)
+    except FormatError as err:
+        raise StorageError(f"benchmark {benchmark_id} holds no environment that a bundle can carry") from err
+    items = {uri: storage.list_artifacts(FilterEQ(key="id", value=uri)) for uri in content.artifacts}
+    entry = {
+        **(content.record.benchmark or {}),
+        "artifact_metadata": {uri: plain(found[0]) for uri, found in items.items() if found},
+    }
+    attachments = {DOCUMENT_NAME: ("application/json", content.record.to_json(entry))}
+    if content.record.pickle is not None:
+        attachments[PICKLE_NAME] = ("application/octet-stream", content.record.pickle)
+    for uri in content.artifacts:
+        attachments[ARTIFACT_PREFIX + uri] = ("application/octet-stream", storage.load_artifact(uri))
+    return attachments
+
+
+def _refuse_existing(target: Path) -> None:
+    if target.exists():
+        raise StorageError(f"{str(target)!r} exists and is not overwritten; choose another path or delete it")
+
+
+def _write_episodes(
+    storage: FileStorage,
+    benchmark_id: str,
+    headers: Sequence[EpisodeHeader],
+    target: Path,
+    attachments: Attachments | None,
+) -> None:
+    names = sorted({header.recording for header in headers})
+    if len(names) == 1:
+        with storage.open_recording(names[0]) as recording:
+            numbers = [header.episode for header in headers]
+            rewrite_recording(
+                recording, target, episodes=numbers, attachments=attachments, benchmark_id=benchmark_id
+            )
+        return
+    reward_space = None
+    if names:
+        with storage.open_recording(names[0]) as recording:
+            spaces = [recording.observation_space, recording.action_space]
+            reward_space = recording.layout.reward_space
+            attachments = attachments or _carried(recording)
+    else:
+        spaces = declared_spaces(storage.load_benchmark(benchmark_id).serialized)
+        if not spaces:
+            raise StorageError(f"benchmark {benchmark_id} has no episodes, and its spaces are not known")
+    try:
+        write_recording(
+            target,
+            _episodes(storage, headers),
+            observation_space=spaces[0],
+            action_space=spaces[1],
+            reward_space=reward_space,
+            benchmark_id=benchmark_id,
+            attachments=attachments,
+        )
+    except StepError as err:
+        raise StorageError(
+            f"the recordings of benchmark {benchmark_id} differ in what they hold, so that one file cannot "
+            f"take them all ({err}); use a filter on `recording`"
+        ) from err
+
+
+def _carried(recording: Recording) -> Attachments:
+    return {
+        name: (info.media_type, recording.read_attachment(name))
+        for name, info in recording.attachments.items()
+    }
+
+
+def _episodes(storage: FileStorage, headers: Sequence[EpisodeHeader]) -> Iterator[EpisodeData]:
+    """The episodes of several recordings as values, one recording open at a time."""
+    for name, group in itertools.groupby(headers, key=lambda header: header.recording):
+        with storage.open_recording(name) as recording:
+            positions = {int(number): i for i, number in enumerate(recording.index["episode"])}
+            for header in group:
+                episode = recording.episodes[positions[header.episode]]
+                steps = list(episode)
+                yield EpisodeData(
+                    states=[step.state for step in steps],
+                    actions=[step.action for step in steps],
+                    rewards=[step.reward for step in steps],
+                    terminals=[step.terminal for step in steps],
+                    timeouts=[step.timeout for step in steps],
+                    final_state=episode.final_state,
+                    seed=episode.seed,
+                    options=episode.options,
+                    metadata=episode.metadata,
+                    infos=None if episode.infos is None else [info or {} for info in episode.infos],
+                    end=episode.end,
+                )
+
+
+def _environment(recording: Recording, path: Path) -> EnvironmentRecord:
+    if DOCUMENT_NAME not in recording.attachments:
+        raise StorageError(
+            f"{str(path)!r} carries no benchmark ({DOCUMENT_NAME}); copy it into the storage instead"
+        )
+    pickle = recording.read_attachment(PICKLE_NAME) if PICKLE_NAME in recording.attachments else None
+    return EnvironmentRecord.from_json(
+        recording.read_attachment(DOCUMENT_NAME), pickle, where=f"{path}: {DOCUMENT_NAME}"
+    )
+
+
+def _header(record: EnvironmentRecord, path: Path) -> BenchmarkHeader:
+    if not (record.benchmark or {}).get("id"):
+        raise StorageError(
+            f"{str(path)!r} carries an environment, but no benchmark; it was recorded outside a storage"
+        )
+    try:
+        return BenchmarkHeader.model_validate(record.benchmark)
+    except ValidationError as err:
+        raise FormatError(f"{path}: {DOCUMENT_NAME}: {first_defect(err)}") from err
+
+
+def _read_artifacts(
+    storage: FileStorage, recording: Recording, record: EnvironmentRecord, path: Path
+) -> None:
+    said = (record.benchmark or {}).get("artifact_metadata")
+    facts = said if isinstance(said, dict) else {}
+    for uri in artifacts_of(record, str(path)):
+        if ARTIFACT_PREFIX + uri not in recording.attachments:
+            if storage.list_artifacts(FilterEQ(key="id", value=uri)):
+                continue
+            raise StorageError(f"{str(path)!r} lacks the artifact {uri} of its benchmark; ask for a bundle")
+        data = recording.read_attachment(ARTIFACT_PREFIX + uri)
+        if sha256(data) != uri:
+            raise FormatError(f"{path}: expected artifact {uri}, found bytes with SHA-256 {sha256(data)}")
+        try:
+            metadata = ArtifactMetadata.model_validate(facts.get(uri, {"name": uri}))
+        except ValidationError as err:
+            raise FormatError(f"{path}: artifact {uri}: {first_defect(err)}") from err
+        storage.store_artifact(data, metadata)
+
+
+def _copy(storage: FileStorage, recording: Recording, path: Path, benchmark_id: str) -> None:
+    """Copy the episodes that the storage does not hold yet."""
+    ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
+    present = {header.id for header in storage.list_episodes(FilterIN(key="id", value=list(ids)))}
+    missing = [number for uri, number in ids.items() if uri not in present]
+    if not missing:
+        return
+    target = storage.new_recording_path(benchmark_id)
+    with os_errors("cannot import", target), fill(target) as temporary:
+        if recording.complete and not present:
+            shutil.copyfile(path, temporary)
+        else:
+            temporary.unlink()
+            rewrite_recording(recording, temporary, episodes=missing)
+    storage.ingest(target)

@@ -1,0 +1,145 @@
+"""Benchmarks as text: what `BenchmarkQuery.serialized` holds, and what identifies a benchmark."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+from pydantic import BaseModel
+
+from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
+from tupli_mcap.errors import FormatError, SpaceError, StorageError
+from tupli_mcap.messages.jsonvalue import dumps_plain
+from tupli_mcap.messages.spaces import space_from_json, space_to_json
+from tupli_mcap.schema import BenchmarkMetadata
+from tupli_mcap.storage.common import is_hash
+
+__all__ = [
+    "BenchmarkContent",
+    "benchmark_hash",
+    "declared_spaces",
+    "facts_about",
+    "pack",
+    "plain",
+    "recording_attachments",
+    "unpack",
+]
+
+PICKLE_NAME = "env.cloudpickle"
+DOCUMENT_NAME = "benchmark.json"
+ARTIFACT_PREFIX = "artifacts/"
+
+
+class BenchmarkContent(NamedTuple):
+    """An environment and the ids (SHA-256) of the artifacts that it needs, sorted."""
+
+    record: EnvironmentRecord
+    artifacts: tuple[str, ...]
+
+
+def plain(model: BaseModel) -> dict[str, Any]:
+    """A model as JSON-able dict: NumPy values become numbers and lists, NaN becomes `{"$float": "nan"}`.
+
+    Raises:
+        StorageError: It holds something that has no JSON form.
+    """
+    try:
+        value: dict[str, Any] = json.loads(dumps_plain(model.model_dump()))
+    except (TypeError, ValueError) as err:
+        raise StorageError(f"{type(model).__name__}: expected values that JSON can hold: {err}") from err
+    return value
+
+
+def benchmark_hash(content: BenchmarkContent, metadata: BenchmarkMetadata) -> str:
+    """The identity of a benchmark: SHA-256 (64 hex digits) over its environment, artifacts and metadata."""
+    return sha256(
+        canonical_json(
+            {
+                "environment": content.record.digest,
+                "artifacts": sorted(set(content.artifacts)),
+                "metadata": plain(metadata),
+            }
+        )
+    )
+
+
+def pack(
+    record: EnvironmentRecord, artifacts: Iterable[str] = (), facts: Mapping[str, Any] | None = None
+) -> str:
+    """The text of an environment: `benchmark.json` with the pickle inside, in base64. `facts` are added to
+    its `benchmark` entry."""
+    entry = {**(facts or {}), "artifacts": sorted(set(artifacts))}
+    document = json.loads(record.to_json(entry))
+    if record.pickle is not None:
+        document["pickle"] = base64.b64encode(record.pickle).decode("ascii")
+    return json.dumps(document, ensure_ascii=False)
+
+
+def unpack(serialized: str, *, where: str = "the benchmark") -> BenchmarkContent:
+    """Read what `pack` wrote; executes nothing.
+
+    Raises:
+        FormatError: It is something else.
+    """
+    try:
+        document = json.loads(serialized)
+        encoded = document.get("pickle") if isinstance(document, dict) else None
+        pickle = None if encoded is None else base64.b64decode(encoded, validate=True)
+    except (ValueError, TypeError, RecursionError, binascii.Error) as err:
+        raise FormatError(f"{where}: expected a serialized benchmark: {err}") from err
+    record = EnvironmentRecord.from_json(serialized.encode("utf-8", "replace"), pickle, where=where)
+    return BenchmarkContent(record, artifacts_of(record, where))
+
+
+def artifacts_of(record: EnvironmentRecord, where: str) -> tuple[str, ...]:
+    """The artifact ids that the `benchmark` entry of a document names.
+
+    Raises:
+        FormatError: They are no ids.
+    """
+    ids = (record.benchmark or {}).get("artifacts", [])
+    if not isinstance(ids, list) or not all(is_hash(item) for item in ids):
+        raise FormatError(f"{where}: expected artifacts named by 64 hex digits, found {str(ids)[:100]!r}")
+    return tuple(sorted(set(ids)))
+
+
+def facts_about(env: gym.Env[Any, Any]) -> dict[str, Any]:
+    """What the `benchmark` entry says of an environment beside its identity: its spaces, where they have
+    JSON."""
+    try:
+        return {
+            "observation_space": space_to_json(env.observation_space),
+            "action_space": space_to_json(env.action_space),
+        }
+    except SpaceError:
+        return {}
+
+
+def declared_spaces(serialized: str) -> list[gym.Space[Any]]:
+    """The observation and action space that a serialized benchmark says it has; empty if it does not."""
+    try:
+        facts = unpack(serialized).record.benchmark or {}
+        return [space_from_json(facts[name]) for name in ("observation_space", "action_space")]
+    except (FormatError, KeyError):
+        return []
+
+
+def recording_attachments(serialized: str, *, max_pickle: int = 16 << 20) -> dict[str, tuple[str, bytes]]:
+    """What a recording carries of its benchmark: name -> (media type, bytes).
+
+    A pickle of more than `max_pickle` bytes is left to the storage, and added when a bundle is made.
+    """
+    try:
+        record = unpack(serialized).record
+    except FormatError:
+        return {}
+    attachments = {DOCUMENT_NAME: ("application/json", record.to_json())}
+    if record.pickle is not None:
+        if len(record.pickle) > max_pickle:
+            return {}
+        attachments[PICKLE_NAME] = ("application/octet-stream", record.pickle)
+    return attachments

@@ -1,0 +1,256 @@
+"""`FileStorage`: benchmarks, artifacts and recordings in a directory.
+
+benchmarks/<id>.json, <id>.cloudpickle     the environment, as data or as trusted code
+artifacts/<sha256>, <sha256>.json          bytes, and what is known of them
+recordings/<benchmark id>/<name>.mcap      episodes; `<name>.mcap.json` notes deletions and publications
+storage.json                               declared keys
+catalog.sqlite                             an index of the recordings, which may be deleted at any time
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from tupli_mcap.errors import FormatError, StorageError
+from tupli_mcap.recording import Recording, write_recording
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    ArtifactMetadataItem,
+    BaseFilter,
+    Benchmark,
+    BenchmarkHeader,
+    BenchmarkQuery,
+    Episode,
+    EpisodeHeader,
+    EpisodeItem,
+    FilterEQ,
+)
+from tupli_mcap.storage import bundles
+from tupli_mcap.storage.artifacts import ArtifactFiles
+from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
+from tupli_mcap.storage.base import TupliStorage
+from tupli_mcap.storage.benchmarks import BenchmarkFiles
+from tupli_mcap.storage.common import first_defect
+from tupli_mcap.storage.document import declared_spaces, recording_attachments
+from tupli_mcap.storage.handmade import episode_data, episode_spaces
+from tupli_mcap.storage.recordings import RecordingFiles
+from tupli_mcap.storage.tuples import with_tuples
+
+__all__ = ["FileStorage"]
+
+
+class _Settings(BaseModel):
+    version: int = 1
+    declared_keys: list[str] = []
+
+
+class FileStorage(TupliStorage):
+    """A storage in the directory `root`, made if it is missing.
+
+    Any number of threads and processes may use one directory at once. The recordings are the truth: files put
+    into the directory by other means are found, and what is removed from it is gone.
+
+    Raises:
+        StorageError: The directory cannot be made.
+    """
+
+    def __init__(self, root: str | os.PathLike[str] = "_local_storage") -> None:
+        self.root = Path(root)
+        with os_errors("cannot make the storage", self.root):
+            self.root.mkdir(parents=True, exist_ok=True)
+        self._lock = Lock(self.root / ".lock")
+        self._benchmarks = BenchmarkFiles(self.root / "benchmarks", self._lock)
+        self._artifacts = ArtifactFiles(self.root / "artifacts", self._lock)
+        self._recordings = RecordingFiles(self.root, self._lock, self._settings().declared_keys)
+
+    def close(self) -> None:
+        """Release the catalog; the storage can still be used, and opens it again."""
+        self._recordings.close()
+
+    def __enter__(self) -> FileStorage:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __reduce__(self) -> tuple[type[FileStorage], tuple[Path]]:
+        return FileStorage, (self.root,)  # each process opens the catalog itself
+
+    def __repr__(self) -> str:
+        return f"FileStorage({str(self.root)!r})"
+
+    # --- benchmarks ---
+
+    def store_benchmark(self, benchmark_query: BenchmarkQuery) -> BenchmarkHeader:
+        return self._benchmarks.store(benchmark_query)
+
+    def load_benchmark(self, uri: str) -> Benchmark:
+        return self._benchmarks.load(uri)
+
+    def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
+        return self._benchmarks.list(filter)
+
+    def delete_benchmark(self, uri: str) -> None:
+        self._benchmarks.delete(uri)
+
+    def publish_benchmark(self, uri: str, publish_in: str = "global") -> None:
+        self._benchmarks.publish(uri, publish_in)
+
+    # --- artifacts ---
+
+    def store_artifact(self, artifact: bytes, metadata: ArtifactMetadata) -> ArtifactMetadataItem:
+        return self._artifacts.store(artifact, metadata)
+
+    def load_artifact(self, uri: str, **kwargs: Any) -> bytes:
+        return self._artifacts.load(uri)
+
+    def list_artifacts(self, filter: BaseFilter | None = None) -> list[ArtifactMetadataItem]:
+        return self._artifacts.list(filter)
+
+    def artifact_users(self, uri: str) -> list[str]:
+        return [
+            header.id for header in self.list_benchmarks() if uri in self._benchmarks.artifacts(header.id)
+        ]
+
+    def delete_artifact(self, uri: str, *, force: bool = False) -> None:
+        with self._lock:  # no benchmark that needs it may come in between
+            users = [] if force else self.artifact_users(uri)
+            if users:
+                raise StorageError(
+                    f"artifact {uri} is needed by benchmark {', '.join(users)}; delete that first, "
+                    "or pass force=True"
+                )
+            self._artifacts.delete(uri)
+
+    def publish_artifact(self, uri: str, publish_in: str = "global") -> None:
+        self._artifacts.publish(uri, publish_in)
+
+    # --- episodes ---
+
+    def record_episode(self, episode: Episode) -> EpisodeHeader:
+        return self.record_episodes([episode])[0]
+
+    def record_episodes(self, episodes: Iterable[Episode]) -> list[EpisodeHeader]:
+        given = list(episodes)
+        for i, episode in enumerate(given):
+            if not episode.tuples:
+                raise StorageError(f"an episode needs at least one tuple, found none in episode {i}")
+        groups: dict[str, list[int]] = {}
+        for i, episode in enumerate(given):
+            groups.setdefault(episode.benchmark_id, []).append(i)
+        headers: dict[int, EpisodeHeader] = {}
+        for benchmark_id, positions in groups.items():
+            made = self._record(benchmark_id, [given[i] for i in positions])
+            headers.update(zip(positions, made, strict=True))
+        return [headers[i] for i in range(len(given))]
+
+    def _record(self, benchmark_id: str, episodes: Sequence[Episode]) -> list[EpisodeHeader]:
+        benchmark = self.load_benchmark(benchmark_id)
+        spaces = episode_spaces(episodes, declared_spaces(benchmark.serialized))
+        path = self.new_recording_path(benchmark_id)
+        with os_errors("cannot record", path):
+            write_recording(
+                path,
+                (episode_data(episode, spaces) for episode in episodes),
+                observation_space=spaces[0],
+                action_space=spaces[1],
+                reward_space=spaces[2],
+                benchmark_id=benchmark_id,
+                attachments=recording_attachments(benchmark.serialized),
+            )
+        self.ingest(path)
+        relative = path.relative_to(self.root).as_posix()
+        return self._recordings.headers(FilterEQ(key="recording", value=relative))
+
+    def list_episodes(
+        self,
+        filter: BaseFilter | None = None,
+        include_tuples: bool = False,
+        *,
+        limit: int | None = None,
+        offset: int = 0,
+    ) -> list[EpisodeHeader] | list[EpisodeItem]:
+        headers = self._recordings.headers(filter, limit=limit, offset=offset)
+        return list(with_tuples(headers, self.open_recording)) if include_tuples else headers
+
+    def count_episodes(self, filter: BaseFilter | None = None) -> int:
+        return self._recordings.count(filter)
+
+    def explain(self, filter: BaseFilter | None) -> str:
+        """The SQL that a filter over episodes becomes, and SQLite's plan for it."""
+        return self._recordings.explain(filter)
+
+    def delete_episode(self, uri: str) -> None:
+        self._recordings.delete([self._recordings.header(uri)])
+
+    def delete_episodes(self, filter: BaseFilter) -> int:
+        headers = self._recordings.headers(filter)
+        self._recordings.delete(headers)
+        return len(headers)
+
+    def publish_episode(self, uri: str, publish_in: str = "global") -> None:
+        self._recordings.publish(self._recordings.header(uri), publish_in)
+
+    # --- recordings ---
+
+    def new_recording_path(self, benchmark_id: str) -> Path:
+        self._benchmarks.header(benchmark_id)
+        return self._recordings.new_path(benchmark_id)
+
+    def ingest(self, path: Path) -> None:
+        self._recordings.ingest(path)
+
+    def open_recording(self, recording: str) -> Recording:
+        return Recording(self._recordings.path(recording))
+
+    def declare_key(self, key: str) -> None:
+        self._recordings.declare_key(key)
+        with self._lock, os_errors("cannot declare a key in", self.root):
+            settings = self._settings()
+            if key not in settings.declared_keys:
+                settings.declared_keys.append(key)
+                write_bytes(self.root / "storage.json", settings.model_dump_json(indent=2).encode())
+
+    def declared_keys(self) -> list[str]:
+        """The metadata keys that are indexed."""
+        return self._settings().declared_keys
+
+    def reindex(self) -> None:
+        """Make the catalog anew from the recordings."""
+        self._recordings.reindex()
+
+    def compact(self) -> int:
+        """Rewrite recordings that hold deleted episodes; returns the number of bytes freed.
+
+        Recordings that are being written are left alone. Episodes that stay keep their ids.
+        """
+        return self._recordings.compact()
+
+    # --- sharing ---
+
+    def bundle(
+        self, benchmark_id: str, target: str | os.PathLike[str], filter: BaseFilter | None = None
+    ) -> Path:
+        """Write one file that holds a benchmark, its artifacts and its episodes, see `bundles.write`."""
+        return bundles.write(self, benchmark_id, Path(target), filter)
+
+    def export(self, target: str | os.PathLike[str], filter: BaseFilter | None = None) -> Path:
+        """Write episodes of one benchmark, those a filter is true of, into one file; see `bundles.export`."""
+        return bundles.export(self, Path(target), filter)
+
+    def import_bundle(self, path: str | os.PathLike[str], *, trust: bool = False) -> str:
+        """Take in what `bundle` wrote, see `bundles.read`; returns the benchmark's id."""
+        return bundles.read(self, Path(path), trust=trust)
+
+    def _settings(self) -> _Settings:
+        path = self.root / "storage.json"
+        try:
+            with os_errors("cannot read", path):
+                return _Settings.model_validate_json(path.read_bytes()) if path.exists() else _Settings()
+        except ValidationError as err:
+            raise FormatError(f"{path}: expected the settings of a storage: {first_defect(err)}") from err

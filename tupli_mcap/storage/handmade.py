@@ -1,0 +1,168 @@
+"""Episodes built by hand: spaces from values, and values in the form their spaces have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.errors import SpaceError
+from tupli_mcap.recording import EpisodeData
+from tupli_mcap.schema import Episode
+
+__all__ = ["conform", "episode_data", "infer_space"]
+
+_NUMBERS = (bool, int, float, np.generic)
+_KINDS = "biuf"
+
+
+def infer_space(values: Sequence[Any], where: str = "value") -> gym.Space[Any]:
+    """The narrowest kind of space that all values have in common; bounds are those of the dtype.
+
+    Numbers and flags give a Box of shape (), arrays and regular lists a Box of their shape, arrays that
+    differ in their first dimension a stacked Sequence, texts a Text, dicts (of the same keys) a Dict, tuples
+    a Tuple. dtypes are the values' common one: int64 for Python integers, float64 for Python floats.
+
+    Raises:
+        SpaceError: The values differ in structure or have no space; the message names the place.
+    """
+    if not len(values):
+        raise SpaceError(f"{where}: expected at least one value to infer a space from, found none")
+    first = values[0]
+    if isinstance(first, Mapping):
+        return _dict_space(values, where)
+    if isinstance(first, tuple):
+        _check_all(values, lambda value: isinstance(value, tuple) and len(value) == len(first), first, where)
+        return spaces.Tuple([infer_space([v[i] for v in values], f"{where}[{i}]") for i in range(len(first))])
+    if isinstance(first, str):
+        _check_all(values, lambda value: isinstance(value, str), first, where)
+        characters = "".join(sorted(set().union(*values))) or " "
+        return spaces.Text(max(1, *(len(value) for value in values)), min_length=0, charset=characters)
+    return _array_space(values, where)
+
+
+def conform(value: Any, space: gym.Space[Any]) -> Any:
+    """The value as a sample of an inferred space looks, equal to what it was.
+
+    Raises:
+        SpaceError: The value does not have the space's structure, or would be changed.
+    """
+    if isinstance(space, spaces.Dict) and isinstance(value, Mapping) and value.keys() == space.spaces.keys():
+        return {key: conform(value[key], part) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple) and isinstance(value, tuple) and len(value) == len(space.spaces):
+        return tuple(conform(item, part) for item, part in zip(value, space.spaces, strict=True))
+    if isinstance(space, spaces.Text) and isinstance(value, str):
+        return value
+    dtype = space.feature_space.dtype if isinstance(space, spaces.Sequence) else space.dtype
+    try:
+        given = np.asarray(value)
+        array = given.astype(dtype)
+    except (TypeError, ValueError, OverflowError) as err:
+        raise SpaceError(f"expected a value of {space}, found {value!r:.80}") from err
+    if given.dtype.kind not in _KINDS or not np.array_equal(array, given, equal_nan=True):
+        raise SpaceError(f"expected a value of {space}, found {value!r:.80}")
+    return dtype.type(array) if isinstance(space, spaces.Discrete) else array  # type: ignore[union-attr]
+
+
+def episode_data(
+    episode: Episode, space: tuple[gym.Space[Any], gym.Space[Any], gym.Space[Any] | None]
+) -> EpisodeData:
+    """An episode's values in the form of its spaces (states, actions, rewards; None where rewards are
+    numbers)."""
+    states, actions, rewards = space
+    tuples = episode.tuples
+    infos = [dict(item.info) for item in tuples]
+    return EpisodeData(
+        states=[conform(item.state, states) for item in tuples],
+        actions=[conform(item.action, actions) for item in tuples],
+        rewards=[float(item.reward) if rewards is None else conform(item.reward, rewards) for item in tuples],
+        terminals=[bool(item.terminal) for item in tuples],
+        timeouts=[bool(item.timeout) for item in tuples],
+        metadata=episode.metadata,
+        infos=infos if any(infos) else None,
+    )
+
+
+def episode_spaces(
+    episodes: Sequence[Episode], declared: Sequence[gym.Space[Any]]
+) -> tuple[gym.Space[Any], gym.Space[Any], gym.Space[Any] | None]:
+    """Spaces of the states, actions and rewards of episodes: the declared ones that fit, else inferred
+    ones."""
+    tuples = [item for episode in episodes for item in episode.tuples]
+    columns = [[item.state for item in tuples], [item.action for item in tuples]]
+    state, action = (
+        _declared_or_inferred(column, declared[i : i + 1], where)
+        for i, (column, where) in enumerate(zip(columns, ("state", "action"), strict=True))
+    )
+    rewards = [item.reward for item in tuples]
+    if all(isinstance(reward, _NUMBERS) or np.shape(reward) == () for reward in rewards):
+        return state, action, None
+    return state, action, infer_space(rewards, "reward")
+
+
+def _declared_or_inferred(
+    column: Sequence[Any], declared: Sequence[gym.Space[Any]], where: str
+) -> gym.Space[Any]:
+    for space in declared:
+        try:
+            if all(space.contains(conform(value, space)) for value in column):
+                return space
+        except (SpaceError, ValueError, TypeError, AttributeError):
+            pass
+    return infer_space(column, where)
+
+
+def _dict_space(values: Sequence[Any], where: str) -> gym.Space[Any]:
+    first = values[0]
+    _check_all(
+        values, lambda value: isinstance(value, Mapping) and value.keys() == first.keys(), first, where
+    )
+    parts = [(key, infer_space([value[key] for value in values], f"{where}[{key!r}]")) for key in first]
+    return spaces.Dict(parts)
+
+
+def _array_space(values: Sequence[Any], where: str) -> gym.Space[Any]:
+    arrays = [_array(value, where) for value in values]
+    dtype = np.result_type(*{array.dtype for array in arrays})
+    if dtype.kind not in _KINDS:
+        raise SpaceError(f"{where}: expected numbers or flags of one kind, found {dtype}")
+    shapes = {array.shape for array in arrays}
+    if len(shapes) == 1:
+        return _box(shapes.pop(), dtype)
+    if len({shape[1:] for shape in shapes}) == 1 and () not in shapes:
+        return spaces.Sequence(_box(next(iter(shapes))[1:], dtype), stack=True)
+    raise SpaceError(f"{where}: expected values of one shape, found shapes {sorted(shapes)[:5]}")
+
+
+def _array(value: Any, where: str) -> np.ndarray[Any, Any]:
+    try:
+        array = np.asarray(value)
+    except ValueError as err:
+        raise SpaceError(f"{where}: expected a list with items of one shape, found {value!r:.80}") from err
+    if array.dtype.kind not in _KINDS or array.dtype.itemsize > 8:
+        kind = f"{type(value).__module__}.{type(value).__qualname__}"
+        raise SpaceError(
+            f"{where}: expected numbers, flags, texts, arrays, dicts or tuples, found {kind}: {value!r:.80}"
+        )
+    return array
+
+
+def _box(shape: tuple[int, ...], dtype: np.dtype[Any]) -> gym.Space[Any]:
+    if dtype.kind == "b":
+        return spaces.Box(0, 1, shape, np.bool_)
+    if dtype.kind == "f":
+        return spaces.Box(-np.inf, np.inf, shape, dtype.type)
+    limits = np.iinfo(dtype)
+    return spaces.Box(limits.min, limits.max, shape, dtype.type)
+
+
+def _check_all(values: Iterable[Any], test: Any, first: Any, where: str) -> None:
+    for i, value in enumerate(values):
+        if not test(value):
+            raise SpaceError(
+                f"{where}: expected every step to be like the first ({first!r:.60}), "
+                f"step {i} has {value!r:.60}"
+            )

@@ -1,0 +1,347 @@
+"""Recordings in a directory, and the catalog that follows them."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import os
+import re
+import secrets
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
+from tupli_mcap.recording import Recording, journal_path, rewrite_recording
+from tupli_mcap.recording.lock import FileLock, is_locked
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
+from tupli_mcap.storage.atomic import Lock, os_errors
+from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
+from tupli_mcap.storage.common import LOCAL_USER, published_in
+from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
+
+__all__ = ["RecordingFiles", "episode_id"]
+
+_ENDS = ("terminal", "timeout", "interrupted")
+_EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
+
+
+class RecordingFiles:
+    """The recordings below a storage's root. Several processes may record, query and delete at once.
+
+    The files are the truth. Before each query the catalog is brought up to date with those that have
+    appeared, changed (by size and time stamps) or gone; recordings that are being written are read anew each
+    time.
+    """
+
+    def __init__(self, root: Path, lock: Lock, declared_keys: Iterable[str]) -> None:
+        self._root = root
+        self._lock = lock
+        self._declared_keys = list(declared_keys)
+        self._opened: Catalog | None = None
+        self._warned: set[tuple[str, RecordingStamp]] = set()
+
+    def close(self) -> None:
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
+
+    # --- queries ---
+
+    def headers(
+        self, filter: BaseFilter | None, *, limit: int | None = None, offset: int = 0
+    ) -> list[EpisodeHeader]:
+        self.sync()
+        return self._catalog.episodes(filter, limit=limit, offset=offset)
+
+    def count(self, filter: BaseFilter | None) -> int:
+        self.sync()
+        return self._catalog.count(filter)
+
+    def explain(self, filter: BaseFilter | None) -> str:
+        return self._catalog.explain(filter)
+
+    def declare_key(self, key: str) -> None:
+        self._catalog.declare_key(key)
+        if key not in self._declared_keys:
+            self._declared_keys.append(key)
+
+    def header(self, uri: str) -> EpisodeHeader:
+        """Raises NotFoundError if there is no such episode."""
+        match = _EPISODE_ID.match(uri) if isinstance(uri, str) else None
+        found = self.headers(FilterEQ(key="id", value=uri), limit=1) if match else []
+        if not found:
+            raise NotFoundError(
+                f"there is no episode with id {str(uri)[:80]!r}; list_episodes() names them all"
+            )
+        return found[0]
+
+    # --- files ---
+
+    def new_path(self, benchmark_id: str) -> Path:
+        """A path below the benchmark's directory that nobody else is given."""
+        directory = self._root / "recordings" / benchmark_id
+        with os_errors("cannot make the directory", directory):
+            directory.mkdir(parents=True, exist_ok=True)
+        now = datetime.datetime.now(datetime.UTC)
+        return directory / f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(6)}.mcap"
+
+    def path(self, recording: str) -> Path:
+        """The file of a catalogued recording.
+
+        Raises:
+            NotFoundError: It is not one, or not below the root.
+        """
+        path = self._root / recording
+        relative = Path(recording)
+        inside = recording.endswith(".mcap") and not relative.is_absolute() and ".." not in relative.parts
+        if not inside or not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises for long names
+            raise NotFoundError(f"there is no recording {recording[:200]!r} in {str(self._root)!r}")
+        return path
+
+    def paths(self) -> Iterator[tuple[str, Path]]:
+        """Every recording: its path relative to the root (with forward slashes), and its path."""
+        for directory, names, files in os.walk(self._root):
+            names[:] = sorted(name for name in names if not name.startswith("."))
+            for name in sorted(files):
+                if name.endswith(".mcap") and not name.startswith("."):
+                    path = Path(directory) / name
+                    yield path.relative_to(self._root).as_posix(), path
+
+    # --- the catalog ---
+
+    @property
+    def _catalog(self) -> Catalog:
+        if self._opened is None:
+            try:
+                self._opened = Catalog(self._root / "catalog.sqlite")
+            except StorageError:
+                if os.access(self._root, os.W_OK):
+                    raise
+                self._opened = Catalog(None)  # a storage that can only be read
+            self._declare_all(self._opened)
+        return self._opened
+
+    def _declare_all(self, catalog: Catalog) -> None:
+        for key in self._declared_keys:
+            catalog.declare_key(key)
+
+    def sync(self) -> None:
+        """Bring the catalog up to date with the files."""
+        try:
+            self._sync()
+        except CatalogDamagedError:
+            self._catalog.reset()
+            self._declare_all(self._catalog)
+            self._sync()
+
+    def reindex(self) -> None:
+        """Forget the catalog and fill it from the files."""
+        self._catalog.reset()
+        self._declare_all(self._catalog)
+        self._warned.clear()
+        self._sync()
+
+    def ingest(self, path: Path) -> None:
+        """Catalogue one recording; a finished one without episodes is removed instead.
+
+        Raises:
+            StorageError: It is not below the root.
+            FormatError: It is damaged.
+        """
+        try:
+            relative = path.resolve().relative_to(self._root.resolve()).as_posix()
+        except ValueError as err:
+            raise StorageError(
+                f"expected a recording below {str(self._root)!r}, found {str(path)!r}"
+            ) from err
+        if not self._put(relative, path, _stamp(path)) and not is_locked(path):
+            self._remove(relative, path)
+
+    def _sync(self) -> None:
+        known = self._catalog.recordings()
+        found = dict(self.paths())
+        # What is gone goes first: a file that was moved is no copy of itself.
+        for relative in known.keys() - found.keys():
+            self._catalog.remove_recording(relative)
+        for relative, path in found.items():
+            try:
+                stamp = _stamp(path)
+            except FileNotFoundError:
+                continue  # deleted since it was listed
+            # A journal means: being written, or killed; what it holds is in no time stamp.
+            if known.get(relative) != stamp or journal_path(path).exists():
+                self._try_to_put(relative, path, stamp)
+
+    def _try_to_put(self, relative: str, path: Path, stamp: RecordingStamp) -> None:
+        try:
+            self._put(relative, path, stamp)
+        except FileNotFoundError:
+            self._catalog.remove_recording(relative)
+        except (FormatError, RecordingError, OSError) as err:
+            self._catalog.remove_recording(relative)
+            self._warn_once(relative, stamp, f"skipped a recording: {err}")
+
+    def _warn_once(self, relative: str, stamp: RecordingStamp, message: str) -> None:
+        if (relative, stamp) not in self._warned:
+            self._warned.add((relative, stamp))
+            warnings.warn(message, stacklevel=6)
+
+    def _put(self, relative: str, path: Path, stamp: RecordingStamp) -> int:
+        """Catalogue a recording unless it is a copy; returns how many episodes it holds."""
+        sidecar = Sidecar.read(path)
+        with Recording(path) as recording:
+            original = self._original_of(relative, recording)
+            if original is not None:
+                self._catalog.remove_recording(relative)
+                self._warn_once(
+                    relative, stamp, f"skipped a recording: {path} holds episodes of {original} again"
+                )
+                return len(recording)
+            self._catalog.put_recording(
+                relative,
+                stamp,
+                uuid=recording.uuid,
+                benchmark_id=recording.benchmark_id,
+                rows=_rows(recording, sidecar, live=is_locked(path)),
+            )
+            return len(recording)
+
+    def _original_of(self, relative: str, recording: Recording) -> str | None:
+        """Another recording that holds the first or the last episode of this one."""
+        numbers = {int(recording.index["episode"][i]) for i in (0, -1)} if len(recording) else set()
+        for number in numbers:
+            uri = episode_id(recording.uuid, number)
+            for header in self._catalog.episodes(FilterEQ(key="id", value=uri)):
+                if header.recording != relative:
+                    return header.recording
+        return None
+
+    # --- changes ---
+
+    def publish(self, header: EpisodeHeader, group: str) -> None:
+        path = self.path(header.recording)
+        with self._lock:
+            sidecar = Sidecar.read(path)
+            groups = sidecar.published_in.get(header.episode, [LOCAL_USER])
+            sidecar.published_in[header.episode] = published_in(groups, group)
+            sidecar.write(path)
+            self.ingest(path)
+
+    def delete(self, headers: Sequence[EpisodeHeader]) -> None:
+        """Delete episodes: by a note beside their recording, or with it where nothing else is left in it."""
+        by_recording: dict[str, set[int]] = {}
+        for header in headers:
+            by_recording.setdefault(header.recording, set()).add(header.episode)
+        for relative, numbers in by_recording.items():
+            with self._lock:
+                self._delete(relative, numbers)
+
+    def _delete(self, relative: str, numbers: set[int]) -> None:
+        path = self.path(relative)
+        sidecar = Sidecar.read(path)
+        sidecar.deleted |= numbers
+        with Recording(path) as recording:
+            left = {int(number) for number in recording.index["episode"]} - sidecar.deleted
+        if left or is_locked(path):
+            sidecar.write(path)
+            self.ingest(path)
+            return
+        self._remove(relative, path)
+
+    def _remove(self, relative: str, path: Path) -> None:
+        with os_errors("cannot delete the recording", path):
+            for gone in (path, journal_path(path), sidecar_path(path)):
+                gone.unlink(missing_ok=True)
+        self._catalog.remove_recording(relative)
+        if path.parent.parent == self._root / "recordings":
+            with contextlib.suppress(OSError):  # not empty
+                path.parent.rmdir()
+
+    def compact(self) -> int:
+        """Rewrite the recordings that hold deleted episodes; returns how many bytes that freed.
+
+        Those that are being written are left alone. Episodes that stay keep their ids.
+        """
+        freed = 0
+        for _, path in list(self.paths()):
+            with self._lock:
+                if path.exists() and Sidecar.read(path).deleted and not is_locked(path):
+                    freed += self._compact(path)
+        return freed
+
+    def _compact(self, path: Path) -> int:
+        sidecar = Sidecar.read(path)
+        before = path.stat().st_size
+        writer_lock = FileLock(path, "a")  # nobody appends meanwhile
+        try:
+            with os_errors("cannot rewrite the recording", path), Recording(path) as recording:
+                kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
+                rewrite_recording(recording, path, episodes=kept)
+                journal_path(path).unlink(missing_ok=True)
+        finally:
+            writer_lock.release()
+        groups = {number: sidecar.published_in[number] for number in kept if number in sidecar.published_in}
+        Sidecar(published_in=groups).write(path)
+        self.ingest(path)
+        return before - path.stat().st_size
+
+
+def episode_id(uuid: str, episode: int) -> str:
+    """The id of an episode: its recording's UUID and its number."""
+    return f"{uuid}-{episode}"
+
+
+def _stamp(path: Path) -> RecordingStamp:
+    status = path.stat()
+    try:
+        sidecar = sidecar_path(path).stat().st_mtime_ns
+    except FileNotFoundError:
+        sidecar = 0
+    return RecordingStamp(status.st_size, status.st_mtime_ns, sidecar)
+
+
+def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[EpisodeRow]:
+    index = recording.index
+    columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return", "end_time")]
+    seeds = [
+        seed if has else None
+        for has, seed in zip(index["has_seed"].tolist(), index["seed"].tolist(), strict=True)
+    ]
+    running = _running(columns[1], columns[3]) if live else set()
+    local = json.dumps([LOCAL_USER])
+    for i, (number, env, length, end, total, time_ns, seed, metadata) in enumerate(
+        zip(*columns, seeds, recording.all_metadata(), strict=True)
+    ):
+        if number in sidecar.deleted or i in running:
+            continue
+        groups = sidecar.published_in.get(number)
+        yield EpisodeRow(
+            episode=number,
+            env=env,
+            n_tuples=length,
+            end=_ENDS[end],
+            episode_return=total,
+            seed=seed,
+            created_at=_iso(time_ns),
+            created_by=LOCAL_USER,
+            published_in=local if groups is None else json.dumps(groups),
+            metadata=metadata,
+        )
+
+
+def _running(envs: Sequence[int], ends: Sequence[int]) -> set[int]:
+    """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no
+    end."""
+    last = {env: i for i, env in enumerate(envs)}
+    return {i for i in last.values() if _ENDS[ends[i]] == "interrupted"}
+
+
+def _iso(time_ns: int) -> str:
+    seconds, rest = divmod(time_ns, 10**9)
+    try:
+        moment = datetime.datetime.fromtimestamp(seconds, datetime.UTC).replace(microsecond=rest // 1000)
+    except (OverflowError, ValueError, OSError):
+        return ""  # a claim of the file that no calendar has
+    return moment.isoformat()
