@@ -57,7 +57,7 @@ class MessageDecoder:
             if position + size > len(body):
                 raise FormatError(f"{leaf.path}: expected {size} bytes at byte {position} of {len(body)}")
             value = np.frombuffer(body[position : position + size], dtype).reshape(leaf.shape).copy()
-            values[leaf.name] = value[()] if leaf.kind == "scalar" else value
+            values[leaf.name] = value[()] if leaf.is_scalar else value
             position += size
         return values, position
 

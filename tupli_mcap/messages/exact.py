@@ -76,7 +76,7 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
         raise StepError(f"{path}: expected an array, found a masked array, whose mask cannot be recorded")
     try:
         array = np.asarray(value)
-    except (ValueError, TypeError) as err:
+    except (ValueError, TypeError, RuntimeError) as err:  # RuntimeError: a torch tensor that requires grad
         raise StepError(f"{path}: expected {dtype.name}{list(shape)}, found {shorten(value)}") from err
     if array.dtype.kind not in "biuf":
         raise StepError(f"{path}: expected {dtype.name}{list(shape)}, found {shorten(value)}")
@@ -101,12 +101,13 @@ def _always_exact(source: DType, target: DType) -> bool:
 
 
 def _equal(array: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bool:
-    """Element-wise equality in Python's exact arithmetic (NumPy would round an int64 to compare it with a float64)."""
+    """Element-wise equality in Python's exact arithmetic (NumPy would round an int64 to compare it with a float64).
+
+    A float must also come back from the cast bit for bit: -0.0 and the payload of a NaN do not survive every cast.
+    """
     if array.dtype.kind == "f":
-        both_nan = np.isnan(array) & (np.isnan(cast) if cast.dtype.kind == "f" else False)
-        if np.all(both_nan):
-            return True
-        array, cast = array[~both_nan], cast[~both_nan]
+        with np.errstate(all="ignore"):
+            return cast.astype(array.dtype).tobytes() == array.tobytes()
     return bool(np.all(array.astype(object) == cast.astype(object)))
 
 

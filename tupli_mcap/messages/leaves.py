@@ -71,6 +71,11 @@ class Leaf:
         """Number of elements of one value."""
         return int(np.prod(self.shape, dtype=np.int64))
 
+    @property
+    def is_scalar(self) -> bool:
+        """True where Gymnasium's own samples are scalars: a Discrete, and a Box of shape () of integers or bools."""
+        return self.shape == () and self.dtype is not None and self.dtype.kind in "iub"
+
     def get(self, value: Any) -> Any:
         """The leaf's value inside a value of the whole space."""
         for key in self.keys:

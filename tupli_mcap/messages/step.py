@@ -37,7 +37,8 @@ _U32, _BOOL = np.dtype(np.uint32), np.dtype(np.bool_)
 class StepLayout:
     """Leaves, stored dtypes and message layouts of `/step`, `/final_state` and the image channels.
 
-    `dtypes` maps a leaf's ROS name to its stored dtype; leaves not named keep the declared one.
+    `dtypes` maps a constant leaf's ROS name to its stored dtype; leaves not named keep the declared one. `inner_dtypes`
+    does the same inside leaves of variable size: ROS name -> path in the leaf -> dtype name.
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
@@ -49,7 +50,9 @@ class StepLayout:
         action_space: gym.Space[Any],
         reward_space: gym.Space[Any] | None = None,
         dtypes: Mapping[str, DType] | None = None,
+        inner_dtypes: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
+        self.inner_dtypes = {name: dict(found) for name, found in (inner_dtypes or {}).items() if found}
         self.observation_space = observation_space
         self.action_space = action_space
         self.reward_space = reward_space
@@ -94,8 +97,16 @@ class StepLayout:
     @cached_property
     def variable(self) -> dict[str, VariableField]:
         """Codecs of the leaves of variable size, by ROS name."""
+        taken: set[str] = set()  # names of nested messages are unique in a schema
         return {
-            leaf.name: VariableField(leaf.space, leaf.name, type_prefix=_camel(leaf.name))
+            leaf.name: VariableField(
+                leaf.space,
+                leaf.name,
+                type_prefix=_camel(leaf.name),
+                path=leaf.path,
+                taken=taken,
+                dtypes=self.inner_dtypes.get(leaf.name),
+            )
             for leaf in self.leaves
             if leaf.kind == "variable"
         }
@@ -152,6 +163,7 @@ class StepLayout:
             "action_space": jsonvalue.dumps(space_to_json(self.action_space)),
             "reward_space": reward,
             "dtypes": jsonvalue.dumps({name: dtype.name for name, dtype in self.dtypes.items()}),
+            "inner_dtypes": jsonvalue.dumps(self.inner_dtypes),
         }
 
     @classmethod
@@ -166,13 +178,19 @@ class StepLayout:
         names = jsonvalue.loads(_entry(metadata, "dtypes"))
         if not isinstance(names, dict) or not all(name in ROS_TYPES for name in names.values()):
             raise FormatError(f"channel metadata 'dtypes': expected ROS names with NumPy dtypes, found {names!r:.200}")
+        inner = jsonvalue.loads(_entry(metadata, "inner_dtypes"))
+        if not isinstance(inner, dict) or not all(isinstance(found, dict) for found in inner.values()):
+            raise FormatError(f"channel metadata 'inner_dtypes': expected paths with dtypes, found {inner!r:.200}")
         try:
-            return cls(
+            layout = cls(
                 space_from_json(jsonvalue.loads(_entry(metadata, "observation_space"))),
                 space_from_json(jsonvalue.loads(_entry(metadata, "action_space"))),
                 reward,
                 {name: np.dtype(text) for name, text in names.items()},
+                inner,
             )
+            _ = layout.variable
+            return layout
         except SpaceError as err:
             raise FormatError(f"channel metadata describes spaces that cannot be recorded: {err}") from err
 

@@ -192,7 +192,7 @@ class ColumnReader:
                 if leaf.kind != "variable":
                     dtype = self._layout.dtypes[leaf.name]
                     value = values.get(leaf.name, np.empty(leaf.shape, dtype))
-                    values[leaf.name] = dtype.type(value) if leaf.kind == "scalar" else np.array(value, dtype)
+                    values[leaf.name] = np.array(value, dtype).reshape(leaf.shape)[() if leaf.is_scalar else ...]
             found.append(values)
         return found
 

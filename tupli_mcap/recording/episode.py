@@ -166,8 +166,8 @@ def _item(space: Any, columns: Any) -> Any:
     if type(space) is spaces.Tuple:
         items = [_item(sub, column) for sub, column in zip(space.spaces, columns, strict=True)]
         return lambda i: tuple(item(i) for item in items)
-    if isinstance(columns, np.ndarray) and columns.ndim == 1 and type(space) is not spaces.Discrete:
-        return lambda i: np.asarray(columns[i])  # a Box of shape () gives arrays
+    if type(space) is spaces.Box and space.shape == () and columns.dtype.kind == "f":
+        return lambda i: np.asarray(columns[i])  # what Gymnasium samples here is an array, of integers a scalar
     return lambda i: columns[i]
 
 

@@ -92,18 +92,17 @@ def _aligned(n: int) -> int:
 
 
 class Journal:
-    """A journal being written."""
+    """A journal being written; `publish` it once it says all that the one before it said."""
 
     def __init__(self, path: Path, areas: list[Area], info: Mapping[str, Any]) -> None:
         self.path = path
         self.areas = {area.name: area for area in areas}
         self.info = dict(info)
         header, self.offsets, size = _plan(areas, self.info)
-        temporary = path.with_name(path.name + ".tmp")
+        self._temporary = temporary = path.with_name(path.name + ".tmp")
         try:
             self._map = _create(temporary, size)
             self._map[: len(header)] = header
-            temporary.replace(path)
         except OSError as err:
             with contextlib.suppress(OSError):
                 temporary.unlink()
@@ -111,6 +110,10 @@ class Journal:
                 f"{path}: expected {size} bytes for the journal, found {err.strerror}; "
                 "free some space or give journal_dir= another place"
             ) from err
+
+    def publish(self) -> None:
+        """Puts the journal in its place, instead of one that may be there; until then it is not found."""
+        self._temporary.replace(self.path)
 
     def buffer(self, name: str) -> memoryview:
         """The bytes of an area."""

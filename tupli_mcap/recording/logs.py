@@ -100,6 +100,13 @@ class EventLog:
         self._commit[0] = position
         self.sequences[channel] -= 1
 
+    def move(self, area: LogArea, buffer: memoryview) -> None:
+        """Goes on in another journal; everything must have been flushed."""
+        self._records = buffer[_HEADER : _HEADER + area.capacity]
+        self._commit = buffer[:8].cast("Q")
+        self._capacity = area.capacity
+        self._position = 0
+
     def flush(self) -> None:
         """Writes the records to the file."""
         for rows in group_records(self._records[: self._position]):
@@ -137,26 +144,28 @@ class StepLog:
         self, layout: StepLayout, area: LogArea, buffer: memoryview, channel: int, sink: Sink, images: Sequence[Any], first: int = 0
     ) -> None:
         self._layout = layout
-        self._area = area
-        self._records = [buffer[h * area.half + _HEADER : (h + 1) * area.half] for h in range(2)]
-        self._ends = [buffer[h * area.half : h * area.half + 8].cast("Q") for h in range(2)]
         self._channel = channel
         self._sink = sink
         self._images = images
-        self._half = 0
-        self._position = 0
-        self._emitted = 0
         self._episode = 0
         self._step = 0
         self._time = 0
         self._pending = bytearray()
         self._state = leaf_encoders(layout, [leaf for leaf in layout.state if leaf.kind != "image"])
-        self._rest = leaf_encoders(layout, [*layout.action, *layout.reward])
+        self._action = leaf_encoders(layout, layout.action)
+        self._reward = leaf_encoders(layout, layout.reward)
         self.count = first
         self.total: Any = 0.0
         self.grow: Callable[[int], None] | None = None
-        for end in self._ends:
-            end[0] = 0
+        self.move(area, buffer)
+
+    def move(self, area: LogArea, buffer: memoryview) -> None:
+        """Goes on in another journal, with everything committed in the file: only the running record moves."""
+        self._area = area
+        self._records = [buffer[h * area.half + _HEADER : (h + 1) * area.half] for h in range(2)]
+        self._ends = [buffer[h * area.half : h * area.half + 8].cast("Q") for h in range(2)]
+        self._half = self._position = self._emitted = 0
+        self._write_pending(0)
 
     def begin_episode(self, episode: int) -> None:
         """The records that follow belong to `episode`."""
@@ -164,7 +173,7 @@ class StepLog:
 
     def put_state(self, state: Any) -> None:
         """Starts the running record over: the state of a reset."""
-        pending, images = self._encode_state(state, 0)
+        pending, images = self._encode_state(state, 0, self.count)
         self._reserve(len(pending))
         self._pending = pending
         self._write_pending(self._position)
@@ -174,10 +183,10 @@ class StepLog:
     def put(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """Completes and commits the running record; `state` starts the next one."""
         out = bytearray(self._pending)
-        for leaves, root in ((self._layout.action, action), (self._layout.reward, reward)):
-            self._encode(out, leaves, root)
+        self._encode(out, self._action, action)
+        self._encode(out, self._reward, reward)
         out += bytes((bool(terminal), bool(timeout)))
-        pending, images = self._encode_state(state, self._step + 1)
+        pending, images = self._encode_state(state, self._step + 1, self.count + 1)
         self._reserve(len(out) + len(pending))
         self._time = max(time.time_ns(), self._time)
         RECORD_HEADER.pack_into(out, 0, 5, len(out) - 9, self._channel, self.count, self._time, self._time)
@@ -198,15 +207,16 @@ class StepLog:
         """The CDR bytes of the running record's state, as they follow `episode` and `env` in `/final_state`."""
         return bytes(self._pending[BODY + 8 :])
 
-    def _encode(self, out: bytearray, leaves: Sequence[Leaf], root: Any) -> None:
-        for leaf, encode in self._state + self._rest:
-            if leaf in leaves:
-                encode(leaf_value(root, leaf), out, BODY)
+    @staticmethod
+    def _encode(out: bytearray, encoders: Sequence[tuple[Leaf, Encoder]], root: Any) -> None:
+        for leaf, encode in encoders:
+            encode(leaf_value(root, leaf), out, BODY)
 
-    def _encode_state(self, state: Any, step: int) -> tuple[bytearray, list[Any]]:
-        out = bytearray(RECORD_HEADER.size) + CDR_HEADER
+    def _encode_state(self, state: Any, step: int, sequence: int) -> tuple[bytearray, list[Any]]:
+        # a length of 0 says that the record is not complete, its sequence which one it will be
+        out = bytearray(RECORD_HEADER.pack(5, 0, self._channel, sequence, 0, 0)) + CDR_HEADER
         out += self._episode.to_bytes(4, "little") + step.to_bytes(4, "little")
-        self._encode(out, [leaf for leaf in self._layout.state if leaf.kind != "image"], state)
+        self._encode(out, self._state, state)
         images = [
             sink.check(leaf_value(state, leaf)) for sink, leaf in zip(self._images, self._layout.images, strict=True)
         ]

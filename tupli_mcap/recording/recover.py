@@ -153,7 +153,7 @@ def _salvage(
             entries = [e for e in log_records(journal, log, {channel: first}) if e[0] == channel]
             rows = to_rows(entries)[0] if entries else None
             total = first + len(entries)
-            state = running_record(journal, log, total - 1, layout)
+            state = running_record(journal, log, total, layout)
             if state is not None:
                 tail.pending[env] = state
         if rows is not None:

@@ -158,16 +158,21 @@ class ImageRows:
         self, leaf: Leaf, layout: ImageLayout, area: RowArea, buffer: memoryview, channel: int, sink: Sink, first: int = 0
     ) -> None:
         self._leaf = leaf
-        self._area = area
-        self._buffer = buffer
+        self._layout = layout
         self._channel = channel
         self._sink = sink
         self._sequence = first
-        self._row = 0
-        self._half = 0
-        self._flushed = 0
         self._time = 0
-        dtype = layout.dtype
+        self._uint8 = np.dtype(np.uint8)
+        self.move(area, buffer)
+
+    def move(self, area: RowArea, buffer: memoryview) -> None:
+        """Goes on in another journal, with the rows before the running one in the file: only that one moves."""
+        running = self._rows[self._half, self._row].copy() if hasattr(self, "_rows") else None
+        self._area = area
+        self._buffer = buffer
+        self._row = self._half = self._flushed = 0
+        layout, channel, dtype = self._layout, self._channel, self._layout.dtype
         self._rows: Array = np.frombuffer(buffer, dtype).reshape(2, area.rows + 1)
         self._rows["fixed"] = np.frombuffer(layout.body[8:], np.uint8)
         record = RECORD_HEADER.pack(5, dtype.itemsize - 9, channel, 0, 0, 0) + CDR_HEADER
@@ -175,7 +180,8 @@ class ImageRows:
         for name in ("#opcode", "#length", "#channel", "#cdr"):
             self._rows[name] = template[name]
         self._data: Array = self._rows["data"]
-        self._uint8 = np.dtype(np.uint8)
+        if running is not None:
+            self._rows[0, 0] = running
 
     def check(self, value: Any) -> Array:
         """`value` as an image of the leaf's shape; StepError if it is none."""

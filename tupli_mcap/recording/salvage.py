@@ -9,7 +9,7 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea
@@ -118,18 +118,19 @@ def to_rows(entries: Sequence[tuple[int, int, int, bytes]]) -> list[Rows]:
 
 
 def running_record(contents: JournalContents, area: LogArea, sequence: int, layout: StepLayout) -> bytes | None:
-    """The state (CDR bytes after `episode` and `env`) that follows the record with `sequence`; None if it is gone."""
+    """The state (CDR bytes after `episode` and `env`) of the running record, which will have `sequence`; None if it is
+    not here."""
     for half in range(area.halves):
-        data = _half(contents, area, half)
-        last = None
-        for _, end, _, found, _ in iter_records(data):
-            last = (found, end)
-        if last is None or last[0] != sequence:
+        start = half * area.half + 64 + len(_half(contents, area, half))
+        raw = memoryview(contents.data[area.name])[start : (half + 1) * area.half]
+        if len(raw) < BODY:
             continue
-        start = half * area.half + 64 + last[1]
-        raw = memoryview(contents.data[area.name])[start + BODY : (half + 1) * area.half]
+        opcode, _, _, found, _, _ = RECORD_HEADER.unpack_from(raw)
+        if (opcode, found) != (5, sequence):
+            continue
         try:
-            return bytes(raw[8 : MessageDecoder(layout).state(raw)])
+            body = raw[BODY:]
+            return bytes(body[8 : MessageDecoder(layout).state(body)])
         except FormatError:
-            return None
+            continue
     return None

@@ -9,6 +9,7 @@ from typing import Any
 from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.messages.exact import check_structure, decide_dtype, exact_array, leaf_value
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.widening import variable_dtypes
 from tupli_mcap.recording.events import INTERRUPTED
 from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
@@ -28,18 +29,19 @@ def decide_layout(
     """
     if recorded is not None:
         return recorded
-    dtypes = {}
+    dtypes, inner = {}, {}
     for leaves, roots in ((spaces.state, states), (spaces.action, actions), (spaces.reward, rewards)):
         for leaf in leaves:
-            if leaf.dtype is None:
-                continue
             values = [leaf_value(root, leaf) for root in roots]
+            if leaf.dtype is None:
+                inner[leaf.name] = variable_dtypes(leaf.space, values, leaf.path)
+                continue
             default_reward = leaf.name == "reward" and spaces.reward_space is None
             dtype = leaf.dtype if default_reward or leaf.kind == "image" else decide_dtype(leaf, values)
             for value in values:
                 exact_array(value, dtype, leaf.shape, leaf.path)
             dtypes[leaf.name] = dtype
-    return StepLayout(spaces.observation_space, spaces.action_space, spaces.reward_space, dtypes)
+    return StepLayout(spaces.observation_space, spaces.action_space, spaces.reward_space, dtypes, inner)
 
 
 class SingleRecorder:

@@ -194,13 +194,8 @@ class RecordingWriter:
         assert self.layout is not None
         layout, channels = self.layout, self.channels
         counts, before_ns = self.container.counts, self.container.end_time
-        definitions = {
-            "uuid": self.uuid,
-            "vector": self.is_vector,
-            "channels": [channels.steps, channels.images, *channels[2:]],
-            "definitions": {str(c): self.container.definitions(c).hex() for c in self.container.channels},
-        }
-        self.journal = Journal(journal_path(self.path, self.options.journal_dir), list(areas), definitions)
+        self.journal = self._new_journal(areas)
+        self.journal.publish()
         by_name = self.journal.areas
         buffer = self.journal.buffer
         self.images = []
@@ -346,7 +341,30 @@ class RecordingWriter:
     def _grow(self, size: int) -> None:
         """Makes a larger journal for steps of `size` bytes; the running states move into it."""
         self.flush()
-        raise RecordingError(f"{self.path}: a step of {size} bytes is larger than the journal's half")
+        areas = self._areas(2 * size)
+        journal = self._new_journal(areas)
+        logs = self.vector if isinstance(self.vector, list) else [self.rows]
+        for i, log in enumerate(logs):
+            log.move(journal.areas[f"steps/{i}"], journal.buffer(f"steps/{i}"))  # type: ignore[union-attr, arg-type]
+        for leaf, sinks in zip(self.layout.images, self.images, strict=True):  # type: ignore[union-attr]
+            for i, sink in enumerate(sinks):
+                name = f"{leaf.name}/{i}"
+                sink.move(journal.areas[name], journal.buffer(name))  # type: ignore[arg-type]
+        for name, log in (("events", self.events), ("info", self.infos)):
+            if log is not None:
+                log.move(journal.areas[name], journal.buffer(name))  # type: ignore[arg-type]
+        journal.publish()
+        self.journal = journal
+
+    def _new_journal(self, areas: Sequence[Area]) -> Journal:
+        channels = self.channels
+        description = {
+            "uuid": self.uuid,
+            "vector": self.is_vector,
+            "channels": [channels.steps, channels.images, *channels[2:]],
+            "definitions": {str(c): self.container.definitions(c).hex() for c in self.container.channels},
+        }
+        return Journal(journal_path(self.path, self.options.journal_dir), list(areas), description)
 
     def close(self) -> None:
         """Writes the rest, the episode index and the summary, and removes the journal."""
