@@ -269,15 +269,22 @@ class TestOneMeaning:
         with Catalog(None) as catalog:
             fill(catalog, [header_of(i, base_row({"x": number}, number)) for i, number in enumerate(NUMBERS)])
             for operation in (FilterEQ, FilterNE, FilterGT, FilterGEQ, FilterLT, FilterLEQ):
-                for key in ("metadata.x", "episode_return"):
+                for key in ("metadata.x", "episode_return", "seed"):
                     asked = operation(key=key, value=value)
                     expected = [h.episode for h in catalog.episodes() if compile_predicate(asked)(h)]
                     assert [h.episode for h in catalog.episodes(asked)] == expected, asked
 
 
 def base_row(metadata: dict[str, Any], number: float) -> dict[str, Any]:
-    ret = number if isinstance(number, float) else None
-    return {"metadata": metadata, "n_tuples": 1, "end": "timeout", "created_by": "me", "episode_return": ret}
+    ret, seed = (number, None) if isinstance(number, float) else (None, number)
+    return {
+        "metadata": metadata,
+        "n_tuples": 1,
+        "end": "timeout",
+        "created_by": "me",
+        "episode_return": ret,
+        "seed": seed,
+    }
 
 
 def has_empty(filter: BaseFilter) -> bool:
@@ -303,6 +310,8 @@ ITEM = {
         "t": "b",
         "yes": True,
         "no": None,
+        "untagged": {"$float": "inf", "x": 1},
+        "huge": 10**5000,
         "l": [1],
         "d": {"x": 1},
     }
@@ -348,6 +357,14 @@ class TestMeaning:
             (F("metadata.d") != 1, True),
             (F("metadata.d.x") == 1, True),
             (F("metadata.n.x") != 1, False),
+            (F("metadata.nan.$float") == "nan", False),
+            (F("metadata.untagged") > 1, False),
+            (F("metadata.untagged.$float") == "inf", True),
+            (F("metadata.huge") > 1e308, True),
+            (F("metadata.huge") > 10**3000, True),
+            (F("metadata.huge") < math.inf, True),
+            (F("metadata.huge") == 10**3000, False),
+            (F("metadata.huge") != 10**3000, True),
             (F("metadata.n").isin([]), False),
             (F("metadata.n").isin(["1", 2, 1]), True),
             (F("metadata.nan").isin([math.nan]), False),
@@ -428,6 +445,7 @@ class TestConstruction:
             (lambda: FilterNOT(filters=[]), "NOT takes exactly one filter, found 0"),
             (lambda: FilterEQ(key="a", value=1, filters=[F("b") == 1]), "takes no filters"),
             (lambda: FilterEQ(key="a", value="\ud800"), "lone surrogate"),
+            (lambda: FilterEQ(key="a", value=1 << 20_000), "too large an integer"),
             (lambda: F("a..b") == 1, r"'a..b' needs a name at character 2"),
             (lambda: F("") == 1, "needs a name at character 0"),
             (lambda: F('a."x') == 1, "needs a name at character 2"),

@@ -59,6 +59,7 @@ class FilterType(StrEnum):
 COMBINING: Final = frozenset({FilterType.AND, FilterType.OR, FilterType.NOT})
 ORDERING: Final = frozenset({FilterType.GT, FilterType.GEQ, FilterType.LT, FilterType.LEQ})
 MAX_DEPTH: Final = 100
+_MAX_INT_BITS: Final = 13_000  # Python neither writes nor reads decimal integers much longer
 
 _SYMBOL: Final[Mapping[FilterType, str]] = {
     FilterType.EQ: "==",
@@ -317,6 +318,10 @@ def _check_value(type: FilterType, key: str, value: Any) -> None:
             raise ValueError(f"{type} on {key!r} orders numbers or text, found {item!r:.60}")
         if isinstance(item, str):
             _check_text(item, "value")
+        if isinstance(item, int) and item.bit_length() > _MAX_INT_BITS:
+            raise ValueError(
+                f"{key!r} is compared with too large an integer, one of {item.bit_length()} bits"
+            )
 
 
 def _sentence(name: str, err: ValidationError) -> str:

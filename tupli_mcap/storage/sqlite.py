@@ -233,7 +233,9 @@ class _Number(ScalarOperand):
             return false()
         comparison = BaseFilter(type=operation, key="value", value=wanted.value)
         asked = func.tupli_compare(comparison.model_dump_json(), self._column) == 1
-        exact = against_floats(operation, wanted.value)
+        exact: tuple[str, float] | None = operation, wanted.value
+        if bindable(wanted.value) != wanted.value:  # an integer beyond 64 bits; those stored are texts
+            exact = against_floats(operation, wanted.value)
         if exact is None:
             return and_(self._column >= "", asked)
         compared = apply(FilterType(exact[0]), self._column, exact[1])
