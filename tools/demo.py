@@ -1,0 +1,130 @@
+"""The demo: record two real rollouts, look at the dataset, say which files to open.
+
+Run it with `tools/demo`, which installs what it needs first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.classic_control import MountainCarEnv
+from rich.console import Console
+from rich.table import Table
+
+from tupli_mcap import F, FileStorage, TupliDataset, TupliEnvWrapper
+from tupli_mcap.vector import RecordEpisodes
+from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+
+ROOT = Path(__file__).resolve().parent.parent / "demo"
+console = Console()
+
+
+class WindyMountainCar(MountainCarEnv):
+    """MountainCar with a head wind that follows a sine over time."""
+
+    def __init__(self, strength: float = 0.0005) -> None:
+        super().__init__()
+        self.strength = strength
+        self.time = 0
+
+    def reset(self, *, seed=None, options=None):
+        self.time = 0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        state, reward, terminated, truncated, info = super().step(action)
+        wind = self.strength * (1 + np.sin(self.time / 50))
+        self.time += 1
+        self.state = (self.state[0], float(np.clip(self.state[1] - wind, -self.max_speed, self.max_speed)))
+        return np.array(self.state, dtype=np.float32), reward, terminated, truncated, {"wind": wind}
+
+
+class Height(EpisodeMetadataCallback):
+    """The highest position of an episode, and its return."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self.highest = -np.inf
+        self.total = 0.0
+
+    def __call__(self, tuple: RLTuple) -> dict:
+        self.highest = max(self.highest, float(tuple.state[0]))
+        self.total += float(tuple.reward)
+        return {"highest": self.highest, "cum_eps_reward": self.total}
+
+
+def energy_pumping(state: np.ndarray) -> int:
+    """Push the way the car is going: the simplest policy that climbs."""
+    return 2 if state[1] > 0 else 0
+
+
+def record_mountain_car(storage: FileStorage, episodes: int) -> str:
+    env = gym.wrappers.TimeLimit(WindyMountainCar(), max_episode_steps=400)
+    with TupliEnvWrapper(env, storage=storage, metadata_callback=Height()) as env:
+        benchmark = env.store(name="windy mountain car", description="MountainCar slowed down by wind")
+        env.action_space.seed(1)
+        for episode in range(episodes):
+            state, _ = env.reset(seed=episode)
+            done = False
+            while not done:
+                action = energy_pumping(state) if episode % 2 else env.action_space.sample()
+                state, _, terminated, truncated, _ = env.step(action)
+                done = terminated or truncated
+    return benchmark
+
+
+def record_cart_poles(path: Path, steps: int) -> None:
+    with RecordEpisodes(gym.make_vec("CartPole-v1", num_envs=8), path) as envs:
+        envs.reset(seed=1)
+        envs.action_space.seed(1)
+        for _ in range(steps):
+            envs.step(envs.action_space.sample())
+
+
+def show(title: str, dataset: TupliDataset) -> None:
+    table = Table(title=title, title_justify="left")
+    for column in ("episode", "steps", "return", "end", "metadata"):
+        table.add_column(column, justify="right" if column in ("steps", "return") else "left")
+    headers = dataset.preview()
+    for header in headers[:8]:
+        facts = ", ".join(f"{key} {value:.3g}" for key, value in header.metadata.items())
+        table.add_row(str(header.episode), str(header.n_tuples), f"{header.episode_return:g}", header.end, facts)
+    if len(headers) > 8:
+        table.add_row("…", "", "", "", f"{len(headers) - 8} more")
+    console.print(table)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="fewer steps")
+    quick = parser.parse_args().quick
+    shutil.rmtree(ROOT, ignore_errors=True)
+    storage = FileStorage(ROOT / "lab")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        benchmark = record_mountain_car(storage, 4 if quick else 20)
+    cart_poles = ROOT / "cartpole-vector.mcap"
+    record_cart_poles(cart_poles, 200 if quick else 2000)
+
+    lab = TupliDataset(storage)
+    show(f"Windy MountainCar, benchmark {benchmark[:12]}…", lab)
+    climbed = lab.with_episode_filter(F("metadata.highest") > 0)
+    console.print(f"{len(climbed.preview())} of {len(lab.preview())} episodes got above 0 in position.\n")
+    show("CartPole, 8 environments in one file", TupliDataset.from_files(cart_poles))
+
+    console.print("\nTo look at them:")
+    recording = next(iter(sorted((ROOT / "lab").rglob("*.mcap"))))
+    for path in (recording, cart_poles):
+        console.print(f"  .venv/bin/tupli-mcap info {path.relative_to(ROOT.parent)}", highlight=False)
+    console.print("They are ordinary MCAP files: Rerun, Foxglove and ROS tools open them too.")
+
+
+if __name__ == "__main__":
+    main()
