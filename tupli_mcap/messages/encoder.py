@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import StepError
-from tupli_mcap.messages.exact import exact_array, leaf_value, shorten
+from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value, shorten
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import DType, Leaf
 from tupli_mcap.messages.step import StepLayout
@@ -304,17 +304,18 @@ def _diagnose(layout: StepLayout, action: Any, state: Any, reward: Any, err: Exc
     """The StepError that names what the fast path stumbled over."""
     if isinstance(err, StepError):
         return err
-    groups: list[tuple[Any, Sequence[Leaf]]] = [(state, layout.state)]
+    groups: list[tuple[str, Any, Any, Sequence[Leaf]]] = [("state", layout.observation_space, state, layout.state)]
     if reward is not None:
-        groups += [(action, layout.action), (reward, layout.reward)]
-    for root, leaves in groups:
-        for leaf in leaves:
-            try:
-                value = leaf_value(root, leaf)
-                if leaf.dtype is not None:
-                    exact_array(value, layout.dtypes[leaf.name], leaf.shape, leaf.path)
-            except StepError as found:
-                return found
+        groups.insert(0, ("action", layout.action_space, action, layout.action))
+        groups.append(("reward", None, reward, layout.reward))
+    try:
+        for name, space, root, leaves in groups:
+            if space is not None:
+                check_structure(space, root, name)
+            for leaf in leaves:
+                exact_array(leaf_value(root, leaf), layout.dtypes[leaf.name], leaf.shape, leaf.path)
+    except StepError as found:
+        return found
     if reward is None:
         return StepError(f"state: expected a value structured as {layout.observation_space}, found {shorten(state)}")
     return StepError(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.leaves import ROS_TYPES, DType, Leaf
@@ -111,9 +113,20 @@ def _equal(array: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bool:
     return bool(np.all(array.astype(object) == cast.astype(object)))
 
 
-def check_structure(value: Any, leaf: Leaf) -> None:
-    """Raises StepError if the Dicts and Tuples above a leaf are not dicts and tuples of the space's own keys."""
-    leaf_value(value, leaf)
+def check_structure(space: gym.Space[Any], value: Any, path: str) -> None:
+    """Raises StepError unless the Dicts and Tuples of `space` are dicts of its keys and tuples of its length in `value`."""
+    if type(space) is spaces.Dict:
+        keys = list(space.spaces)
+        if not isinstance(value, Mapping) or set(value) != set(keys):
+            found = sorted(map(repr, value)) if isinstance(value, Mapping) else shorten(value)
+            raise StepError(f"{path}: expected an entry for each of {shorten(keys)}, found {shorten(found)}")
+        for key, sub in space.spaces.items():
+            check_structure(sub, value[key], f"{path}[{key!r}]")
+    elif type(space) is spaces.Tuple:
+        if not isinstance(value, tuple) or len(value) != len(space.spaces):
+            raise StepError(f"{path}: expected a tuple of {len(space.spaces)} entries, found {shorten(value)}")
+        for i, sub in enumerate(space.spaces):
+            check_structure(sub, value[i], f"{path}[{i}]")
 
 
 def leaf_value(value: Any, leaf: Leaf) -> Any:

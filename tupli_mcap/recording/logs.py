@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError, StepError
-from tupli_mcap.messages.exact import exact_array, leaf_value
+from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
@@ -182,6 +182,7 @@ class StepLog:
 
     def put(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """Completes and commits the running record; `state` starts the next one."""
+        check_structure(self._layout.action_space, action, "action")
         out = bytearray(self._pending)
         self._encode(out, self._action, action)
         self._encode(out, self._reward, reward)
@@ -213,6 +214,7 @@ class StepLog:
             encode(leaf_value(root, leaf), out, BODY)
 
     def _encode_state(self, state: Any, step: int, sequence: int) -> tuple[bytearray, list[Any]]:
+        check_structure(self._layout.observation_space, state, "state")
         # a length of 0 says that the record is not complete, its sequence which one it will be
         out = bytearray(RECORD_HEADER.pack(5, 0, self._channel, sequence, 0, 0)) + CDR_HEADER
         out += self._episode.to_bytes(4, "little") + step.to_bytes(4, "little")

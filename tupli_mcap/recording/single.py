@@ -69,8 +69,7 @@ class SingleRecorder:
         self.end(INTERRUPTED, metadata)
         rows = self._writer.rows
         if rows is None:
-            for leaf in self._spaces.state:
-                check_structure(state, leaf)
+            check_structure(self._spaces.observation_space, state, "state")
             self._reset = (copy.deepcopy(state), facts)
             self.put = self._first
             return

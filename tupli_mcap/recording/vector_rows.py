@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.messages.exact import exact_array, leaf_value
+from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
@@ -82,6 +82,8 @@ class VectorRows:
 
     def check(self, action: Any, state: Any, reward: Any) -> Any:
         """A batch as `put` takes it; StepError if it cannot be stored."""
+        check_structure(self._layout.action_space, action, "action")
+        check_structure(self._layout.observation_space, state, "state")
         return self._checked(self._action, action), self._checked(self._reward, reward), self._checked(self._state, state)
 
     def put_state(self, state: Any, mask: Array | None = None) -> None:

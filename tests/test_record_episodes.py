@@ -1,0 +1,485 @@
+"""The wrapper: what it records of real environments, what it leaves alone, and how episodes end."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Sampler, Scripted, roll, same
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from sample_spaces import SPACES, space_id
+
+from tupli_mcap import RecordEpisodes, Recording, RecordingError, SpaceError, StepError
+from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+
+BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+def check_against(path: Path, taken: list[tuple[Any, ...]]) -> Recording:
+    """Every step of the recording is the one taken, next states included."""
+    recording = Recording(path)
+    steps = [(step, episode, i) for episode in recording.episodes for i, step in enumerate(episode)]
+    assert len(steps) == len(taken)
+    for (step, _, _), (state, action, reward, terminal, timeout, _) in zip(steps, taken, strict=True):
+        assert same(step.state, state)
+        assert same(step.action, action)
+        assert step.reward == reward
+        assert (step.terminal, step.timeout) == (terminal, timeout)
+    at = 0
+    for episode in recording.episodes:
+        at += len(episode)
+        assert same(episode.final_state, taken[at - 1][5])
+    return recording
+
+
+@pytest.mark.parametrize("side", ["state", "action"])
+@pytest.mark.parametrize("space", SPACES, ids=space_id)
+def test_every_space_comes_back_exactly(tmp_path: Path, space: gym.Space[Any], side: str) -> None:
+    other = spaces.Discrete(3, start=-1)
+    env = Sampler(space, other) if side == "state" else Sampler(other, space)
+    with RecordEpisodes(env, tmp_path / "r.mcap", chunk_size=1500) as recorded:
+        taken = roll(recorded, 23)
+    recording = check_against(tmp_path / "r.mcap", taken)
+    assert (recording.observation_space, recording.action_space) == (env.observation_space, env.action_space)
+    assert [episode.end for episode in recording.episodes] == ["terminal", "terminal", "timeout", "interrupted"]
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "MountainCarContinuous-v0", "FrozenLake-v1", "Blackjack-v1"])
+def test_real_environments(tmp_path: Path, env_id: str, compression: str) -> None:
+    path = tmp_path / "r.mcap"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        with RecordEpisodes(gym.make(env_id), path, compression=compression, chunk_size=4000) as env:
+            taken = roll(env, 300)
+    recording = Recording(path)
+    columns = recording.read(fields=["rewards", "terminals", "timeouts"])
+    assert columns.rewards.tolist() == [step[2] for step in taken]
+    assert columns.terminals.tolist() == [step[3] for step in taken]
+    assert columns.timeouts.tolist() == [step[4] for step in taken]
+    states = [step.state for episode in recording.episodes for step in episode]
+    assert all(np.array_equal(a, b) for a, b in zip(states, [step[0] for step in taken], strict=True))
+
+
+def test_the_policy_sees_the_same_objects(tmp_path: Path) -> None:
+    class Keeper(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            self.last = self.env.step(action)
+            return self.last
+
+    keeper = Keeper(gym.make("CartPole-v1"))
+    with RecordEpisodes(keeper, tmp_path / "r.mcap") as env:
+        env.reset(seed=1)
+        assert env.step(0) is keeper.last
+        assert env.spec is keeper.spec
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "s.mcap") as env:
+        assert env.spec is not None
+        assert isinstance(gym.make(env.spec).unwrapped, type(env.unwrapped))
+
+
+def test_gymnasiums_own_check_passes(tmp_path: Path) -> None:
+    env = RecordEpisodes(gym.make("CartPole-v1", disable_env_checker=True).unwrapped, tmp_path / "r.mcap")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*is different from the unwrapped version")
+        check_env(env, skip_render_check=True, skip_close_check=True)
+    env.close()
+    assert Recording(tmp_path / "r.mcap").num_steps > 0
+
+
+def test_under_and_over_other_wrappers(tmp_path: Path) -> None:
+    inner = gym.wrappers.RescaleAction(gym.make("MountainCarContinuous-v0"), np.float32(-2), np.float32(2))
+    env = gym.wrappers.RecordEpisodeStatistics(RecordEpisodes(inner, tmp_path / "r.mcap"))
+    taken = roll(env, 50)
+    env.close()
+    check_against(tmp_path / "r.mcap", taken)
+
+
+def test_environments_may_reuse_their_arrays(tmp_path: Path) -> None:
+    buffer = np.zeros(2, np.float32)
+
+    def observe(step: int) -> Any:
+        buffer[:] = step / 16
+        return buffer
+
+    with RecordEpisodes(Scripted(observe, BOX), tmp_path / "r.mcap") as env:
+        env.reset()
+        for _ in range(10):
+            env.step(0)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert (episode.states[:, 0] * 16).tolist() == list(range(10))
+    assert (episode.final_state * 16).tolist() == [10, 10]
+
+
+# ---- values that stray from their space
+
+
+def test_float64_observations_are_kept_with_one_warning(tmp_path: Path) -> None:
+    env = Scripted(lambda step: np.array([0.1, step]), BOX)
+    with pytest.warns(UserWarning, match=r"state is declared float32, but the values are float64") as caught:
+        with RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
+            taken = roll(recorded, 15)
+    assert len(caught) == 1
+    recording = check_against(tmp_path / "r.mcap", taken)
+    assert recording.episodes[0].states.dtype == np.float64
+    assert recording.observation_space == BOX
+
+
+def test_python_floats_are_not_rounded(tmp_path: Path) -> None:
+    env = Scripted(lambda step: step * 0.1, spaces.Box(0, 1, (), np.float32))
+    with pytest.warns(UserWarning, match="float64"), RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
+        recorded.reset()
+        recorded.step(0)
+        recorded.step(1)
+    assert Recording(tmp_path / "r.mcap").episodes[0].states.tolist() == [0.0, 0.1]
+
+
+def test_python_scalars_are_fine(tmp_path: Path) -> None:
+    env = Scripted(lambda step: step, spaces.Discrete(100), reward=lambda step: step)
+    with RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
+        recorded.reset()
+        for action in (1, True, np.int8(2), np.array(0)):
+            recorded.step(action)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert episode.actions.tolist() == [1, 1, 2, 0]
+    assert episode.actions.dtype == np.int64
+    assert episode.rewards.tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert episode.states.tolist() == [0, 1, 2, 3]
+
+
+def test_values_outside_the_bounds_and_nan_are_kept(tmp_path: Path) -> None:
+    odd = np.array([0x7FC01234, 0xFF800000], np.uint32).view(np.float32)  # a NaN with a payload, and -inf
+    with RecordEpisodes(Scripted(lambda step: odd, BOX, reward=lambda step: np.nan), tmp_path / "r.mcap") as env:
+        taken = roll(env, 3)
+    episode = Recording(tmp_path / "r.mcap").episodes[0]
+    assert episode.states[0].tobytes() == odd.tobytes()
+    assert np.isnan(episode.rewards).all()
+    assert len(taken) == len(episode)
+
+
+BAD_STATES = [
+    (BOX, np.zeros(3, np.float32), r"state: expected shape \(2,\), found shape \(3,\)"),
+    (BOX, np.array([0.1, 0.2]), r"state: expected values that float32 holds exactly, found float64"),
+    (BOX, "text", r"state: expected float32\[2\], found 'text'"),
+    (BOX, None, r"state: expected float32\[2\], found None"),
+    (spaces.Discrete(3), 1.5, r"state: expected values that int64 holds exactly, found float64 1.5"),
+    (spaces.Discrete(3), 2**70, r"state: expected"),
+    (spaces.Dict({"a": BOX}), {"b": np.zeros(2, np.float32)}, r"state: expected an entry for each of \['a'\], found"),
+    (spaces.Tuple((BOX, BOX)), (np.zeros(2, np.float32),), r"state: expected a tuple of 2 entries"),
+    (spaces.Tuple((BOX,)), [np.zeros(2, np.float32)], r"state: expected a tuple of 1 entries, found \["),
+    (spaces.Box(0, 255, (4, 4, 3), np.uint8), np.zeros((4, 4), np.uint8), r"state: expected shape \(4, 4, 3\)"),
+    (spaces.Text(5), 7, r"state: expected"),
+]
+
+
+@pytest.mark.parametrize(("space", "bad", "message"), BAD_STATES)
+def test_what_cannot_be_stored_is_refused_and_the_rest_is_safe(
+    tmp_path: Path, space: gym.Space[Any], bad: Any, message: str
+) -> None:
+    good = space.sample()
+    env = RecordEpisodes(Scripted(lambda step: bad if step == 3 else good, space), tmp_path / "r.mcap")
+    env.reset()
+    env.step(0)
+    env.step(1)
+    with pytest.raises(StepError, match=message):
+        env.step(2)
+    with pytest.raises(StepError, match="could not be recorded; call env.reset"):
+        env.step(0)
+    env.reset()
+    env.step(2)
+    env.close()
+    first, second = Recording(tmp_path / "r.mcap").episodes
+    assert (len(first), first.end) == (2, "interrupted")
+    assert same(first.final_state, good)
+    assert first.actions.tolist() == [0, 1]
+    assert len(second) == 1
+
+
+def test_an_action_that_does_not_fit_names_the_leaf(tmp_path: Path) -> None:
+    space = spaces.Dict({"move": spaces.Box(-1, 1, (2,), np.float32), "grip": spaces.Discrete(2)})
+    env = RecordEpisodes(Scripted(lambda step: 0, spaces.Discrete(1), space), tmp_path / "r.mcap")
+    env.reset()
+    env.step(space.sample())
+    with pytest.raises(StepError, match=r"action\['move'\]: expected shape \(2,\)"):
+        env.step({"move": np.zeros(3, np.float32), "grip": 0})
+    env.close()
+
+
+def test_array_rewards_need_a_reward_space(tmp_path: Path) -> None:
+    reward = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+    env = Scripted(lambda step: 0, spaces.Discrete(1), reward=lambda step: np.arange(3.0) * step)
+    with RecordEpisodes(env, tmp_path / "r.mcap", reward_space=reward) as recorded:
+        taken = roll(recorded, 4)
+    episode = Recording(tmp_path / "r.mcap").episodes[0]
+    assert np.array_equal(episode.rewards, [step[2] for step in taken])
+    assert episode.return_ == 30.0
+    refused = RecordEpisodes(env, tmp_path / "s.mcap")
+    refused.reset()
+    with pytest.raises(StepError, match=r"reward: expected shape \(\), found shape \(3,\)"):
+        refused.step(0)
+    refused.close()
+
+
+def test_unknown_spaces_are_refused_before_a_file_is_made(tmp_path: Path) -> None:
+    class MyBox(spaces.Box):
+        pass
+
+    space = spaces.Dict({"ok": BOX, "mine": spaces.Tuple((MyBox(0, 1, (2,)),))})
+    with pytest.raises(SpaceError, match=r"state\['mine'\]\[0\]: expected a space of Gymnasium itself, found .*MyBox"):
+        RecordEpisodes(Scripted(lambda step: None, space), tmp_path / "r.mcap")
+    with pytest.raises(SpaceError, match=r"state: dtype 'longdouble' cannot be stored|state: dtype 'float128'"):
+        RecordEpisodes(Scripted(lambda step: None, spaces.Box(0, 1, (2,), np.longdouble)), tmp_path / "r.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- how episodes end
+
+
+def test_a_reset_in_mid_episode_interrupts(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+        env.reset(seed=1)
+        env.step(0)
+        after = env.step(1)[0]
+        env.reset(seed=2)
+        env.reset(seed=3)  # a reset without a step is no episode
+        env.step(0)
+    first, second = Recording(tmp_path / "r.mcap").episodes
+    assert (len(first), first.end, first.seed) == (2, "interrupted", 1)
+    assert same(first.final_state, after)
+    assert (len(second), second.end, second.seed) == (1, "interrupted", 3)
+
+
+def test_garbage_collection_closes(tmp_path: Path) -> None:
+    env = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap")
+    env.reset()
+    env.step(0)
+    del env
+    gc.collect()
+    recording = Recording(tmp_path / "r.mcap")
+    assert recording.complete
+    assert [len(episode) for episode in recording.episodes] == [1]
+    assert not (tmp_path / "r.mcap.journal").exists()
+
+
+def test_the_end_of_the_interpreter_closes(tmp_path: Path) -> None:
+    code = (
+        "import sys, gymnasium as gym\nfrom tupli_mcap import RecordEpisodes\n"
+        "env = RecordEpisodes(gym.make('CartPole-v1'), sys.argv[1])\nenv.reset()\nenv.step(0)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "r.mcap")], check=True, timeout=60)
+    recording = Recording(tmp_path / "r.mcap")
+    assert recording.complete
+    assert recording.episodes[0].end == "interrupted"
+
+
+def test_an_exception_out_of_step_leaves_a_valid_file(tmp_path: Path) -> None:
+    class Fails(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            if action == 1:
+                raise RuntimeError("motor failure")
+            return self.env.step(action)
+
+    with pytest.raises(RuntimeError, match="motor failure"):
+        with RecordEpisodes(Fails(gym.make("CartPole-v1")), tmp_path / "r.mcap") as env:
+            env.reset()
+            env.step(0)
+            env.step(1)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert (len(episode), episode.end) == (1, "interrupted")
+
+
+def test_steps_after_an_end_are_an_episode_of_their_own(tmp_path: Path) -> None:
+    with RecordEpisodes(Scripted(lambda step: step, spaces.Discrete(99), length=3), tmp_path / "r.mcap") as env:
+        env.reset()
+        for _ in range(4):
+            env.step(0)
+    first, second = Recording(tmp_path / "r.mcap").episodes
+    assert (first.states.tolist(), first.final_state) == ([0, 1, 2], 3)
+    assert (second.states.tolist(), second.final_state, second.start.continued) == ([3], 4, True)
+
+
+def test_data_is_written_before_the_environment_is_closed(tmp_path: Path) -> None:
+    class Inner(gym.Wrapper[Any, Any, Any, Any]):
+        def close(self) -> None:
+            self.found = Recording(tmp_path / "r.mcap").num_steps
+            super().close()
+
+    inner = Inner(gym.make("CartPole-v1"))
+    env = RecordEpisodes(inner, tmp_path / "r.mcap")
+    env.reset()
+    env.step(0)
+    env.close()
+    env.close()
+    assert inner.found == 1
+    with pytest.raises(RecordingError, match="is closed; wrap the environment again"):
+        env.step(0)
+
+
+# ---- resets, infos, metadata
+
+
+def test_seeds_options_and_reset_infos(tmp_path: Path) -> None:
+    class Informed(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(self, **kwargs: Any) -> Any:
+            return self.env.reset(**kwargs)[0], {"start": np.arange(2), "nan": np.nan, "none": None}
+
+    options = {"low": -0.01, "high": 0.01}
+    with RecordEpisodes(Informed(gym.make("CartPole-v1")), tmp_path / "r.mcap") as env:
+        env.reset(seed=2**40, options=options)
+        env.step(0)
+        env.reset()
+        env.step(0)
+    first, second = Recording(tmp_path / "r.mcap").episodes
+    assert (first.seed, first.options, first.start.seed_given) == (2**40, options, True)
+    assert first.reset_info["start"].tolist() == [0, 1]
+    assert np.isnan(first.reset_info["nan"])
+    assert first.reset_info["none"] is None
+    assert (second.seed, second.options) == (None, None)
+
+
+def test_the_seed_of_an_unseeded_first_reset_is_found(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+        state, _ = env.reset()
+        env.step(0)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert not episode.start.seed_given
+    assert np.array_equal(gym.make("CartPole-v1").reset(seed=episode.seed)[0], state)
+
+
+INFOS = [
+    {"x": 0.5, "text": "a", "array": np.arange(3, dtype=np.int16)},
+    {"x": None, "nan": np.float32(np.nan), "nested": {"t": (1, 2)}},
+    {},
+    {"x": np.float64(2.5)},
+]
+
+
+@pytest.mark.parametrize("how", [True, ["x", "text"], lambda info: {"n": len(info)}], ids=["all", "named", "callable"])
+def test_infos(tmp_path: Path, how: Any) -> None:
+    env = Scripted(lambda step: 0, spaces.Discrete(1), info=lambda step: INFOS[step - 1], length=4)
+    with RecordEpisodes(env, tmp_path / "r.mcap", record_info=how) as recorded:
+        roll(recorded, 4)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    found = episode.infos
+    assert found is not None
+    if how is True:
+        for a, b in zip(found, INFOS, strict=True):
+            assert repr(a) == repr(b)
+    elif isinstance(how, list):
+        assert found == [{"x": 0.5, "text": "a"}, {"x": None}, {}, {"x": 2.5}]
+    else:
+        assert found == [{"n": 3}, {"n": 3}, {"n": 0}, {"n": 1}]
+
+
+def test_infos_are_left_out_unless_asked_for(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+        roll(env, 30)
+    assert Recording(tmp_path / "r.mcap").episodes[0].infos is None
+
+
+def test_a_step_callback_adds_to_the_info(tmp_path: Path) -> None:
+    with RecordEpisodes(
+        gym.make("CartPole-v1"), tmp_path / "r.mcap", step_callback=lambda step: {"angle": float(step.state[2])}
+    ) as env:
+        taken = roll(env, 30)
+    infos = [info for episode in Recording(tmp_path / "r.mcap").episodes for info in episode.infos or []]
+    assert [info["angle"] for info in infos if info] == [float(step[0][2]) for step in taken]
+
+
+class Totals(EpisodeMetadataCallback):
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self.total, self.first = 0.0, None
+
+    def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+        self.total += tuple.reward
+        self.first = self.first if self.first is not None else tuple.state
+        return {"total": np.float64(self.total), "first": self.first, "good": self.total > 20}
+
+
+def test_metadata_callbacks(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", metadata_callback=Totals()) as env:
+        roll(env, 200)
+    for episode in Recording(tmp_path / "r.mcap").episodes:
+        assert episode.metadata["total"] == episode.return_ == len(episode)
+        assert episode.metadata["first"] == episode.states[0].tolist()
+        assert episode.metadata["good"] is (len(episode) > 20)
+
+
+# ---- files
+
+
+def test_existing_files_and_bad_places_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    RecordEpisodes(gym.make("CartPole-v1"), path).close()
+    with pytest.raises(RecordingError, match='exists and is not overwritten; choose another path, or mode="a"'):
+        RecordEpisodes(gym.make("CartPole-v1"), path)
+    with pytest.raises(RecordingError, match="its directory does not exist"):
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "no" / "r.mcap")
+    with pytest.raises(RecordingError, match="cannot be recorded to"):
+        RecordEpisodes(gym.make("CartPole-v1"), "/proc/r.mcap")
+    with pytest.raises(RecordingError, match="mode: expected"):
+        RecordEpisodes(gym.make("CartPole-v1"), path, mode="r")  # type: ignore[arg-type]
+    with pytest.raises(RecordingError, match="compression: expected one of"):
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "x.mcap", compression="gzip")
+    assert not (tmp_path / "x.mcap").exists()
+
+
+def test_two_writers_of_one_file_are_refused(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+        roll(env, 10)
+        for mode in ("a", "w"):
+            with pytest.raises(RecordingError, match="is being recorded by another writer"):
+                RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", mode=mode)  # type: ignore[arg-type]
+        roll(env, 10)
+    assert Recording(tmp_path / "r.mcap").num_steps == 20
+
+
+def test_a_recording_is_readable_while_it_grows(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", chunk_size=2000) as env:
+        for round_ in range(1, 5):
+            roll(env, 40)
+            recording = Recording(tmp_path / "r.mcap")
+            assert (recording.num_steps, recording.complete) == (40 * round_, False)
+
+
+def test_flush_in_any_state(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+        env.flush()
+        env.reset()
+        env.flush()
+        taken = []
+        for seed in range(5):
+            state, _ = env.reset(seed=seed)
+            env.flush()
+            env.flush()
+            for _ in range(3):
+                after, reward, terminal, timeout, _ = env.step(0)
+                taken.append((state, np.int64(0), reward, terminal, timeout, after))
+                state = after
+                env.flush()
+    check_against(tmp_path / "r.mcap", taken)
+
+
+def test_wrappers_are_not_pickled(tmp_path: Path) -> None:
+    import pickle
+
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+        with pytest.raises(RecordingError, match="cannot be pickled or copied"):
+            pickle.dumps(env)
+
+
+def test_the_environment_is_in_the_file(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1", sutton_barto_reward=True), tmp_path / "r.mcap") as env:
+        roll(env, 10)
+    rebuilt = Recording(tmp_path / "r.mcap").benchmark.make_env()
+    assert rebuilt.unwrapped._sutton_barto_reward is True
