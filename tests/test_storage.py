@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import multiprocessing
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import uuid
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +28,7 @@ from tupli_mcap.errors import (
     NotFoundError,
     SpaceError,
     StorageError,
+    TupliError,
     UntrustedError,
 )
 from tupli_mcap.recording import Recording
@@ -33,7 +42,8 @@ from tupli_mcap.schema import (
     FilterIN,
     RLTuple,
 )
-from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError
+from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, recordings
+from tupli_mcap.storage.catalog import Catalog
 from tupli_mcap.storage.document import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
 from tupli_mcap.storage.handmade import conform, infer_space
 from tupli_mcap.wrappers import RecordEpisodes
@@ -462,6 +472,62 @@ class TestFileStorage(StorageContract):
             [0.0, 1.0, 2.0, 3.0] * 3
         )
 
+    def test_several_threads_at_once(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda i: _work(storage, header.id, i), range(4)))
+        assert storage.count_episodes() == 16
+
+    def test_a_full_disk_is_one_error(self, storage: FileStorage, monkeypatch: pytest.MonkeyPatch) -> None:
+        def refuse(*_: object) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        header = storage.store_benchmark(query())
+        monkeypatch.setattr(os, "fsync", refuse)
+        with pytest.raises(StorageError, match=r"cannot store the artifact .*No space left on device"):
+            storage.store_artifact(b"abc", ArtifactMetadata(name="x"))
+        with pytest.raises(StorageError, match=r"cannot store the benchmark .*No space left on device"):
+            storage.store_benchmark(query("other"))
+        with pytest.raises(StorageError, match="No space left on device"):
+            storage.publish_benchmark(header.id)
+        monkeypatch.undo()
+        assert storage.list_benchmarks() == [header]
+        assert storage.list_artifacts() == []
+        assert [p.name for p in storage.root.rglob(".*")] == [".lock"]  # no temporary file is left
+
+    def test_a_storage_that_can_only_be_read(
+        self, storage: FileStorage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        header = storage.store_benchmark(query())
+        made = storage.record_episode(episode(header.id))
+        storage.close()
+        copy = tmp_path / "read only"
+        shutil.copytree(storage.root, copy, ignore=shutil.ignore_patterns("catalog*"))
+        monkeypatch.setattr(os, "access", lambda *_: False)  # permissions do not bind root
+        monkeypatch.setattr(recordings, "Catalog", _refuse_path)
+        with FileStorage(copy) as other:
+            assert [h.id for h in other.list_episodes()] == [made.id]
+        assert not (copy / "catalog.sqlite").exists()
+
+    def test_a_killed_recording_is_there(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        script = textwrap.dedent("""
+            import os, sys, gymnasium as gym
+            from tupli_mcap.benchmark import TupliEnvWrapper
+            from tupli_mcap.storage import FileStorage
+            env = TupliEnvWrapper.load(FileStorage(sys.argv[1]), sys.argv[2])
+            env.reset(seed=0)
+            for action in range(5):
+                env.step(action % 2)
+            os.kill(os.getpid(), 9)
+        """)
+        done = subprocess.run([sys.executable, "-c", script, str(storage.root), header.id], check=False)
+        assert done.returncode == -signal.SIGKILL
+        (item,) = storage.list_episodes(include_tuples=True)
+        assert (item.n_tuples, item.end) == (5, "interrupted")
+        storage.delete_episode(item.id)
+        assert list(storage.root.rglob("*.mcap*")) == []
+
     # --- bundles ---
 
     def bundle(self, storage: FileStorage, target: Path) -> tuple[str, str]:
@@ -581,6 +647,62 @@ def _work(storage: FileStorage, benchmark_id: str, worker: int) -> None:
     for i in range(4):
         storage.record_episode(episode(benchmark_id, score=float(i)))
         storage.list_episodes()
+
+
+def _refuse_path(path: Path | None) -> Catalog:
+    if path is not None:
+        raise StorageError("unable to open database file")
+    return Catalog(None)
+
+
+# --- the contract can fail ---
+
+
+class _Forgetful(FileStorage):
+    """Wrong in one place each: every test named below must notice."""
+
+    def delete_episode(self, uri: str) -> None:
+        pass
+
+
+class _Duplicating(FileStorage):
+    def store_artifact(self, artifact: bytes, metadata: ArtifactMetadata) -> Any:
+        return super().store_artifact(artifact + uuid.uuid4().bytes, metadata)
+
+
+class _Careless(FileStorage):
+    def delete_artifact(self, uri: str, *, force: bool = False) -> None:
+        super().delete_artifact(uri, force=True)
+
+
+class _Unfiltered(FileStorage):
+    def list_episodes(self, filter: Any = None, include_tuples: bool = False, **page: Any) -> Any:
+        return super().list_episodes(None, include_tuples, **page)
+
+
+class _Believing(FileStorage):
+    def open_recording(self, recording: str) -> Recording:
+        return Recording(self.root / recording)
+
+
+@pytest.mark.parametrize(
+    ("broken", "test"),
+    [
+        (_Forgetful, "test_delete_episodes"),
+        (_Duplicating, "test_artifact_round_trip"),
+        (_Duplicating, "test_artifacts_are_deduplicated"),
+        (_Careless, "test_an_artifact_in_use_is_not_deleted"),
+        (_Unfiltered, "test_episodes_filter_and_page"),
+    ],
+)
+def test_the_contract_notices_broken_storages(tmp_path: Path, broken: type[FileStorage], test: str) -> None:
+    with broken(tmp_path / "lab") as storage, pytest.raises((AssertionError, pytest.fail.Exception)):
+        getattr(StorageContract(), test)(storage)
+
+
+def test_the_contract_notices_ids_used_as_paths(tmp_path: Path) -> None:
+    with _Believing(tmp_path / "lab") as storage, pytest.raises((TupliError, AssertionError)):
+        StorageContract().test_ids_are_no_paths(storage, "..")
 
 
 def test_pytupli_s_error_name() -> None:

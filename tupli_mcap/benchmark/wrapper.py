@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +15,7 @@ from gymnasium.envs.registration import EnvSpec
 from tupli_mcap import trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
 from tupli_mcap.environment import Snapshot, build, record_environment
-from tupli_mcap.errors import NotFoundError, StorageError, TupliError
+from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError
 from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, FilterEQ, RLTuple
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.document import benchmark_hash, facts_about, pack, recording_attachments, unpack
@@ -155,7 +156,11 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         if callback is not None and self.rl_tuple_cls is not RLTuple:
             callback = Retyped(callback, self.rl_tuple_cls)
         if self._path is not None and self._path.exists():
-            return RecordEpisodes(self._tap, self._path, metadata_callback=callback, mode="a", attachments={})
+            # Where the file cannot go on (somebody else writes to it), another one is begun.
+            with contextlib.suppress(RecordingError):
+                return RecordEpisodes(
+                    self._tap, self._path, metadata_callback=callback, mode="a", attachments={}
+                )
         benchmark = self.storage.load_benchmark(self.id)
         self._path = self.storage.new_recording_path(self.id)
         return RecordEpisodes(

@@ -32,7 +32,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.storage import bundles
 from tupli_mcap.storage.artifacts import ArtifactFiles
-from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
+from tupli_mcap.storage.atomic import Lock, fill, os_errors, write_bytes
 from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.common import first_defect
@@ -153,9 +153,10 @@ class FileStorage(TupliStorage):
         benchmark = self.load_benchmark(benchmark_id)
         spaces = episode_spaces(episodes, declared_spaces(benchmark.serialized))
         path = self.new_recording_path(benchmark_id)
-        with os_errors("cannot record", path):
+        with os_errors("cannot record", path), fill(path) as temporary:
+            temporary.unlink()
             write_recording(
-                path,
+                temporary,
                 (episode_data(episode, spaces) for episode in episodes),
                 observation_space=spaces[0],
                 action_space=spaces[1],

@@ -11,6 +11,9 @@ import secrets
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
@@ -68,14 +71,25 @@ class RecordingFiles:
             self._declared_keys.append(key)
 
     def header(self, uri: str) -> EpisodeHeader:
-        """Raises NotFoundError if there is no such episode."""
+        """The header of an episode.
+
+        Raises:
+            NotFoundError: There is no such episode.
+        """
         match = _EPISODE_ID.match(uri) if isinstance(uri, str) else None
-        found = self.headers(FilterEQ(key="id", value=uri), limit=1) if match else []
-        if not found:
-            raise NotFoundError(
-                f"there is no episode with id {str(uri)[:80]!r}; list_episodes() names them all"
-            )
-        return found[0]
+        if match:
+            # What the catalog knows already may be out of date in all but where the episode is.
+            found = self._catalog.episodes(FilterEQ(key="id", value=uri), limit=1)
+            if found and self._holds(found[0]):
+                return found[0]
+            found = self.headers(FilterEQ(key="id", value=uri), limit=1)
+            if found:
+                return found[0]
+        raise NotFoundError(f"there is no episode with id {str(uri)[:80]!r}; list_episodes() names them all")
+
+    def _holds(self, header: EpisodeHeader) -> bool:
+        path = self._root / header.recording
+        return path.is_file() and header.episode not in Sidecar.read(path).deleted
 
     # --- files ---
 
@@ -156,26 +170,42 @@ class RecordingFiles:
             raise StorageError(
                 f"expected a recording below {str(self._root)!r}, found {str(path)!r}"
             ) from err
-        if not self._put(relative, path, _stamp(path)) and not is_locked(path):
-            self._remove(relative, path)
+        with self._lock:
+            if not self._put(relative, path, _stamp(path)) and not is_locked(path):
+                self._remove(relative, path)
 
     def _sync(self) -> None:
+        if not self._changes():
+            return
+        # One process at a time: what another one read a moment ago must not replace what is newer.
+        with self._lock:
+            for relative, path in self._changes().items():
+                if path is None:
+                    self._catalog.remove_recording(relative)
+                else:
+                    self._try_to_put(relative, path)
+
+    def _changes(self) -> dict[str, Path | None]:
+        """Recordings that the catalog does not know as they are; None for those that are gone.
+
+        The latter come first: a file that was moved is no copy of itself.
+        """
         known = self._catalog.recordings()
         found = dict(self.paths())
-        # What is gone goes first: a file that was moved is no copy of itself.
-        for relative in known.keys() - found.keys():
-            self._catalog.remove_recording(relative)
+        changes: dict[str, Path | None] = dict.fromkeys(known.keys() - found.keys())
         for relative, path in found.items():
             try:
-                stamp = _stamp(path)
+                # A journal means: being written, or killed; what it holds is in no time stamp.
+                if known.get(relative) != _stamp(path) or journal_path(path).exists():
+                    changes[relative] = path
             except FileNotFoundError:
                 continue  # deleted since it was listed
-            # A journal means: being written, or killed; what it holds is in no time stamp.
-            if known.get(relative) != stamp or journal_path(path).exists():
-                self._try_to_put(relative, path, stamp)
+        return changes
 
-    def _try_to_put(self, relative: str, path: Path, stamp: RecordingStamp) -> None:
+    def _try_to_put(self, relative: str, path: Path) -> None:
+        stamp = RecordingStamp(0, 0, 0)
         try:
+            stamp = _stamp(path)
             self._put(relative, path, stamp)
         except FileNotFoundError:
             self._catalog.remove_recording(relative)
@@ -191,7 +221,9 @@ class RecordingFiles:
     def _put(self, relative: str, path: Path, stamp: RecordingStamp) -> int:
         """Catalogue a recording unless it is a copy; returns how many episodes it holds."""
         sidecar = Sidecar.read(path)
+        live = is_locked(path)
         with Recording(path) as recording:
+            live |= is_locked(path)  # a writer may have come or gone meanwhile
             original = self._original_of(relative, recording)
             if original is not None:
                 self._catalog.remove_recording(relative)
@@ -204,7 +236,7 @@ class RecordingFiles:
                 stamp,
                 uuid=recording.uuid,
                 benchmark_id=recording.benchmark_id,
-                rows=_rows(recording, sidecar, live=is_locked(path)),
+                rows=_rows(recording, sidecar, live=live),
             )
             return len(recording)
 
@@ -226,8 +258,7 @@ class RecordingFiles:
             sidecar = Sidecar.read(path)
             groups = sidecar.published_in.get(header.episode, [LOCAL_USER])
             sidecar.published_in[header.episode] = published_in(groups, group)
-            sidecar.write(path)
-            self.ingest(path)
+            sidecar.write(path)  # the next query notices
 
     def delete(self, headers: Sequence[EpisodeHeader]) -> None:
         """Delete episodes: by a note beside their recording, or with it where nothing else is left in it."""
@@ -245,8 +276,7 @@ class RecordingFiles:
         with Recording(path) as recording:
             left = {int(number) for number in recording.index["episode"]} - sidecar.deleted
         if left or is_locked(path):
-            sidecar.write(path)
-            self.ingest(path)
+            sidecar.write(path)  # the next query notices
             return
         self._remove(relative, path)
 
@@ -296,23 +326,25 @@ def episode_id(uuid: str, episode: int) -> str:
 def _stamp(path: Path) -> RecordingStamp:
     status = path.stat()
     try:
-        sidecar = sidecar_path(path).stat().st_mtime_ns
+        beside = sidecar_path(path).stat()
     except FileNotFoundError:
-        sidecar = 0
-    return RecordingStamp(status.st_size, status.st_mtime_ns, sidecar)
+        return RecordingStamp(status.st_size, status.st_mtime_ns, 0)
+    # A clock ticks every few ms only: a sidecar may be replaced twice in one tick, but not by its equal.
+    mixed = hash((beside.st_mtime_ns, beside.st_ino, beside.st_size)) & (2**63 - 1)
+    return RecordingStamp(status.st_size, status.st_mtime_ns, mixed)
 
 
 def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[EpisodeRow]:
     index = recording.index
-    columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return", "end_time")]
+    columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return")]
     seeds = [
         seed if has else None
         for has, seed in zip(index["has_seed"].tolist(), index["seed"].tolist(), strict=True)
     ]
     running = _running(columns[1], columns[3]) if live else set()
     local = json.dumps([LOCAL_USER])
-    for i, (number, env, length, end, total, time_ns, seed, metadata) in enumerate(
-        zip(*columns, seeds, recording.all_metadata(), strict=True)
+    for i, (number, env, length, end, total, created_at, seed, metadata) in enumerate(
+        zip(*columns, _iso(index["end_time"]), seeds, recording.all_metadata(), strict=True)
     ):
         if number in sidecar.deleted or i in running:
             continue
@@ -324,7 +356,7 @@ def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[Epi
             end=_ENDS[end],
             episode_return=total,
             seed=seed,
-            created_at=_iso(time_ns),
+            created_at=created_at,
             created_by=LOCAL_USER,
             published_in=local if groups is None else json.dumps(groups),
             metadata=metadata,
@@ -338,10 +370,7 @@ def _running(envs: Sequence[int], ends: Sequence[int]) -> set[int]:
     return {i for i in last.values() if _ENDS[ends[i]] == "interrupted"}
 
 
-def _iso(time_ns: int) -> str:
-    seconds, rest = divmod(time_ns, 10**9)
-    try:
-        moment = datetime.datetime.fromtimestamp(seconds, datetime.UTC).replace(microsecond=rest // 1000)
-    except (OverflowError, ValueError, OSError):
-        return ""  # a claim of the file that no calendar has
-    return moment.isoformat()
+def _iso(times_ns: np.ndarray[Any, Any]) -> list[str]:
+    """Wall clock times (ns) as ISO 8601 in UTC, to the microsecond."""
+    texts = np.datetime_as_string(times_ns.astype("datetime64[ns]"), unit="us", casting="unsafe")
+    return [f"{text}+00:00" for text in texts.tolist()]
