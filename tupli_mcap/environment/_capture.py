@@ -140,7 +140,9 @@ def _spec_object(env: gym.Env[Any, Any]) -> dict[str, Any] | None:
     spec = env.spec
     if spec is None:
         return None
-    told = {f.name: getattr(spec, f.name) for f in dataclasses.fields(spec) if f.init}
+    names = [field.name for field in dataclasses.fields(spec) if field.init]
+    names.remove("vector_entry_point")  # how others are made, and changing with gymnasium's versions
+    told = {name: getattr(spec, name) for name in names}
     told["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]
     # Callables, arrays and NaN have no JSON: raises, and the environment is pickled.
     plain: dict[str, Any] = json.loads(canonical_json(told))

@@ -28,7 +28,6 @@ _SPEC_DEFAULTS: dict[str, Any] = {
     "disable_env_checker": False,
     "kwargs": {},
     "additional_wrappers": [],
-    "vector_entry_point": None,
 }
 
 

@@ -28,7 +28,6 @@ from tupli_mcap.schema import (
     Episode,
     EpisodeHeader,
     EpisodeItem,
-    FilterEQ,
 )
 from tupli_mcap.storage import bundles
 from tupli_mcap.storage.artifacts import ArtifactFiles
@@ -50,7 +49,7 @@ class _Settings(BaseModel):
 
 
 class FileStorage(TupliStorage):
-    """A storage in the directory `root`, made if it is missing.
+    """A storage in the directory `root`, made if it is missing (`storage_base_dir` is PyTupli's name for it).
 
     Any number of threads and processes may use one directory at once. The recordings are the truth: files put
     into the directory by other means are found, and what is removed from it is gone.
@@ -59,8 +58,13 @@ class FileStorage(TupliStorage):
         StorageError: The directory cannot be made.
     """
 
-    def __init__(self, root: str | os.PathLike[str] = "_local_storage") -> None:
-        self.root = Path(root)
+    def __init__(
+        self,
+        root: str | os.PathLike[str] = "_local_storage",
+        *,
+        storage_base_dir: str | os.PathLike[str] | None = None,
+    ) -> None:
+        self.root = Path(root if storage_base_dir is None else storage_base_dir)
         with os_errors("cannot make the storage", self.root):
             self.root.mkdir(parents=True, exist_ok=True)
         self._lock = Lock(self.root / ".lock")
@@ -165,8 +169,7 @@ class FileStorage(TupliStorage):
                 attachments=recording_attachments(benchmark.serialized),
             )
         self.ingest(path)
-        relative = path.relative_to(self.root).as_posix()
-        return self._recordings.headers(FilterEQ(key="recording", value=relative))
+        return self._recordings.of_recording(path)
 
     def list_episodes(
         self,

@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import json
 import os
 import re
 import secrets
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.recording.lock import FileLock, is_locked
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
-from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
+from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, RecordingStamp
 from tupli_mcap.storage.common import LOCAL_USER, published_in
+from tupli_mcap.storage.entries import catalog_rows
+from tupli_mcap.storage.scan import scan, stamp_of
 from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles", "episode_id"]
 
-_ENDS = ("terminal", "timeout", "interrupted")
 _EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
 
 
@@ -51,6 +48,11 @@ class RecordingFiles:
             self._opened = None
 
     # --- queries ---
+
+    def of_recording(self, path: Path) -> list[EpisodeHeader]:
+        """The episodes of a recording that has just been ingested, without a look at the others."""
+        relative = path.relative_to(self._root).as_posix()
+        return self._catalog.episodes(FilterEQ(key="recording", value=relative))
 
     def headers(
         self, filter: BaseFilter | None, *, limit: int | None = None, offset: int = 0
@@ -114,15 +116,6 @@ class RecordingFiles:
             raise NotFoundError(f"there is no recording {recording[:200]!r} in {str(self._root)!r}")
         return path
 
-    def paths(self) -> Iterator[tuple[str, Path]]:
-        """Every recording: its path relative to the root (with forward slashes), and its path."""
-        for directory, names, files in os.walk(self._root):
-            names[:] = sorted(name for name in names if not name.startswith("."))
-            for name in sorted(files):
-                if name.endswith(".mcap") and not name.startswith("."):
-                    path = Path(directory) / name
-                    yield path.relative_to(self._root).as_posix(), path
-
     # --- the catalog ---
 
     @property
@@ -171,7 +164,7 @@ class RecordingFiles:
                 f"expected a recording below {str(self._root)!r}, found {str(path)!r}"
             ) from err
         with self._lock:
-            if not self._put(relative, path, _stamp(path)) and not is_locked(path):
+            if not self._put(relative, path, stamp_of(path)) and not is_locked(path):
                 self._remove(relative, path)
 
     def _sync(self) -> None:
@@ -191,21 +184,19 @@ class RecordingFiles:
         The latter come first: a file that was moved is no copy of itself.
         """
         known = self._catalog.recordings()
-        found = dict(self.paths())
-        changes: dict[str, Path | None] = dict.fromkeys(known.keys() - found.keys())
-        for relative, path in found.items():
-            try:
-                # A journal means: being written, or killed; what it holds is in no time stamp.
-                if known.get(relative) != _stamp(path) or journal_path(path).exists():
-                    changes[relative] = path
-            except FileNotFoundError:
-                continue  # deleted since it was listed
+        with os_errors("cannot list the recordings below", self._root):
+            found = sorted(scan(self._root))
+        changes: dict[str, Path | None] = dict.fromkeys(known.keys() - {item.relative for item in found})
+        for item in found:
+            # A journal means: being written, or killed; what it holds is in no time stamp.
+            if item.journal or known.get(item.relative) != item.stamp:
+                changes[item.relative] = self._root / item.relative
         return changes
 
     def _try_to_put(self, relative: str, path: Path) -> None:
         stamp = RecordingStamp(0, 0, 0)
         try:
-            stamp = _stamp(path)
+            stamp = stamp_of(path)
             self._put(relative, path, stamp)
         except FileNotFoundError:
             self._catalog.remove_recording(relative)
@@ -236,7 +227,7 @@ class RecordingFiles:
                 stamp,
                 uuid=recording.uuid,
                 benchmark_id=recording.benchmark_id,
-                rows=_rows(recording, sidecar, live=live),
+                rows=catalog_rows(recording, sidecar, live=live),
             )
             return len(recording)
 
@@ -295,7 +286,8 @@ class RecordingFiles:
         Those that are being written are left alone. Episodes that stay keep their ids.
         """
         freed = 0
-        for _, path in list(self.paths()):
+        for item in sorted(scan(self._root)):
+            path = self._root / item.relative
             with self._lock:
                 if path.exists() and Sidecar.read(path).deleted and not is_locked(path):
                     freed += self._compact(path)
@@ -321,56 +313,3 @@ class RecordingFiles:
 def episode_id(uuid: str, episode: int) -> str:
     """The id of an episode: its recording's UUID and its number."""
     return f"{uuid}-{episode}"
-
-
-def _stamp(path: Path) -> RecordingStamp:
-    status = path.stat()
-    try:
-        beside = sidecar_path(path).stat()
-    except FileNotFoundError:
-        return RecordingStamp(status.st_size, status.st_mtime_ns, 0)
-    # A clock ticks every few ms only: a sidecar may be replaced twice in one tick, but not by its equal.
-    mixed = hash((beside.st_mtime_ns, beside.st_ino, beside.st_size)) & (2**63 - 1)
-    return RecordingStamp(status.st_size, status.st_mtime_ns, mixed)
-
-
-def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[EpisodeRow]:
-    index = recording.index
-    columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return")]
-    seeds = [
-        seed if has else None
-        for has, seed in zip(index["has_seed"].tolist(), index["seed"].tolist(), strict=True)
-    ]
-    running = _running(columns[1], columns[3]) if live else set()
-    local = json.dumps([LOCAL_USER])
-    for i, (number, env, length, end, total, created_at, seed, metadata) in enumerate(
-        zip(*columns, _iso(index["end_time"]), seeds, recording.all_metadata(), strict=True)
-    ):
-        if number in sidecar.deleted or i in running:
-            continue
-        groups = sidecar.published_in.get(number)
-        yield EpisodeRow(
-            episode=number,
-            env=env,
-            n_tuples=length,
-            end=_ENDS[end],
-            episode_return=total,
-            seed=seed,
-            created_at=created_at,
-            created_by=LOCAL_USER,
-            published_in=local if groups is None else json.dumps(groups),
-            metadata=metadata,
-        )
-
-
-def _running(envs: Sequence[int], ends: Sequence[int]) -> set[int]:
-    """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no
-    end."""
-    last = {env: i for i, env in enumerate(envs)}
-    return {i for i in last.values() if _ENDS[ends[i]] == "interrupted"}
-
-
-def _iso(times_ns: np.ndarray[Any, Any]) -> list[str]:
-    """Wall clock times (ns) as ISO 8601 in UTC, to the microsecond."""
-    texts = np.datetime_as_string(times_ns.astype("datetime64[ns]"), unit="us", casting="unsafe")
-    return [f"{text}+00:00" for text in texts.tolist()]

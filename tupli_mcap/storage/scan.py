@@ -1,0 +1,67 @@
+"""The recordings below a directory, and what their files look like; cheap, as each query needs it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from tupli_mcap.recording import journal_path
+from tupli_mcap.storage.rows import RecordingStamp
+from tupli_mcap.storage.sidecar import sidecar_path
+
+__all__ = ["FoundRecording", "scan", "stamp_of"]
+
+
+class FoundRecording(NamedTuple):
+    """A recording: its path below the root (with forward slashes), its stamp, whether it has a journal."""
+
+    relative: str
+    stamp: RecordingStamp
+    journal: bool
+
+
+def scan(root: Path) -> Iterator[FoundRecording]:
+    """Every recording below a directory; what is hidden is passed over, and so are links to directories."""
+    pending = [(os.fspath(root), "")]
+    while pending:
+        directory, prefix = pending.pop()
+        try:
+            with os.scandir(directory) as entries:
+                found = {entry.name: entry for entry in entries if not entry.name.startswith(".")}
+        except FileNotFoundError:
+            continue  # deleted since it was listed
+        for name, entry in found.items():
+            if name.endswith(".mcap"):
+                try:
+                    if entry.is_file():
+                        journal = journal_path(name).name in found
+                        yield FoundRecording(prefix + name, _stamp(entry, found), journal)
+                except FileNotFoundError:
+                    continue
+            elif entry.is_dir(follow_symlinks=False):
+                pending.append((entry.path, f"{prefix}{name}/"))
+
+
+def stamp_of(path: Path) -> RecordingStamp:
+    """The stamp of one recording; FileNotFoundError if it is gone."""
+    status = path.stat()
+    try:
+        return _mix(status, sidecar_path(path).stat())
+    except FileNotFoundError:
+        return _mix(status, None)
+
+
+def _stamp(entry: os.DirEntry[str], found: dict[str, os.DirEntry[str]]) -> RecordingStamp:
+    beside = found.get(f"{entry.name}.json")
+    # Not `beside.stat()`: what scandir knows of a file may be older than its name.
+    return _mix(os.stat(entry.path), None if beside is None else os.stat(beside.path))  # noqa: PTH116
+
+
+def _mix(status: os.stat_result, beside: os.stat_result | None) -> RecordingStamp:
+    if beside is None:
+        return RecordingStamp(status.st_size, status.st_mtime_ns, 0)
+    # A clock ticks every few ms only: a sidecar may be replaced twice in one tick, but not by its equal.
+    mixed = hash((beside.st_mtime_ns, beside.st_ino, beside.st_size)) & (2**63 - 1)
+    return RecordingStamp(status.st_size, status.st_mtime_ns, mixed)
