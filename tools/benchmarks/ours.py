@@ -18,7 +18,7 @@ COLUMNS = ("states", "actions", "rewards", "terminals", "timeouts")
 
 def record(workload: Workload, path: Path, episodes: int) -> tuple[float, int]:
     """Seconds of constructing RecordEpisodes, rolling out and closing it, and the number of steps."""
-    from tupli_mcap.wrappers import RecordEpisodes
+    from tupli_mcap import RecordEpisodes
 
     inner = workload.make()
     watch = Stopwatch()
@@ -31,7 +31,7 @@ def record(workload: Workload, path: Path, episodes: int) -> tuple[float, int]:
 
 def record_with_reference(workload: Workload, path: Path, steps: int) -> Columns:
     """Record at least `steps` steps of whole episodes, untimed, and return what the file must hold."""
-    from tupli_mcap.wrappers import RecordEpisodes
+    from tupli_mcap import RecordEpisodes
 
     log = Log(RecordEpisodes(workload.make(), path))
     next_action = itertools.cycle(workload.actions).__next__
@@ -69,7 +69,7 @@ def rollout_vector(env: Any, actions: list[NDArray[np.int64]], steps: int) -> No
 
 def read(path: Path, threads: int | None = None) -> Any:
     """The whole recording as columns, opening included."""
-    from tupli_mcap.recording import Recording
+    from tupli_mcap import Recording
 
     with Recording(path) as recording:
         return recording.read(threads=threads)
@@ -91,7 +91,7 @@ def check_vector(
     make: Callable[[], TableVectorEnv], actions: list[NDArray[np.int64]], path: Path, steps: int
 ) -> int:
     """Every sub-environment's steps are there, its reset steps are not. Returns the number of env-steps."""
-    from tupli_mcap.recording import Recording
+    from tupli_mcap import Recording
 
     env = make()
     period = len(env.phase)
@@ -99,7 +99,7 @@ def check_vector(
     taken = np.stack([actions[step % len(actions)] for step in range(steps)])
     with Recording(path) as recording:
         columns = recording.read(fields=["actions"])
-        env_of_row = np.repeat(recording.index["env"], recording.index["length"])
+        env_of_row = np.repeat(recording.index["env"], recording.index["length"].astype(np.int64))
         check(recording.num_steps == int((~reset_step).sum()), f"{recording.num_steps} steps")
         for number in range(env.num_envs):
             mine = columns.actions[env_of_row == number]
@@ -116,7 +116,7 @@ def window(recording: Any, episode: int, start: int, length: int) -> tuple[NDArr
 
 def list_episodes(path: Path) -> list[tuple[int, int, float, str]]:
     """Open and go through all episodes, one object each."""
-    from tupli_mcap.recording import Recording
+    from tupli_mcap import Recording
 
     with Recording(path) as recording:
         return [(e.number, len(e), e.return_, e.end) for e in recording.episodes]
@@ -124,7 +124,7 @@ def list_episodes(path: Path) -> list[tuple[int, int, float, str]]:
 
 def list_columns(path: Path) -> list[NDArray[Any]]:
     """Open and take the index as columns."""
-    from tupli_mcap.recording import Recording
+    from tupli_mcap import Recording
 
     with Recording(path) as recording:
         return [recording.index[name].copy() for name in ("episode", "length", "return", "end", "seed")]

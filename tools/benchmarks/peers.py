@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from benchmarks.measure import Stopwatch, check
 from benchmarks.workloads import SEED, Columns, Workload
 
-MINARI_NEEDS = {"hdf5": ("minari", "h5py", "jax"), "arrow": ("minari", "pyarrow", "jax")}
+MINARI_NEEDS = {"hdf5": ("minari", "h5py", "jax", "PIL"), "arrow": ("minari", "pyarrow", "jax", "PIL")}
 MINARI_NEEDS["parquet"] = MINARI_NEEDS["arrow"]
 PYTUPLI_NEEDS = ("pytupli",)
 

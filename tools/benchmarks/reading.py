@@ -199,7 +199,7 @@ class _WarmWindows:
     """Windows from one open recording; before the first timing every chunk has been decoded once."""
 
     def __init__(self, path: Path, reference: Columns) -> None:
-        from tupli_mcap.recording import Recording
+        from tupli_mcap import Recording
 
         self._recording = Recording(path)
         self._reference = reference
@@ -219,7 +219,7 @@ class _WarmWindows:
 
 
 def _cold_windows(path: Path, reference: Columns) -> float:
-    from tupli_mcap.recording import Recording
+    from tupli_mcap import Recording
 
     watch = Stopwatch()
     for episode, start in _places(len(reference.episode_lengths)):
