@@ -131,6 +131,15 @@ class Container:
         self.counts[channel.id] = 0
         return channel.id
 
+    def define_channels(self) -> None:
+        """Writes the definitions of channels that have no chunk yet, so that a file without its journal knows them.
+
+        Readers that take chunks one by one find them again at the start of a channel's first chunk.
+        """
+        for channel in self.channels:
+            if channel not in self._announced:
+                self.write(self.definitions(channel))
+
     def definitions(self, channel: int) -> bytes:
         """The Schema and Channel records of a channel, as they precede its first message."""
         builder = RecordBuilder()

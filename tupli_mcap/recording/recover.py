@@ -241,7 +241,15 @@ def _complete(
     store = ChunkStore(source, _table(found, tail.rows), [bytes(r.data) for r in tail.rows], 1 << 26)
     episodes = _Episodes(store, topics)
     made: list[tuple[int, int, int, bytes]] = []
-    counts = {c: store.count(c) for c in (topics["/episode_end"], topics["/final_state"])}
+    counts = {topics[t]: store.count(topics[t]) for t in ("/episode_start", "/episode_end", "/final_state")}
+    for number, (_, _, end) in list(episodes.ends.items()):
+        if end.env >= len(steps) or end.first_row + end.length > store.count(steps[end.env]):
+            del episodes.ends[number]  # its steps were lost with the end of the file
+    for start, time in _unstarted(store, layout, steps, set(episodes.starts)):
+        channel = topics["/episode_start"]
+        made.append((channel, counts[channel], time, record(channel, counts[channel], time, start.encode())))
+        episodes.starts[start.episode] = (counts[channel], time, start)
+        counts[channel] += 1
     for number in sorted(set(episodes.starts) - set(episodes.ends)):
         row, time, start = episodes.starts[number]
         facts = _rows_of(store, layout, steps, start, number)
@@ -281,6 +289,18 @@ def _index(episodes: _Episodes, table: np.ndarray[Any, Any]) -> EpisodeIndex:
         )  # fmt: skip
         builder.add(row, end.metadata)
     return EpisodeIndex.decode(builder.encode(table.tobytes()), "recovered index")
+
+
+def _unstarted(
+    store: ChunkStore, layout: StepLayout, steps: list[int], known: set[int]
+) -> Iterator[tuple[EpisodeStart, int]]:
+    """Starts made for episodes that have steps but lost their `/episode_start` (with the journal), and their times."""
+    for env, channel in enumerate(steps):
+        row, last = 0, -1
+        for episode, _, _, time in _step_facts(store, layout, channel, 0, store.count(channel)):
+            if episode != last and episode not in known:
+                yield EpisodeStart(episode, env, row, False, False, "", "", "{}"), time
+            row, last = row + 1, episode
 
 
 def _is_last(store: ChunkStore, steps: list[int], start: EpisodeStart, length: int) -> bool:

@@ -59,6 +59,10 @@ class SingleRecorder:
         self._reset: tuple[Any, ResetFacts] | None = None
         self._episode: StartedEpisode | None = None
         self.put: Put = self._unreset
+        writer.on_abandon = self._abandon
+
+    def _abandon(self) -> None:
+        self.put = self._closed
 
     def reset(self, state: Any, facts: ResetFacts, metadata: str = "{}") -> None:
         """Starts an episode at `state`; a running one ends as interrupted, with `metadata`.
@@ -66,6 +70,8 @@ class SingleRecorder:
         Raises:
             StepError: the state cannot be stored exactly.
         """
+        if self._writer.closed:
+            self._closed()
         self.end(INTERRUPTED, metadata)
         rows = self._writer.rows
         if rows is None:

@@ -11,7 +11,7 @@ import os
 import time
 import uuid
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -81,6 +81,7 @@ class RecordingWriter:
         self.images: list[list[ImageRows]] = []
         self.events: EventLog | None = None
         self.infos: EventLog | None = None
+        self.on_abandon: Callable[[], None] | None = None  # tells the recorder, whose encoder knows only its buffer
         self.num_envs = 1
         self.is_vector = False
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
@@ -131,6 +132,7 @@ class RecordingWriter:
         self.num_envs = num_envs
         self.is_vector = vector
         self.channels = self._register(layout, info_schema)
+        self.container.define_channels()
         self._make_stores(self._areas())
 
     def _register(self, layout: StepLayout, info: tuple[str, Mapping[str, str]] | None) -> Channels:
@@ -394,6 +396,8 @@ class RecordingWriter:
             f"{self.path} is recorded by the process that opened it, not by its forked child; wrap the environment there"
         )
         self.lock.abandon()
+        if self.on_abandon is not None:
+            self.on_abandon()
 
 
 class ResetFacts(NamedTuple):

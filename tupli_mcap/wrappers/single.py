@@ -96,10 +96,10 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             raise
         self._recorder = SingleRecorder(self._writer, spaces, infos)
         self._watches = metadata_callback is not None or infos is not None
-        self._metadata: list[str] = ["{}"]  # shared with the finalizer, which must not hold the wrapper
+        self._episode_metadata: list[str] = ["{}"]  # shared with the finalizer, which must not hold the wrapper
         self._stepped = False
         self._state: Any = None
-        self._finalizer = weakref.finalize(self, _close, self._recorder, self._metadata)
+        self._finalizer = weakref.finalize(self, _close, self._recorder, self._episode_metadata)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -138,7 +138,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             jsonvalue.dumps(info, fallback=repr) if info else "{}",
             time.time_ns(),
         )
-        interrupted, self._metadata[0] = self._metadata[0], "{}"
+        interrupted, self._episode_metadata[0] = self._episode_metadata[0], "{}"
         self._recorder.reset(state, facts, interrupted)
         if self._metadata_callback is not None and self._stepped:
             self._metadata_callback.reset()
@@ -158,12 +158,12 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
                 state=before, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
             )
             metadata = self._metadata_callback(rl_tuple)
-            self._metadata[0] = jsonvalue.dumps_plain(metadata) if metadata else "{}"
+            self._episode_metadata[0] = jsonvalue.dumps_plain(metadata) if metadata else "{}"
         self._stepped = True
         self._state = copy.deepcopy(state)  # the environment may reuse its arrays
 
     def _end(self, end: int) -> None:
-        metadata, self._metadata[0] = self._metadata[0], "{}"
+        metadata, self._episode_metadata[0] = self._episode_metadata[0], "{}"
         self._recorder.end(end, metadata)
         self._stepped = False
         if self._metadata_callback is not None:

@@ -1,0 +1,268 @@
+"""Recordings whose writer died: every finished step is there, to the bit."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import shutil
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Sampler, roll, same
+from gymnasium import spaces
+from killed_recorder import KINDS
+
+from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError, journal_path
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+SCRIPT = Path(__file__).with_name("killed_recorder.py")
+
+
+def kill_while_recording(kind: str, path: Path, mode: str, chunk_size: int, seconds: float) -> list[Any]:
+    """What the child reported before it was killed."""
+    child = subprocess.Popen(
+        [sys.executable, str(SCRIPT), kind, str(path), mode, str(chunk_size)], stdout=subprocess.PIPE
+    )
+    assert child.stdout is not None
+    head = child.stdout.read(4)
+    child.stdout.read(int.from_bytes(head, "little"))
+    time.sleep(seconds)
+    child.kill()
+    data = child.stdout.read()
+    child.wait()
+    child.stdout.close()
+    reports, at = [], 0
+    while at + 4 <= len(data):
+        size = int.from_bytes(data[at : at + 4], "little")
+        if at + 4 + size > len(data):
+            break
+        reports.append(pickle.loads(data[at + 4 : at + 4 + size]))
+        at += 4 + size
+    return reports
+
+
+def check_single(recording: Recording, reports: list[Any], before: int) -> None:
+    steps = [step for episode in recording.episodes for step in episode][before:]
+    finals = {len(e) + sum(len(x) for x in recording.episodes[:i]) - before: e.final_state for i, e in enumerate(recording.episodes)}
+    assert len(steps) in (len(reports), len(reports) + 1)  # one more: committed, but not reported
+    for i, (action, state, terminal, timeout) in enumerate(reports):
+        assert same(steps[i].action, action)
+        assert (steps[i].terminal, steps[i].timeout) == (terminal, timeout)
+        after = finals[i + 1] if i + 1 in finals else steps[i + 1].state
+        assert same(after, state)
+    last = recording.episodes[-1]
+    assert last.final_state is not None
+    assert last.end == "interrupted" or steps[-1].terminal or steps[-1].timeout
+
+
+def check_vector(recording: Recording, reports: list[Any]) -> None:
+    ended = np.zeros(3, dtype=bool)
+    taken: list[list[Any]] = [[], [], []]
+    for actions, states, terminals, timeouts in reports:
+        for i in range(3):
+            if not ended[i]:
+                taken[i].append((actions[i], states[i]))
+        ended = (terminals | timeouts) & ~ended
+    for i in range(3):
+        mine = [e for e in recording.episodes if e.env == i]
+        found = [(step.action, after) for e in mine for step, after in zip(e, e.next_states, strict=True)]
+        assert len(found) - len(taken[i]) in (0, 1)
+        assert all(same(a, b) for a, b in zip(found, taken[i], strict=False))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_killed_process_loses_no_finished_step(tmp_path: Path, kind: str) -> None:
+    rng = random.Random(kind)
+    for round_ in range(3):
+        path = tmp_path / f"{round_}.mcap"
+        before, mode = 0, "x"
+        if round_ == 2 and kind != "vector":
+            with RecordEpisodes(Sampler(KINDS[kind], spaces.Discrete(9)), path, record_info=kind == "info") as env:
+                roll(env, 10)
+            before, mode = 10, "a"
+        reports = kill_while_recording(kind, path, mode, rng.choice([700, 4000, 500_000]), rng.random() * 0.15 + 0.01)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # killed before its first step: no journal
+            recording = Recording(path)
+        assert not recording.complete
+        assert not reports or recording.num_steps
+        if not recording.num_steps:
+            continue
+        if kind == "vector":
+            check_vector(recording, reports)
+        else:
+            check_single(recording, reports, before)
+        again = Recording(path)
+        assert np.array_equal(again.index, recording.index)
+
+
+def abandon(path: Path, make: Any, steps: int) -> None:
+    """Records in a forked child that dies without closing anything."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            env = make(path)
+            roll(env, steps)
+        finally:
+            os.kill(os.getpid(), 9)
+    os.waitpid(pid, 0)
+
+
+def cart_pole(path: Path, **kwargs: Any) -> RecordEpisodes:
+    return RecordEpisodes(gym.make("CartPole-v1"), path, chunk_size=3000, **kwargs)
+
+
+def test_appending_finishes_what_a_killed_writer_left(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    abandon(path, cart_pole, 100)
+    found = Recording(path)
+    before = found.read()
+    assert (len(before), found.complete, found.episodes[-1].end) == (100, False, "interrupted")
+    with cart_pole(path, mode="a") as env:
+        roll(env, 50)
+    recording = Recording(path)
+    assert recording.complete
+    assert np.array_equal(recording.read().states[:100], before.states)
+    assert recording.num_steps == 150
+    assert not journal_path(path).exists()
+
+
+def test_a_journal_elsewhere(tmp_path: Path) -> None:
+    (tmp_path / "fast").mkdir()
+    path = tmp_path / "r.mcap"
+    abandon(path, lambda p: cart_pole(p, journal_dir=tmp_path / "fast"), 10)
+    assert (tmp_path / "fast" / "r.mcap.journal").exists()
+    assert Recording(path).num_steps == 10
+
+
+def test_a_missing_journal_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    abandon(path, cart_pole, 100)
+    whole = Recording(path).read().states
+    journal_path(path).unlink()
+    with pytest.warns(UserWarning, match=r"has no journal r\.mcap\.journal beside it"):
+        recording = Recording(path)
+    kept = recording.read().states
+    assert 0 < len(kept) < 100
+    assert np.array_equal(kept, whole[: len(kept)])
+
+
+def test_a_stale_journal_of_another_recording_is_left_alone(tmp_path: Path) -> None:
+    first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    abandon(first, cart_pole, 100)
+    abandon(second, cart_pole, 77)
+    shutil.copy(journal_path(second), journal_path(first))
+    recording = Recording(first)
+    assert 0 < recording.num_steps < 100
+
+
+def test_a_damaged_journal_leaves_the_chunks_readable(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    abandon(path, cart_pole, 100)
+    data = bytearray(journal_path(path).read_bytes())
+    data[20] ^= 255
+    journal_path(path).write_bytes(data)
+    with pytest.warns(UserWarning, match="its journal cannot be read"):
+        assert Recording(path).num_steps > 0
+
+
+def test_a_finished_recording_that_was_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with cart_pole(path) as env:
+        roll(env, 300)
+    whole = Recording(path).read().states
+    data = path.read_bytes()
+    counts = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        for size in range(0, len(data), 97):
+            path.write_bytes(data[:size])
+            try:
+                found = Recording(path).read().states
+            except FormatError:
+                continue
+            kept = 0 if found is None else len(found)
+            assert kept == 0 or np.array_equal(found, whole[:kept])
+            counts.append(kept)
+    assert counts == sorted(counts)
+    assert counts[-1] > 100
+
+
+def test_a_forked_child_neither_records_nor_holds_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    env = cart_pole(path)
+    roll(env, 5)
+    pid = os.fork()
+    if pid == 0:
+        try:
+            env.step(0)
+        except RecordingError:
+            env.close()
+            os._exit(42)
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 42
+    roll(env, 5)
+    env.close()
+    assert Recording(path).num_steps == 10
+
+
+def test_a_full_disk_is_one_clear_error_and_the_rest_stays(tmp_path: Path) -> None:
+    code = (
+        "import resource, signal, sys, gymnasium as gym\n"
+        "from tupli_mcap import RecordEpisodes, RecordingError\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "env = RecordEpisodes(gym.make('CartPole-v1'), sys.argv[1], chunk_size=20_000, compression='none')\n"
+        "env.reset(seed=1); env.step(0)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))\n"
+        "n = 1\n"
+        "try:\n"
+        "    while True:\n"
+        "        n += 1\n"
+        "        _, _, a, b, _ = env.step(0)\n"
+        "        if a or b: env.reset()\n"
+        "except RecordingError as err:\n"
+        "    print(n, err)\n"
+        "try:\n"
+        "    env.close()\n"
+        "except RecordingError:\n"
+        "    pass\n"
+    )
+    path = tmp_path / "r.mcap"
+    child = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, timeout=60)
+    taken, message = child.stdout.split(" ", 1)
+    assert "could not write" in message
+    assert "stays readable" in message
+    assert Recording(path).num_steps == int(taken)
+
+
+def test_vector_recordings_are_finished_by_append(tmp_path: Path) -> None:
+    def make(path: Path, **kwargs: Any) -> Any:
+        envs = gym.vector.SyncVectorEnv([lambda: Sampler(KINDS["box"], spaces.Discrete(9)) for _ in range(2)])
+        return RecordVector(envs, path, chunk_size=1000, **kwargs)
+
+    path = tmp_path / "r.mcap"
+    pid = os.fork()
+    if pid == 0:
+        env = make(path)
+        env.reset(seed=1)
+        for _ in range(50):
+            env.step(env.action_space.sample())
+        os.kill(os.getpid(), 9)
+    os.waitpid(pid, 0)
+    before = Recording(path)
+    states = before.read().states
+    with make(path, mode="a") as env:
+        env.reset()
+        env.step(env.action_space.sample())
+    after = Recording(path)
+    assert after.complete
+    assert np.array_equal(after.read(range(len(before.index))).states, states)
+    assert after.num_steps == before.num_steps + 2

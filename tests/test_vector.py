@@ -1,0 +1,233 @@
+"""Vector environments: one stream a sub-environment, under every autoreset mode, for constant and variable layouts."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Sampler, same
+from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from gymnasium.vector.utils import iterate
+
+from tupli_mcap import Recording, RecordingError, SpaceError, StepError
+from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+from tupli_mcap.vector import RecordEpisodes
+
+try:
+    from gymnasium.vector import AutoresetMode
+
+    MODES: list[Any] = list(AutoresetMode)
+except ImportError:  # Gymnasium 1.0 knows next-step autoreset only
+    MODES = [None]
+
+N = 3
+SPACES: dict[str, gym.Space[Any]] = {
+    "box": spaces.Box(-1, 1, (4,), np.float32),
+    "discrete": spaces.Discrete(7, start=2),
+    "dict": spaces.Dict({"a": spaces.Box(0, 1, (2, 2)), "b": spaces.Tuple((spaces.Discrete(3), spaces.MultiBinary(2)))}),
+    "image": spaces.Dict({"camera": spaces.Box(0, 255, (6, 5, 3), np.uint8), "x": spaces.Box(-1, 1, (1,))}),
+    "text": spaces.Dict({"note": spaces.Text(8), "x": spaces.Discrete(5)}),
+    "sequence": spaces.Sequence(spaces.Box(-1, 1, (2,))),
+}
+
+
+def make(space: gym.Space[Any], mode: Any, kind: Callable[..., Any] = SyncVectorEnv) -> Any:
+    def one(i: int) -> Callable[[], Any]:
+        return lambda: Sampler(space, SPACES["discrete"], length=4 + i)
+
+    kwargs = {} if mode is None else {"autoreset_mode": mode}
+    return kind([one(i) for i in range(N)], **kwargs)
+
+
+def name_of(mode: Any) -> str:
+    return "NextStep" if mode is None else str(mode.value)
+
+
+def run(env: Any, mode: Any, batches: int) -> list[list[list[tuple[Any, ...]]]]:
+    """Steps the environment; what was taken, by sub-environment and episode, written down independently."""
+    episodes: list[list[list[tuple[Any, ...]]]] = [[[]] for _ in range(N)]
+    env.action_space.seed(0)
+    states = copy.deepcopy(list(iterate(env.observation_space, env.reset(seed=5)[0])))
+    ended = np.zeros(N, dtype=bool)
+    for _ in range(batches):
+        actions = env.action_space.sample()
+        chosen = list(iterate(env.action_space, actions))
+        batch, rewards, terminals, timeouts, infos = env.step(actions)
+        after = copy.deepcopy(list(iterate(env.observation_space, batch)))
+        done = terminals | timeouts
+        for i in range(N):
+            if name_of(mode) == "NextStep" and ended[i]:
+                continue
+            final = infos["final_obs"][i] if name_of(mode) == "SameStep" and done[i] else after[i]
+            step = (states[i], chosen[i], float(rewards[i]), bool(terminals[i]), bool(timeouts[i]), copy.deepcopy(final))
+            episodes[i][-1].append(step)
+            if done[i]:
+                episodes[i].append([])
+        ended = done & ~ended if name_of(mode) == "NextStep" else done
+        states = after
+        if name_of(mode) == "Disabled" and done.any():
+            states = copy.deepcopy(list(iterate(env.observation_space, env.reset(options={"reset_mask": done})[0])))
+    return [[episode for episode in found if episode] for found in episodes]
+
+
+def check(path: Path, taken: list[list[list[tuple[Any, ...]]]]) -> Recording:
+    recording = Recording(path)
+    found: list[list[Any]] = [[e for e in recording.episodes if e.env == i] for i in range(N)]
+    assert [len(episodes) for episodes in found] == [len(episodes) for episodes in taken]
+    for episodes, expected in zip(found, taken, strict=True):
+        for episode, steps in zip(episodes, expected, strict=True):
+            assert len(episode) == len(steps)
+            for step, (state, action, reward, terminal, timeout, _) in zip(episode, steps, strict=True):
+                assert same(step.state, state)
+                assert same(step.action, action)
+                assert (step.reward, step.terminal, step.timeout) == (reward, terminal, timeout)
+            assert same(episode.final_state, steps[-1][5])
+            assert episode.return_ == pytest.approx(sum(step[2] for step in steps), abs=0)
+    assert [e.number for e in recording.episodes] == list(range(len(recording.index)))
+    return recording
+
+
+@pytest.mark.parametrize("mode", MODES, ids=name_of)
+@pytest.mark.parametrize("kind", SPACES)
+def test_every_autoreset_mode(tmp_path: Path, kind: str, mode: Any) -> None:
+    with RecordEpisodes(make(SPACES[kind], mode), tmp_path / "r.mcap", chunk_size=1000) as env:
+        taken = run(env, mode, 40)
+    recording = check(tmp_path / "r.mcap", taken)
+    assert recording.num_envs == N
+    assert {e.end for e in recording.episodes} == {"terminal", "timeout", "interrupted"}
+
+
+@pytest.mark.parametrize("mode", MODES, ids=name_of)
+def test_long_enough_to_fill_halves(tmp_path: Path, mode: Any) -> None:
+    with RecordEpisodes(make(SPACES["box"], mode), tmp_path / "r.mcap", chunk_size=1000) as env:
+        taken = run(env, mode, 2500)
+    recording = check(tmp_path / "r.mcap", taken)
+    columns = recording.read(fields=["states", "next_states"])
+    expected = np.concatenate([episode.next_states for episode in recording.episodes])
+    assert np.array_equal(columns.next_states, expected)
+    assert np.array_equal(columns.states, np.concatenate([episode.states for episode in recording.episodes]))
+
+
+def test_asynchronous_environments(tmp_path: Path) -> None:
+    with RecordEpisodes(make(SPACES["dict"], None, AsyncVectorEnv), tmp_path / "r.mcap") as env:
+        taken = run(env, None, 25)
+    check(tmp_path / "r.mcap", taken)
+
+
+def test_a_custom_environment_that_reuses_its_arrays(tmp_path: Path) -> None:
+    class Counters(gym.vector.VectorEnv):  # type: ignore[type-arg]
+        num_envs = 4
+        single_observation_space = spaces.Box(0, 1e6, (1,), np.float64)
+        single_action_space = spaces.Discrete(2)
+        observation_space = spaces.Box(0, 1e6, (4, 1), np.float64)
+        action_space = spaces.MultiDiscrete([2] * 4)
+        metadata: dict[str, Any] = {}
+
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            self.count = np.zeros((4, 1))
+            return self.count, {}
+
+        def step(self, actions: Any) -> Any:
+            self.count += 1
+            no = np.zeros(4, dtype=bool)
+            return self.count, np.ones(4), no, no, {}
+
+    with RecordEpisodes(Counters(), tmp_path / "r.mcap") as env:
+        env.reset()
+        for _ in range(6):
+            env.step(np.array([0, 1, 0, 1]))
+    for i, episode in enumerate(Recording(tmp_path / "r.mcap").episodes):
+        assert episode.states[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+        assert episode.final_state.tolist() == [6]
+        assert episode.actions.tolist() == [i % 2] * 6
+
+
+def test_seeds_are_those_of_the_sub_environments(tmp_path: Path) -> None:
+    with RecordEpisodes(make(SPACES["box"], None), tmp_path / "r.mcap") as env:
+        env.reset(seed=10)
+        env.step([2, 3, 4])
+        env.reset(seed=[7, None, 9])
+        env.step([2, 3, 4])
+    seeds = {(e.env, e.number): e.seed for e in Recording(tmp_path / "r.mcap").episodes}
+    assert seeds == {(0, 0): 10, (1, 1): 11, (2, 2): 12, (0, 3): 7, (1, 4): None, (2, 5): 9}
+
+
+def test_a_full_reset_interrupts_every_episode(tmp_path: Path) -> None:
+    with RecordEpisodes(make(SPACES["box"], None), tmp_path / "r.mcap") as env:
+        env.reset(seed=1)
+        env.step([2, 3, 4])
+        env.reset(seed=2)
+        env.reset(seed=3)
+        env.step([2, 3, 4])
+    episodes = Recording(tmp_path / "r.mcap").episodes
+    assert [(e.env, len(e), e.end) for e in episodes] == [(i, 1, "interrupted") for i in (0, 1, 2, 0, 1, 2)]
+
+
+class Returns(EpisodeMetadataCallback):
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self.total = 0.0
+
+    def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+        self.total += tuple.reward
+        return {"total": self.total}
+
+
+@pytest.mark.parametrize("mode", MODES, ids=name_of)
+def test_metadata_and_infos(tmp_path: Path, mode: Any) -> None:
+    with RecordEpisodes(
+        make(SPACES["box"], mode),
+        tmp_path / "r.mcap",
+        metadata_callback=Returns(),
+        step_callback=lambda step: {"first": float(step.state[0])},
+    ) as env:
+        run(env, mode, 30)
+    for episode in Recording(tmp_path / "r.mcap").episodes:
+        assert episode.metadata == {"total": episode.return_}
+        assert episode.infos is not None
+        assert [info["first"] for info in episode.infos if info] == episode.states[:, 0].tolist()
+
+
+def test_appending_goes_on_with_every_stream(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(make(SPACES["box"], None), path) as env:
+        taken = run(env, None, 20)
+    with RecordEpisodes(make(SPACES["box"], None), path, mode="a") as env:
+        more = run(env, None, 20)
+    check(path, [a + b for a, b in zip(taken, more, strict=True)])
+    with pytest.raises(SpaceError, match=r"records 3 sub-environment\(s\), found 1"):
+        RecordEpisodes(SyncVectorEnv([lambda: Sampler(SPACES["box"], SPACES["discrete"])]), path, mode="a")
+
+
+def test_a_batch_that_cannot_be_stored(tmp_path: Path) -> None:
+    class Strays(gym.vector.VectorWrapper):  # type: ignore[type-arg]
+        def step(self, actions: Any) -> Any:
+            states, *rest = self.env.step(actions)
+            return (states if self.good else states[:, :2], *rest)
+
+        good = True
+
+    strays = Strays(make(SPACES["box"], None))
+    env = RecordEpisodes(strays, tmp_path / "r.mcap")
+    env.reset()
+    env.step([2, 3, 4])
+    strays.good = False
+    with pytest.raises(StepError, match=r"state: expected shape \(3, 4\), found shape \(3, 2\)"):
+        env.step([2, 3, 4])
+    strays.good = True
+    with pytest.raises(StepError, match="could not be recorded; call env.reset"):
+        env.step([2, 3, 4])
+    env.reset()
+    env.step([2, 3, 4])
+    env.close()
+    assert [len(e) for e in Recording(tmp_path / "r.mcap").episodes] == [1] * 6
+    with pytest.raises(RecordingError, match="is closed"):
+        env.step([2, 3, 4])
