@@ -83,8 +83,9 @@ def _predicate(filter: BaseFilter) -> Predicate:
 def scalar_test(filter: BaseFilter) -> Callable[[Scalar], bool]:
     """What a comparison says of a value that is there."""
     if filter.type is FilterType.IN:
-        choices = [classify(value) for value in filter.value]
-        return lambda found: any(compare("EQ", found, choice) for choice in choices)
+        # Equal scalars of one kind hash alike, 1 and 1.0 too; only NaN is not equal to itself.
+        choices = {scalar for value in filter.value if (scalar := classify(value)).kind != "nan"}
+        return lambda found: found in choices
     operation, wanted = filter.type.value, classify(filter.value)
     return lambda found: compare(operation, found, wanted)
 

@@ -153,7 +153,9 @@ class Catalog:
     def explain(self, filter: BaseFilter | None) -> str:
         """The SQL of a filter, its parameters, and SQLite's plan for it."""
         with self._read() as connection:
-            compiled = self._query(connection, filter, EPISODE.c.id).compile(connection)
+            compiled = self._query(connection, filter, EPISODE.c.id).compile(
+                connection, compile_kwargs={"render_postcompile": True}
+            )
             values = tuple(compiled.params[name] for name in compiled.positiontup or ())
             plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {compiled}", values)
             steps = [f"  {row.detail}" for row in plan]

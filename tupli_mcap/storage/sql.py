@@ -16,8 +16,10 @@ from typing import Any, Final, Protocol
 from sqlalchemy import Text, and_, case, cast, false, or_, true
 from sqlalchemy.sql.elements import ColumnElement
 
+from tupli_mcap.errors import FilterError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterIN, FilterType, check_keys
-from tupli_mcap.schema.filters import path_of
+from tupli_mcap.schema.filters import COMBINING, path_of
+from tupli_mcap.schema.predicate import comparisons
 from tupli_mcap.schema.values import Scalar, classify
 from tupli_mcap.storage.rows import escape_text
 from tupli_mcap.storage.tables import EPISODE, RECORDING
@@ -25,7 +27,9 @@ from tupli_mcap.storage.tables import EPISODE, RECORDING
 Condition = ColumnElement[bool]
 
 _EPISODE_NUMBER: Final = re.compile("0|[1-9][0-9]{0,9}")
-_MAX_TERMS: Final = 200  # SQLite parses a chain of ORs as a tree of that depth, and refuses one of 1000
+# A database compares the constants of a statement with each other, and parses a chain of ORs as a deep tree.
+_MANY: Final = 64
+_MAX_TERMS: Final = 500
 
 
 class Operand(Protocol):
@@ -41,11 +45,17 @@ class Dialect(Protocol):
     def metadata(self, path: tuple[str, ...]) -> Operand:
         """The operand of a path inside the metadata (one segment or more)."""
 
+    def metadata_filter(self, filter: BaseFilter) -> Condition:
+        """A filter that is about metadata only, of any size."""
+
     def number(self, column: ColumnElement[Any]) -> Operand:
         """The operand of a nullable column of numbers."""
 
     def any_text(self, column: ColumnElement[Any], texts: Sequence[str]) -> Condition:
         """True where a column holds one of `texts` (one or more, escaped; thousands are fine)."""
+
+    def any_integer(self, column: ColumnElement[Any], integers: Sequence[int]) -> Condition:
+        """True where a column holds one of `integers` (64 bits each; thousands are fine)."""
 
     def any_episode(self, episodes: Sequence[tuple[str, int]]) -> Condition:
         """True of the episodes named by (uuid of the recording, number) (one or more, escaped)."""
@@ -55,7 +65,7 @@ def compile_filter(filter: BaseFilter | None, dialect: Dialect) -> Condition:
     """The condition on rows of `EPISODE` joined with `RECORDING` that a filter stands for.
 
     Raises:
-        FilterError: The filter names an unknown top-level key.
+        FilterError: The filter names an unknown top-level key, or makes too many comparisons.
     """
     if filter is None:
         return true()
@@ -64,26 +74,37 @@ def compile_filter(filter: BaseFilter | None, dialect: Dialect) -> Condition:
 
 
 def _compile(filter: BaseFilter, dialect: Dialect) -> Condition:
-    match filter.type:
-        case FilterType.AND:
-            return _joined(and_, true(), [_compile(part, dialect) for part in filter.filters])
-        case FilterType.OR:
-            return _joined(or_, false(), [_compile(part, dialect) for part in _merged(filter.filters)])
-        case FilterType.NOT:
-            return negated(_compile(filter.filters[0], dialect))
-    return _operand(path_of(filter), dialect).compare(filter)
+    if filter.type is FilterType.NOT:
+        return negated(_compile(filter.filters[0], dialect))
+    if filter.type not in COMBINING:
+        return _operand(path_of(filter), dialect).compare(filter)
+    either = filter.type is FilterType.OR
+    parts = _merged(filter.filters) if either else filter.filters
+    inside: list[BaseFilter] = []
+    others: list[BaseFilter] = []
+    if sum(1 for part in parts for _ in comparisons(part)) > _MANY:
+        for part in parts:
+            (inside if _is_metadata_only(part) else others).append(part)
+    else:
+        others = list(parts)
+    if len(others) > _MAX_TERMS:
+        raise FilterError(
+            f"a filter has at most {_MAX_TERMS} comparisons outside the metadata beside each other, "
+            f"found {len(others)}; ask for many values of one key with IN"
+        )
+    compiled = [_compile(part, dialect) for part in others]
+    if inside:
+        compiled.append(dialect.metadata_filter(BaseFilter(type=filter.type, filters=inside)))
+    return or_(false(), *compiled) if either else and_(true(), *compiled)
+
+
+def _is_metadata_only(filter: BaseFilter) -> bool:
+    return all(path_of(item)[0] == "metadata" for item in comparisons(filter))
 
 
 def negated(condition: Condition) -> Condition:
     """True where a condition is false or NULL."""
     return case((condition, false()), else_=true())
-
-
-def _joined(join: Callable[..., Condition], empty: Condition, parts: Sequence[Condition]) -> Condition:
-    while len(parts) > _MAX_TERMS:
-        chunks = (parts[i : i + _MAX_TERMS] for i in range(0, len(parts), _MAX_TERMS))
-        parts = [case((join(empty, *chunk), true()), else_=false()) for chunk in chunks]
-    return join(empty, *parts)
 
 
 def _merged(filters: Iterable[BaseFilter]) -> list[BaseFilter]:
@@ -114,7 +135,7 @@ def _operand(path: tuple[str, ...], dialect: Dialect) -> Operand:
     if name in _TEXTS:
         return TextOperand(_TEXTS[name], dialect)
     if name in _INTEGERS:
-        return IntegerOperand(_INTEGERS[name])
+        return IntegerOperand(_INTEGERS[name], dialect)
     if name in _FLAGS:
         return _Flag(_FLAGS[name])
     if name in _NUMBERS:
@@ -169,7 +190,7 @@ class ScalarOperand:
         return self._one(filter.type, classify(filter.value))
 
     def _any(self, choices: Sequence[Scalar]) -> Condition:
-        return _joined(or_, false(), [self._one(FilterType.EQ, choice) for choice in choices])
+        return or_(false(), *(self._one(FilterType.EQ, choice) for choice in choices))
 
     def _one(self, operation: FilterType, wanted: Scalar) -> Condition:
         raise NotImplementedError
@@ -213,13 +234,17 @@ class TextOperand(ScalarOperand):
 class IntegerOperand(ScalarOperand):
     """A column of 64-bit integers, never NULL."""
 
-    def __init__(self, column: ColumnElement[Any]) -> None:
+    def __init__(self, column: ColumnElement[Any], dialect: Dialect) -> None:
         self._column = column
+        self._dialect = dialect
 
     def _one(self, operation: FilterType, wanted: Scalar) -> Condition:
         if wanted.kind != "number":
             return false()
         return apply(operation, self._column, bindable(wanted.value))
+
+    def _any(self, choices: Sequence[Scalar]) -> Condition:
+        return self._dialect.any_integer(self._column, whole_numbers(choices))
 
 
 class _Flag(ScalarOperand):
@@ -261,3 +286,9 @@ def bindable(number: float) -> float:
     if isinstance(number, int) and not -(2**63) <= number < 2**63:
         return math.inf if number > 0 else -math.inf
     return number
+
+
+def whole_numbers(choices: Iterable[Scalar]) -> list[int]:
+    """The 64-bit integers among scalars, floats with such a value included."""
+    numbers = (choice.value for choice in choices if choice.kind == "number")
+    return [int(number) for number in numbers if -(2**63) <= number < 2**63 and int(number) == number]

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Final
 
-from sqlalchemy import Text, and_, case, column, false, func, literal_column, or_, select, true
+from sqlalchemy import Text, and_, case, column, false, func, literal_column, null, or_, select, true
 from sqlalchemy.dialects import sqlite
 from sqlalchemy.sql.elements import ColumnElement
 
@@ -27,12 +27,12 @@ from tupli_mcap.schema import BaseFilter, FilterIN, FilterType, compile_predicat
 from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import FLOAT_TAG, Scalar, against_floats, classify
 from tupli_mcap.storage.rows import escape_text, load_metadata, load_number
-from tupli_mcap.storage.sql import Condition, Operand, ScalarOperand, apply, bindable
+from tupli_mcap.storage.sql import Condition, Operand, ScalarOperand, apply, bindable, whole_numbers
 from tupli_mcap.storage.tables import EPISODE, EPISODE_BITS, RECORDING, AsStored, declared_columns
 
 _SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
 _FEW: Final = 16  # so many numbers of an IN are looked up one by one
-_FEW_TEXTS: Final = 500
+_FEW_VALUES: Final = 500
 
 # Far wider than what SQLite's reading of decimals errs by, narrow enough to hold few values.
 _RELATIVE_BAND: Final = 1e-12
@@ -58,14 +58,23 @@ class SqliteDialect:
             return _Json(path, *_expressions(path, EPISODE.c.metadata), self)
         return _Unsearchable()
 
+    def metadata_filter(self, filter: BaseFilter) -> Condition:
+        return _asked(filter)
+
     def number(self, column: _Value) -> Operand:
         return _Number(column)
 
     def any_text(self, column: _Value, texts: Sequence[str]) -> Condition:
-        if len(texts) <= _FEW_TEXTS:
+        if len(texts) <= _FEW_VALUES:
             return column.in_(texts)
         # SQLite takes some 30,000 parameters, and a list of any length.
         values = func.json_each(json.dumps(texts, ensure_ascii=False)).table_valued("value")
+        return column.in_(select(values.c.value))
+
+    def any_integer(self, column: _Value, integers: Sequence[int]) -> Condition:
+        if len(integers) <= _FEW_VALUES:
+            return column.in_(integers)
+        values = func.json_each(json.dumps(integers)).table_valued("value")
         return column.in_(select(values.c.value))
 
     def any_episode(self, episodes: Sequence[tuple[str, int]]) -> Condition:
@@ -123,22 +132,25 @@ def _asked(filter: BaseFilter) -> Condition:
     return func.tupli_match(filter.model_dump_json(), text) == 1
 
 
+def _compared(filter: BaseFilter, column: _Value) -> Condition:
+    """A comparison with a column of numbers, decided by Python."""
+    return func.tupli_compare(filter.model_dump_json(), column) == 1
+
+
 def _expressions(path: tuple[str, ...], source: _Value) -> tuple[_Value, _Value]:
     """Kind and value of a path in a column of metadata."""
     where = "$" + "".join(f'."{segment}"' for segment in path)
     json_type = func.json_type(source, where, type_=Text)
     tagged = func.json_extract(source, f'{where}."{FLOAT_TAG}"', type_=Text)
-    names = {"integer": "number", "real": "number", "true": "bool", "false": "bool", "array": "other"}
-    kind = case(
-        *((json_type == name, _word(kind)) for name, kind in names.items()),
-        (json_type != "object", json_type),
-        (tagged == "nan", _word("nan")),
-        (tagged.is_not(None), _word("number")),
-        (json_type == "object", _word("other")),
-    )
+    kinds = {"integer": "number", "real": "number", "text": "text", "true": "bool", "false": "bool"}
+    kinds |= {"null": "null", "array": "other"}
+    floats = {"nan": "nan", "inf": "number", "-inf": "number"}
+    of_object = case(_words(floats), value=tagged, else_=_word("other"))
+    kind = case(_words(kinds) | {"object": of_object}, value=json_type)
     value = case(
-        (json_type == "object", case((tagged == "inf", _INFINITY), (tagged == "-inf", -_INFINITY))),
-        (json_type != "array", func.json_extract(source, where, type_=AsStored)),
+        {"object": case({"inf": _INFINITY, "-inf": -_INFINITY}, value=tagged), "array": null()},
+        value=json_type,
+        else_=func.json_extract(source, where, type_=AsStored),
     )
     return kind, value
 
@@ -148,6 +160,10 @@ _INFINITY: Final[_Value] = literal_column("9e999")
 
 def _declared(name: str) -> _Value:
     return literal_column(f"{EPISODE.name}.{name}")
+
+
+def _words(texts: Mapping[str, str]) -> dict[str, _Value]:
+    return {name: _word(text) for name, text in texts.items()}
 
 
 def _word(text: str) -> _Value:
@@ -186,8 +202,10 @@ class _Json(ScalarOperand):
             parts += [self._one(FilterType.EQ, Scalar("number", number)) for number in numbers]
         else:
             within = self._value.between(_band(min(numbers))[0], _band(max(numbers))[1])
+            whole = self._dialect.any_integer(self._value, whole_numbers(choices))
             asked = _asked(FilterIN(key=self._key, value=numbers))
-            parts.append(and_(self._kind == "number", within, asked))
+            decided = case((func.typeof(self._value) == "integer", whole), else_=asked)
+            parts.append(and_(self._kind == "number", within, decided))
         return or_(false(), *parts)
 
     def _number(self, operation: FilterType, number: float) -> Condition:
@@ -226,13 +244,17 @@ class _Number(ScalarOperand):
     def __init__(self, column: _Value) -> None:
         self._column = column
 
+    def _any(self, choices: Sequence[Scalar]) -> Condition:
+        if len(choices) <= _FEW:
+            return super()._any(choices)
+        return _compared(FilterIN(key="value", value=[choice.value for choice in choices]), self._column)
+
     def _one(self, operation: FilterType, wanted: Scalar) -> Condition:
         if wanted.kind == "null":
             return self._column.is_(None)
         if wanted.kind != "number":
             return false()
-        comparison = BaseFilter(type=operation, key="value", value=wanted.value)
-        asked = func.tupli_compare(comparison.model_dump_json(), self._column) == 1
+        asked = _compared(BaseFilter(type=operation, key="value", value=wanted.value), self._column)
         exact: tuple[str, float] | None = operation, wanted.value
         if bindable(wanted.value) != wanted.value:  # an integer beyond 64 bits; those stored are texts
             exact = against_floats(operation, wanted.value)

@@ -1,0 +1,461 @@
+"""The catalog: what goes in comes out, fast, whatever happens to its file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tupli_mcap.errors import FilterError, FormatError, StorageError
+from tupli_mcap.messages.jsonvalue import dumps_plain
+from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR
+from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
+from tupli_mcap.storage.rows import escape_text, unescape_text
+
+STAMP = RecordingStamp(size=10, mtime_ns=20, sidecar_mtime_ns=30)
+TEXTS = st.text() | st.sampled_from(["\x00", "\x01", "\ud7ff", "\ud800", "\udfff", "\ue000", "a\x00\x01"])
+
+
+def row(episode: int = 0, metadata: Any = None, **changes: Any) -> EpisodeRow:
+    base = EpisodeRow(
+        episode=episode,
+        env=0,
+        n_tuples=22,
+        end="terminal",
+        episode_return=1.5,
+        seed=7,
+        created_at="2026-11-21T09:00:00+00:00",
+        created_by="me",
+        published_in='["me"]',
+        metadata=metadata if isinstance(metadata, str) else dumps_plain(metadata or {}),
+    )
+    return base._replace(**changes)
+
+
+def put(
+    catalog: Catalog, path: str = "a.mcap", rows: Any = (), uuid: str = "u", benchmark_id: str = "b"
+) -> None:
+    catalog.put_recording(path, STAMP, uuid=uuid, benchmark_id=benchmark_id, rows=rows)
+
+
+@pytest.fixture
+def catalog(tmp_path: Path) -> Iterator[Catalog]:
+    with Catalog(tmp_path / "lab" / "catalog.sqlite") as catalog:
+        yield catalog
+
+
+class TestRows:
+    def test_a_row_comes_back_as_a_header(self, catalog: Catalog) -> None:
+        metadata = {
+            "score": 0.1,
+            "nan": math.inf,
+            "name": "größe\x00",
+            "tags": ["a", {"$x": 1}],
+            "none": None,
+        }
+        put(
+            catalog,
+            "runs/ä.mcap",
+            [row(3, metadata, end="timeout", env=2)],
+            uuid="f" * 32,
+            benchmark_id="b",
+        )
+        (header,) = catalog.episodes()
+        assert header == EpisodeHeader(
+            id="f" * 32 + "-3",
+            created_by="me",
+            published_in=["me"],
+            created_at="2026-11-21T09:00:00+00:00",
+            benchmark_id="b",
+            metadata=metadata,
+            n_tuples=22,
+            terminated=False,
+            timeout=True,
+            end="timeout",
+            episode_return=1.5,
+            seed=7,
+            env=2,
+            episode=3,
+            recording="runs/ä.mcap",
+        )
+        assert EpisodeHeader.model_validate(header.model_dump()) == header
+
+    @pytest.mark.parametrize("seed", [None, 0, 2**63 - 1, 2**63, -(2**63) - 1, 2**128 + 1])
+    def test_seeds_of_any_size(self, catalog: Catalog, seed: int | None) -> None:
+        put(catalog, rows=[row(seed=seed)])
+        assert catalog.episodes()[0].seed == seed
+        assert catalog.count(F("seed") == seed) == 1
+
+    @pytest.mark.parametrize("value", [None, 0.1, math.nan, math.inf, -math.inf, 1e308])
+    def test_returns_of_any_kind(self, catalog: Catalog, value: float | None) -> None:
+        put(catalog, rows=[row(episode_return=value)])
+        assert repr(catalog.episodes()[0].episode_return) == repr(value)
+
+    def test_headers_do_not_share_values(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(0), row(1)])
+        first, second = catalog.episodes()
+        first.published_in.append("global")
+        assert second.published_in == ["me"]
+
+    @pytest.mark.parametrize(
+        ("metadata", "message"),
+        [
+            ("[1]", "expected the metadata of an episode to be a JSON object, found '\\[1\\]'"),
+            ("{", "expected JSON"),
+            ('{"a": NaN}', "expected strict JSON, found NaN"),
+            ('{"a": {"$b": 1}}', "expected one known tag"),
+            ('{"a": ' + "[" * 5000 + "]" * 5000 + "}", "levels of nesting"),
+        ],
+    )
+    def test_bad_metadata_is_refused_and_changes_nothing(
+        self, catalog: Catalog, metadata: str, message: str
+    ) -> None:
+        put(catalog, rows=[row(0)])
+        with pytest.raises(FormatError, match=message):
+            put(catalog, rows=[row(0), row(1, metadata)])
+        assert catalog.count() == 1
+
+    def test_a_key_twice_is_the_last_one_everywhere(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(0, '{"a": 1, "a": 2}')])
+        assert catalog.episodes(F("metadata.a") == 2)[0].metadata == {"a": 2}
+
+    def test_an_episode_number_twice_or_too_large(self, catalog: Catalog) -> None:
+        with pytest.raises(StorageError, match="UNIQUE constraint failed"):
+            put(catalog, rows=[row(1), row(1)])
+        with pytest.raises(FormatError, match=r"episode number below 2\*\*32, found 4294967296"):
+            put(catalog, rows=[row(2**32)])
+        assert catalog.recordings() == {}
+
+    @given(TEXTS, TEXTS)
+    def test_escaped_texts_sort_as_they_did(self, left: str, right: str) -> None:
+        assert unescape_text(escape_text(left)) == left
+        assert (escape_text(left).encode() < escape_text(right).encode()) == (left < right)
+        assert "\x00" not in escape_text(left)
+
+
+class TestRecordings:
+    def test_put_replace_remove(self, catalog: Catalog) -> None:
+        put(catalog, "b.mcap", [row(0), row(1)], uuid="1")
+        put(catalog, "a.mcap", [row(5)], uuid="2")
+        put(catalog, "b.mcap", [row(1), row(0), row(2)], uuid="3")
+        put(catalog, "odd\udcff\x01.mcap", [], uuid="4")
+        assert catalog.recordings() == {"a.mcap": STAMP, "b.mcap": STAMP, "odd\udcff\x01.mcap": STAMP}
+        assert [h.id for h in catalog.episodes()] == ["2-5", "3-0", "3-1", "3-2"]
+        catalog.remove_recording("b.mcap")
+        catalog.remove_recording("missing.mcap")
+        assert [h.id for h in catalog.episodes()] == ["2-5"]
+        assert sorted(catalog.recordings()) == ["a.mcap", "odd\udcff\x01.mcap"]
+
+    def test_pages(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(n, {"n": n}) for n in range(10)])
+        wanted = F("metadata.n") > 2
+        pages = [catalog.episodes(wanted, limit=3, offset=offset) for offset in (0, 3, 6)]
+        assert [[h.episode for h in page] for page in pages] == [[3, 4, 5], [6, 7, 8], [9]]
+        assert len(catalog.episodes(wanted, offset=5)) == 2
+        assert [h.episode for h in catalog.episodes(limit=2)] == [0, 1]
+
+    def test_a_failing_source_changes_nothing(self, catalog: Catalog) -> None:
+        def failing() -> Iterator[EpisodeRow]:
+            yield from (row(n) for n in range(50_000))
+            raise OSError("the disk is gone")
+
+        put(catalog, rows=[row(0)])
+        with pytest.raises(OSError, match="the disk is gone"):
+            put(catalog, rows=failing())
+        assert catalog.count() == 1
+
+    def test_by_id(self, catalog: Catalog) -> None:
+        put(catalog, "a.mcap", [row(n) for n in range(20)], uuid="a-b")
+        put(catalog, "b.mcap", [row(n) for n in range(20)], uuid="c")
+        assert [h.id for h in catalog.episodes(F("id") == "a-b-7")] == ["a-b-7"]
+        assert [h.id for h in catalog.episodes(F("id").isin(["c-1", "a-b-2", "c-99", "x"]))] == [
+            "a-b-2",
+            "c-1",
+        ]
+        for unknown in ("c-07", "c--7", "c-7 ", "c-", "-7", "", "c-" + "9" * 5000, "c-٧"):
+            assert catalog.count(F("id") == unknown) == 0
+        assert "SEARCH episode USING INTEGER PRIMARY KEY" in catalog.explain(F("id") == "a-b-7")
+
+
+class TestDeclaredKeys:
+    def test_an_index_is_used(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(0, {"score": 1, "name": "x"})])
+        wanted = [
+            F("metadata.score") > 0.5,
+            F("metadata.score") <= 1,
+            F("metadata.score") == 1,
+            F("metadata.score") == "text",
+            F("metadata.score").isin([1, 2, "a"]),
+            (F("metadata.score") > 0) & (F("metadata.name") == "x") & (F("benchmark_id") == "b"),
+        ]
+        for part in wanted:
+            assert "USING INDEX ix_key" not in catalog.explain(part)
+        catalog.declare_key("metadata.score")
+        for part in wanted:
+            assert "USING INDEX ix_key_0 (key_0_kind=?" in catalog.explain(part), part
+        catalog.declare_key("metadata.name")
+        assert "MULTI-INDEX OR" in catalog.explain((F("metadata.score") == 1) | (F("metadata.name") == "x"))
+        catalog.declare_key("n_tuples")
+        assert "USING INDEX ix_key_2 (n_tuples>?" in catalog.explain(F("n_tuples") > 100)
+        catalog.declare_key("episode_return")
+        assert "USING INDEX ix_key_3 (episode_return>?" in catalog.explain(F("episode_return") > 100)
+
+    def test_they_are_generated_columns_of_kind_and_value(self, catalog: Catalog) -> None:
+        catalog.declare_key("metadata.a b.c")
+        values = [1, 1.5, "1", True, None, math.nan, -math.inf, [1], {"x": 1}]
+        rows = [row(n, {"a b": {"c": value}}) for n, value in enumerate(values)]
+        put(catalog, rows=[*rows, row(len(values), {})])
+        with sqlite3.connect(catalog.path) as connection:
+            hidden = {name: kind for _, name, *_, kind in connection.execute("PRAGMA table_xinfo(episode)")}
+            found = connection.execute("SELECT key_0_kind, key_0_value FROM episode").fetchall()
+        connection.close()
+        assert (hidden["key_0_kind"], hidden["key_0_value"]) == (2, 2)  # virtual generated
+        assert found == [
+            ("number", 1),
+            ("number", 1.5),
+            ("text", "1"),
+            ("bool", 1),
+            ("null", None),
+            ("nan", None),
+            ("number", -math.inf),
+            ("other", None),
+            ("other", None),
+            (None, None),
+        ]
+
+    def test_they_last(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(0, {"score": 1})])
+        for _ in range(2):
+            catalog.declare_key("metadata.score")
+            catalog.declare_key("metadata.x.y")
+        with Catalog(catalog.path) as again:
+            assert again.declared_keys() == ["metadata.score", "metadata.x.y"]
+            assert "ix_key_0" in again.explain(F("metadata.score") == 1)
+            again.declare_key("benchmark_id")  # indexed as it is
+            assert again.count(F("benchmark_id") == "b") == 1
+        assert catalog.declared_keys()[-1] == "benchmark_id"
+
+    @pytest.mark.parametrize(
+        ("key", "message"),
+        [
+            ("score", "unknown filter key 'score'; the keys are"),
+            ("metadata", "cannot be declared"),
+            ('metadata."a\\"b"', "cannot be declared: its names need to be printable ASCII"),
+            ("metadata.größe", "cannot be declared"),
+            ("metadata.x'); DROP TABLE episode; --", "cannot be declared"),
+            ("metadata..x", "needs a name at character 9"),
+        ],
+    )
+    def test_keys_that_cannot_be_declared(self, catalog: Catalog, key: str, message: str) -> None:
+        with pytest.raises(FilterError, match=message):
+            catalog.declare_key(key)
+        assert catalog.declared_keys() == []
+
+    @settings(max_examples=60, deadline=None)
+    @given(st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=6))
+    def test_any_declarable_name_is_found(self, name: str) -> None:
+        wanted = F("metadata", name) == 3
+        with Catalog(None) as catalog:
+            put(catalog, rows=[row(0, {name: 3}), row(1, {name + "x": 3})])
+            assert catalog.count(wanted) == 1
+            try:
+                catalog.declare_key(F("metadata", name).key)
+            except FilterError:
+                return
+            assert "ix_key_0" in catalog.explain(wanted)
+            assert catalog.count(wanted) == 1
+
+    def test_few_among_many_come_back_at_once(self, catalog: Catalog) -> None:
+        chance = random.Random(1)
+        rows = [row(n, {"score": chance.random(), "n": n, "name": f"run-{n % 7}"}) for n in range(20_000)]
+        catalog.declare_key("metadata.score")
+        put(catalog, rows=rows)
+        wanted = (F("metadata.score") > 0.5) & (F("metadata.score") < 0.55)
+        expected = sum(0.5 < json.loads(r.metadata)["score"] < 0.55 for r in rows)
+        took = math.inf
+        for _ in range(5):
+            start = time.perf_counter()
+            found = catalog.episodes(wanted)
+            took = min(took, time.perf_counter() - start)
+        assert len(found) == expected
+        assert "(key_0_kind=? AND key_0_value>? AND key_0_value<?)" in catalog.explain(wanted)
+        assert took < 0.1  # 10 ms on an idle machine
+
+
+class TestLargeFilters:
+    def test_many_values(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(n, {"name": f"{n}", "n": n, "f": n + 0.5}) for n in range(50)])
+        for count in (60, 600, 40_000):
+            assert catalog.count(F("metadata.name").isin([f"{n}" for n in range(count)])) == 50
+            assert catalog.count(F("metadata.n").isin(range(10, count))) == 40
+            assert catalog.count(F("metadata.f").isin([n + 0.5 for n in range(10, count)])) == 40
+            assert catalog.count(F("benchmark_id").isin([f"{n}" for n in range(count)] + ["b"])) == 50
+            assert catalog.count(F("episode").isin(range(10, count))) == 40
+            assert catalog.count(F("episode_return").isin([n + 0.5 for n in range(count)])) == 50
+            assert catalog.count(F("seed").isin([None, 2**70, *range(count)])) == 50
+            assert catalog.count(F("id").isin([f"u-{n}" for n in range(10, count)])) == 40
+
+    def test_many_parts(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(n, {"n": n}) for n in range(50)])
+        parts = [F(f"metadata.n{i}") == i for i in range(1500)]
+        assert catalog.count(FilterOR(filters=[*parts, F("metadata.n") > 39])) == 10
+        assert catalog.count(FilterOR(filters=[F("benchmark_id") == f"{i}" for i in range(3000)])) == 0
+        assert catalog.count(~FilterOR(filters=parts)) == 50
+        assert catalog.count(FilterOR(filters=[*parts, F("episode") < 3, F("benchmark_id") == "x"])) == 3
+        assert catalog.count(FilterAND(filters=[F("metadata.n") > i for i in range(-1500, 40)])) == 10
+
+    def test_too_many_parts(self, catalog: Catalog) -> None:
+        with pytest.raises(FilterError, match=r"at most 500 comparisons outside the metadata .* found 600"):
+            catalog.count(FilterAND(filters=[F("created_by") != f"{n}" for n in range(600)]))
+
+
+class TestFile:
+    def test_it_is_a_wal_database(self, catalog: Catalog) -> None:
+        with sqlite3.connect(catalog.path) as connection:
+            assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+        connection.close()
+
+    @pytest.mark.parametrize("content", [b"", b"no database", b"SQLite format 3\x00" + b"\xff" * 5000])
+    def test_what_is_no_catalog_is_replaced(self, tmp_path: Path, content: bytes) -> None:
+        path = tmp_path / "catalog.sqlite"
+        path.write_bytes(content)
+        with Catalog(path) as catalog:
+            put(catalog, rows=[row(0)])
+            assert catalog.count() == 1
+
+    @pytest.mark.parametrize(
+        "change", ["PRAGMA user_version = 99", "PRAGMA application_id = 1", "DROP TABLE declared"]
+    )
+    def test_another_version_is_replaced(self, tmp_path: Path, change: str) -> None:
+        path = tmp_path / "catalog.sqlite"
+        with Catalog(path) as catalog:
+            put(catalog, rows=[row(0)])
+        with sqlite3.connect(path) as connection:
+            connection.execute(change)
+        connection.close()
+        with Catalog(path) as catalog:
+            assert catalog.recordings() == {}
+            put(catalog, rows=[row(0)])
+        with Catalog(path) as catalog:
+            assert catalog.count() == 1
+
+    def test_damage_inside_is_said_and_reset_repairs(self, tmp_path: Path) -> None:
+        path = tmp_path / "catalog.sqlite"
+        with Catalog(path) as catalog:
+            put(catalog, rows=[row(n) for n in range(1000)])
+        content = bytearray(path.read_bytes())
+        content[4096 * 8 :] = b"\xa5" * (len(content) - 4096 * 8)
+        path.write_bytes(content)
+        with Catalog(path) as catalog:
+            with pytest.raises(CatalogDamagedError, match=r"is damaged .* delete it"):
+                catalog.episodes()
+            catalog.reset()
+            assert catalog.recordings() == {}
+            put(catalog, rows=[row(0)])
+            assert catalog.count() == 1
+
+    def test_deleted_while_open(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(0)])
+        for path in list(catalog.path.parent.iterdir()):
+            path.unlink()
+        assert catalog.recordings() == {}
+        put(catalog, rows=[row(0)])
+        with Catalog(catalog.path) as again:
+            assert again.count() == 1
+
+    def test_an_impossible_place(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("")
+        with pytest.raises(StorageError, match="cannot be used"):
+            Catalog(tmp_path / "file" / "catalog.sqlite")
+
+    def test_closed(self, catalog: Catalog) -> None:
+        catalog.close()
+        catalog.close()
+        with pytest.raises(StorageError, match="is closed"):
+            catalog.episodes()
+
+    def test_a_temporary_catalog_leaves_nothing(self) -> None:
+        with Catalog(None) as catalog:
+            put(catalog, rows=[row(0)])
+            folder = catalog.path.parent
+            assert folder.exists()
+        assert not folder.exists()
+
+
+WORKER = """
+import sys
+from pathlib import Path
+from tupli_mcap.storage.catalog import Catalog, EpisodeRow, RecordingStamp
+
+path, name = Path(sys.argv[1]), sys.argv[2]
+sys.stdin.readline()
+with Catalog(path) as catalog:
+    for n in range(10):
+        rows = [EpisodeRow(i, 0, 1, "terminal", 1.0, None, "", "", "[]", '{"a": %d}' % i) for i in range(20)]
+        catalog.put_recording(f"{name}-{n}", RecordingStamp(1, 2, 3), uuid=name, benchmark_id="b", rows=rows)
+        catalog.declare_key(f"metadata.score{n % 3}")
+        assert len(catalog.episodes()) >= 20
+"""
+
+
+class TestSharing:
+    def test_several_processes(self, tmp_path: Path) -> None:
+        path = tmp_path / "catalog.sqlite"
+        path.write_bytes(b"garbage, which all of them find")
+        command = [sys.executable, "-c", WORKER, str(path)]
+        workers = [subprocess.Popen([*command, str(n)], stdin=subprocess.PIPE, text=True) for n in range(4)]
+        for worker in workers:
+            assert worker.stdin is not None
+            worker.stdin.write("go\n")
+            worker.stdin.close()
+        assert [worker.wait(60) for worker in workers] == [0] * 4
+        with Catalog(path) as catalog:
+            assert len(catalog.recordings()) == 40
+            assert catalog.count() == 800
+            assert sorted(catalog.declared_keys()) == [f"metadata.score{n}" for n in range(3)]
+
+    def test_several_threads(self, catalog: Catalog) -> None:
+        errors: list[StorageError] = []
+
+        def work(name: int) -> None:
+            try:
+                for n in range(5):
+                    put(catalog, f"{name}-{n}", [row(i, {"n": i}) for i in range(20)])
+                    assert catalog.count(F("metadata.n") == 3) >= 1
+            except StorageError as err:
+                errors.append(err)
+
+        threads = [threading.Thread(target=work, args=(n,)) for n in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert not errors
+        assert catalog.count() == 400
+
+    @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+    def test_a_forked_child(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(0)])
+        child = os.fork()
+        if child == 0:  # nothing of pytest may run here
+            status = 1
+            try:
+                put(catalog, "child.mcap", [row(0)])
+                status = 0 if catalog.count() == 2 else 2
+            finally:
+                os._exit(status)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert sorted(catalog.recordings()) == ["a.mcap", "child.mcap"]
