@@ -409,6 +409,20 @@ def test_tuples_of_another_class(storage: FileStorage) -> None:
     assert seen[0].state == observation.tolist()  # the observation the action was chosen on
 
 
+def test_recording_options(storage: FileStorage) -> None:
+    env = TupliEnvWrapper(gym.make("FrozenLake-v1"), storage)
+    loaded = TupliEnvWrapper.load(storage, env.store(name="lake"), record_info=True, compression="lz4")
+    loaded.reset(seed=0)
+    _, _, _, _, info = loaded.step(1)
+    loaded.close()
+    (item,) = storage.list_episodes(include_tuples=True)
+    assert item.tuples[0].info == info  # type: ignore[union-attr]
+    with pytest.raises(
+        TypeError, match=r"expected recording options among record_info, .* found journal_dir"
+    ):
+        TupliEnvWrapper(gym.make("FrozenLake-v1"), storage, journal_dir="/tmp")
+
+
 def test_the_wrapper_changes_nothing_that_is_seen(storage: FileStorage) -> None:
     env = TupliEnvWrapper(gym.make("MountainCar-v0"), storage)
     env.store(name="car")

@@ -17,6 +17,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils import EzPickle
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tupli_mcap import trust
 from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture, record_environment
@@ -394,7 +396,26 @@ def test_defects_in_benchmark_json_are_format_errors() -> None:
         (changed(pickle=None), None, "found neither"),
         (changed(spec={"id": "CartPole-v1"}), record.pickle, "found both"),
         (changed(spec=3), record.pickle, "environment.spec"),
+        (changed(spec={"id": float("nan")}, pickle=None), None, "no strict JSON"),
     ]
     for data, beside, message in cases:
         with pytest.raises(FormatError, match=message):
             EnvironmentRecord.from_json(data, beside)
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=st.data())
+def test_a_damaged_document_is_the_right_one_or_a_format_error(data: st.DataObject) -> None:
+    good = bytearray(GOOD.to_json())
+    for _ in range(data.draw(st.integers(1, 3))):
+        good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        record = EnvironmentRecord.from_json(bytes(good), GOOD.pickle)
+    except FormatError:
+        return
+    assert record.digest == GOOD.digest
+
+
+GOOD = EnvironmentRecord(
+    "cart", spec={"id": "CartPole-v1", "kwargs": {"a": [1, 2.5, None]}}, versions={"python": "3"}
+)

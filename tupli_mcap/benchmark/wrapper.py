@@ -23,6 +23,16 @@ from tupli_mcap.wrappers import RecordEpisodes
 
 __all__ = ["DeletedBenchmark", "TupliEnvWrapper"]
 
+# Not `journal_dir`: a storage finds a recording that is being written by the journal beside it.
+_RECORDING_OPTIONS = (
+    "record_info",
+    "step_callback",
+    "reward_space",
+    "compression",
+    "chunk_size",
+    "flush_seconds",
+)
+
 
 class DeletedBenchmark(NamedTuple):
     """What `TupliEnvWrapper.delete` did.
@@ -50,6 +60,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         benchmark_id: the id of the benchmark that `env` was loaded from.
         metadata_callback: called with every recorded step; its last result becomes the episode's metadata.
         rl_tuple_cls: the class of the tuples that the callback is given. Recorded are the values themselves.
+        recording_options: for `RecordEpisodes`: record_info, step_callback, reward_space, compression,
+            chunk_size, flush_seconds.
 
     Subclasses that keep data outside of the environment override `_serialize` and `_deserialize`.
     Not thread-safe.
@@ -62,8 +74,16 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         benchmark_id: str | None = None,
         metadata_callback: EpisodeMetadataCallback | None = None,
         rl_tuple_cls: type[RLTuple] = RLTuple,
+        **recording_options: Any,
     ) -> None:
         super().__init__(env)
+        unknown = recording_options.keys() - set(_RECORDING_OPTIONS)
+        if unknown:
+            raise TypeError(
+                f"expected recording options among {', '.join(_RECORDING_OPTIONS)}, "
+                f"found {', '.join(sorted(unknown))}"
+            )
+        self._recording_options = recording_options
         self.storage = storage
         self.id = benchmark_id
         self.metadata_callback = metadata_callback
@@ -159,7 +179,12 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             # Where the file cannot go on (somebody else writes to it), another one is begun.
             with contextlib.suppress(RecordingError):
                 return RecordEpisodes(
-                    self._tap, self._path, metadata_callback=callback, mode="a", attachments={}
+                    self._tap,
+                    self._path,
+                    metadata_callback=callback,
+                    mode="a",
+                    attachments={},
+                    **self._recording_options,
                 )
         benchmark = self.storage.load_benchmark(self.id)
         self._path = self.storage.new_recording_path(self.id)
@@ -169,6 +194,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             metadata_callback=callback,
             benchmark_id=self.id,
             attachments=recording_attachments(benchmark.serialized),
+            **self._recording_options,
         )
 
     def _finish(self) -> None:
@@ -226,6 +252,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         rl_tuple_cls: type[RLTuple] = RLTuple,
         *,
         trust: bool = False,
+        **recording_options: Any,
     ) -> Self:
         """Rebuild a benchmark's environment and wrap it.
 
@@ -239,7 +266,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             )
         serialized = storage.load_benchmark(benchmark_id).serialized
         env = cls.deserialize_env(serialized, storage, trust=trust)
-        return cls(env, storage, benchmark_id, metadata_callback, rl_tuple_cls)
+        return cls(env, storage, benchmark_id, metadata_callback, rl_tuple_cls, **recording_options)
 
     def publish(self, publish_in: str = "global") -> None:
         """Note that a group may see the benchmark."""

@@ -156,9 +156,13 @@ class EnvironmentRecord:
             versions=environment.versions,
             benchmark=document.benchmark,
         )
-        if record.digest != environment.digest:
+        try:
+            found = record.digest
+        except (ValueError, RecursionError) as err:
+            raise FormatError(f"{where}: the environment's spec is no strict JSON: {err}") from err
+        if found != environment.digest:
             raise FormatError(
-                f"{where}: expected an environment with digest {environment.digest}, found {record.digest}"
+                f"{where}: expected an environment with digest {environment.digest}, found {found}"
             )
         return record
 
