@@ -509,7 +509,7 @@ class TestFileStorage(StorageContract):
             assert [h.id for h in other.list_episodes()] == [made.id]
         assert not (copy / "catalog.sqlite").exists()
 
-    def test_a_killed_recording_is_there(self, storage: FileStorage) -> None:
+    def test_a_killed_recording_is_there(self, storage: FileStorage, monkeypatch: pytest.MonkeyPatch) -> None:
         header = storage.store_benchmark(query())
         script = textwrap.dedent("""
             import os, sys, gymnasium as gym
@@ -525,6 +525,9 @@ class TestFileStorage(StorageContract):
         assert done.returncode == -signal.SIGKILL
         (item,) = storage.list_episodes(include_tuples=True)
         assert (item.n_tuples, item.end) == (5, "interrupted")
+        with monkeypatch.context() as patch:
+            patch.setattr(recordings, "Recording", None)  # a dead recording is read once
+            assert storage.count_episodes() == 1
         storage.delete_episode(item.id)
         assert list(storage.root.rglob("*.mcap*")) == []
 

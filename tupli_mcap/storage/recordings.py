@@ -24,6 +24,7 @@ from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles", "episode_id"]
 
+_LIVE = -1  # in place of a stamp that must not be believed next time
 _EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
 
 
@@ -188,9 +189,10 @@ class RecordingFiles:
             found = sorted(scan(self._root))
         changes: dict[str, Path | None] = dict.fromkeys(known.keys() - {item.relative for item in found})
         for item in found:
-            # A journal means: being written, or killed; what it holds is in no time stamp.
-            if item.journal or known.get(item.relative) != item.stamp:
-                changes[item.relative] = self._root / item.relative
+            path = self._root / item.relative
+            # What a live writer's journal holds is in no time stamp.
+            if known.get(item.relative) != item.stamp or (item.journal and is_locked(path)):
+                changes[item.relative] = path
         return changes
 
     def _try_to_put(self, relative: str, path: Path) -> None:
@@ -224,7 +226,7 @@ class RecordingFiles:
                 return len(recording)
             self._catalog.put_recording(
                 relative,
-                stamp,
+                stamp._replace(sidecar_mtime_ns=_LIVE) if live else stamp,
                 uuid=recording.uuid,
                 benchmark_id=recording.benchmark_id,
                 rows=catalog_rows(recording, sidecar, live=live),
