@@ -1,0 +1,437 @@
+"""`TupliDataset`: which episodes and steps, and the arrays they are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+import numpy as np
+
+from tupli_mcap.dataset import convert, display
+from tupli_mcap.dataset.columns import pick
+from tupli_mcap.dataset.episodes import EpisodeItems, items_of
+from tupli_mcap.dataset.loading import Selected, read_columns
+from tupli_mcap.dataset.parsers import BaseTupleParser, NumpyTupleParser, map_columns
+from tupli_mcap.dataset.selection import TupleFilter, selector_of
+from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
+from tupli_mcap.dataset.tuples import Tuples
+from tupli_mcap.errors import FilterError
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.schema import (
+    BaseFilter,
+    BenchmarkHeader,
+    EpisodeHeader,
+    EpisodeItem,
+    RLTuple,
+    check_keys,
+)
+from tupli_mcap.storage import TupliStorage
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["TupliDataset"]
+
+FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
+AnyFilter = TypeVar("AnyFilter", bound="BaseFilter | None")
+
+
+class TupliDataset:
+    """Episodes of a storage (or of files, see `from_files`), and the steps in them, as filters choose them.
+
+    A dataset reads when it is asked for something, and only what it is asked for. Its filters never change:
+    `with_benchmark_filter`, `with_episode_filter` and `with_tuple_filter` return another dataset with that
+    one filter replaced (None takes it away; combine conditions with `&` and `|`), which finds its episodes
+    itself.
+
+    The episodes are listed once, and everything the dataset says agrees with that list until `preview()` or
+    `load()` list them anew. Properties keep what they have read, as arrays that cannot be written to; the
+    `convert_to_…` methods give arrays that are the caller's own, and keep nothing that `load()` has not read
+    before.
+
+    A column is an array of shape (steps, ...) in the dtype that was recorded, a list of one value a step
+    where values differ in size (texts, graphs), or dicts and tuples of those, nested as the environment's
+    space is. Recordings may differ in dtype as long as one dtype holds the values of both exactly. Not
+    thread-safe.
+
+    Args:
+        storage: where the episodes are.
+        info: anything the user wants to keep with the dataset.
+    """
+
+    def __init__(self, storage: TupliStorage, info: dict[str, Any] | None = None) -> None:
+        self._setup(StorageSource(storage), info)
+
+    @classmethod
+    def from_files(
+        cls,
+        files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+        info: dict[str, Any] | None = None,
+    ) -> Self:
+        """A dataset of recordings in no storage: a path, a pattern ("runs/*.mcap"), a URL, or a list.
+
+        An episode that is in two of the files counts once, with a warning.
+
+        Raises:
+            RecordingError: there is no such file.
+        """
+        made = cls.__new__(cls)
+        made._setup(FilesSource(files), info)
+        return made
+
+    def _setup(self, source: Source, info: dict[str, Any] | None) -> None:
+        self.info = info
+        self._source = source
+        self._benchmark_filter: BaseFilter | None = None
+        self._episode_filter: BaseFilter | None = None
+        self._tuple_filter: TupleFilter | None = None
+        self._seed: int | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        self._random = np.random.default_rng(self._seed)
+        self._benchmarks: list[BenchmarkHeader] | None = None
+        self._headers: list[EpisodeHeader] | None = None
+        self._selected: Selected | None = None
+        self._columns: dict[str, Any] = {}
+        self._layout: StepLayout | None = None
+
+    @property
+    def storage(self) -> TupliStorage | None:
+        """The storage; None for a dataset of files."""
+        return self._source.storage if isinstance(self._source, StorageSource) else None
+
+    # --- filters ---
+
+    def with_benchmark_filter(self, filter: BaseFilter | None) -> Self:
+        """The dataset of benchmarks a filter over `BenchmarkHeader` fields is true of, in place of any such
+        filter.
+
+        Raises:
+            FilterError: the filter names an unknown field.
+        """
+        return self._with("_benchmark_filter", _checked(filter, BenchmarkHeader))
+
+    def with_episode_filter(self, filter: BaseFilter | None) -> Self:
+        """The dataset of episodes a filter over `EpisodeHeader` fields (`metadata.score`, `n_tuples`, `end`,
+        …) is true of, in place of any such filter.
+
+        Raises:
+            FilterError: the filter names an unknown field.
+        """
+        return self._with("_episode_filter", _checked(filter, EpisodeHeader))
+
+    def with_tuple_filter(self, filter: TupleFilter | None) -> Self:
+        """The dataset of steps a filter is true of, in place of any such filter.
+
+        Args:
+            filter: an expression over state, action, reward, terminal, timeout, info, next_state and step
+                (counted from 0 in each episode), such as `F("state.0") > 1`, which is evaluated on whole
+                columns; or a function of one `RLTuple` that returns True or False, called for every step.
+
+        Raises:
+            FilterError: it is neither, or names an unknown field.
+        """
+        if filter is not None:
+            selector_of(filter)
+        return self._with("_tuple_filter", filter)
+
+    def _with(self, name: str, filter: Any) -> Self:
+        made = type(self).__new__(type(self))
+        made.__dict__.update(self.__dict__)
+        setattr(made, name, filter)
+        made._forget()
+        return made
+
+    # --- looking and loading ---
+
+    def preview(self) -> list[EpisodeHeader]:
+        """The episodes, listed anew; no step is read."""
+        headers = self._source.episodes(self._benchmark_filter, self._episode_filter)
+        if self._headers is None or _identity(headers) != _identity(self._headers):
+            self._selected, self._layout = None, None
+            self._columns = {}
+        self._headers, self._benchmarks = headers, None
+        return list(headers)
+
+    def load(self) -> None:
+        """List the episodes anew and read their steps (states, actions, rewards, terminals, timeouts) into
+        memory.
+
+        Raises:
+            SpaceError: the steps of two recordings do not fit into one array; the message says which.
+        """
+        self.preview()
+        self._read(FIVE)
+
+    def _listed(self) -> list[EpisodeHeader]:
+        if self._headers is None:
+            self.preview()
+        return self._headers or []
+
+    def _read(self, fields: Sequence[str], *, keep: bool = True) -> dict[str, Any]:
+        """Columns by field: kept ones (read-only), and others that are kept only if asked."""
+        missing = [field for field in fields if field not in self._columns]
+        found: dict[str, Any] = {}
+        if missing:
+            selector = None if self._tuple_filter is None else selector_of(self._tuple_filter)
+            found, self._selected, layout = read_columns(
+                self._source, self._listed(), missing, selector, self._selected
+            )
+            self._layout = layout or self._layout
+        if keep:
+            self._columns.update({field: map_columns(_frozen, column) for field, column in found.items()})
+            return {field: self._columns[field] for field in fields}
+        return {field: found[field] if field in found else self._columns[field] for field in fields}
+
+    def _own(self, fields: Sequence[str]) -> dict[str, Any]:
+        """Columns that are the caller's own."""
+        kept = set(self._columns)
+        columns = self._read(fields, keep=False)
+        return {
+            field: pick(column, slice(None)) if field in kept else column for field, column in columns.items()
+        }
+
+    def _choice(self) -> Selected:
+        if self._selected is None:
+            self._read(["terminals"])
+        if self._selected is None:
+            raise AssertionError("reading says which steps are selected")
+        return self._selected
+
+    # --- what is in it ---
+
+    @property
+    def benchmarks(self) -> list[BenchmarkHeader]:
+        """The benchmarks the benchmark filter is true of."""
+        if self._benchmarks is None:
+            self._benchmarks = self._source.benchmarks(self._benchmark_filter)
+        return list(self._benchmarks)
+
+    @property
+    def episodes(self) -> Sequence[EpisodeItem]:
+        """The episodes with those of their steps that the tuple filter is true of; each is made when it is
+        asked for.
+
+        Steps are read at the first access to an item. Use `preview()` for facts about episodes only.
+        """
+        headers = self._listed()
+        return EpisodeItems(headers, self._episode_columns)
+
+    def _episode_columns(self) -> tuple[dict[str, Any], np.ndarray[Any, Any], StepLayout | None]:
+        columns = self._read((*FIVE, "infos"))
+        return columns, self._choice().lengths, self._layout
+
+    @property
+    def tuples(self) -> Sequence[RLTuple]:
+        """The steps; each is made when it is asked for."""
+        return Tuples(self._read((*FIVE, "infos")), self._layout)
+
+    @property
+    def observations(self) -> Any:
+        """The state of each step, the observation its action was chosen on: a read-only column."""
+        return self._read(["states"])["states"]
+
+    @property
+    def next_states(self) -> Any:
+        """The state after each step, never one of another episode: a read-only column.
+
+        Where it was not recorded (the last step of an episode built by hand), the step's own state.
+        """
+        return self._read(["next_states"])["next_states"]
+
+    @property
+    def actions(self) -> Any:
+        """The action of each step: a read-only column."""
+        return self._read(["actions"])["actions"]
+
+    @property
+    def rewards(self) -> Any:
+        """The reward of each step: a read-only column, float64 unless the rewards have a space of their
+        own."""
+        return self._read(["rewards"])["rewards"]
+
+    @property
+    def terminals(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Whether the environment ended with the step (read-only, of bools)."""
+        found: np.ndarray[Any, np.dtype[np.bool_]] = self._read(["terminals"])["terminals"]
+        return found
+
+    @property
+    def timeouts(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Whether the episode was truncated with the step, as it was recorded (read-only, of bools)."""
+        found: np.ndarray[Any, np.dtype[np.bool_]] = self._read(["timeouts"])["timeouts"]
+        return found
+
+    @property
+    def infos(self) -> list[dict[str, Any]]:
+        """The info of each step; empty where none was recorded."""
+        return list(self._read(["infos"])["infos"])
+
+    def __len__(self) -> int:
+        """The number of steps, after all filters; with a tuple filter, this evaluates it."""
+        if self._tuple_filter is None:
+            return sum(header.n_tuples for header in self._listed())
+        return self._choice().steps
+
+    def __iter__(self) -> Iterator[RLTuple]:
+        return iter(self.tuples)
+
+    # --- conversions ---
+
+    def convert_to_numpy(self, *, mark_cuts: bool = True) -> tuple[Any, Any, Any, Any, Any]:
+        """States, actions, rewards, terminals and timeouts as columns of NumPy arrays; they are the caller's
+        own.
+
+        Args:
+            mark_cuts: also set the timeout of a step that is followed by anything else than its own episode's
+                next step: the last one of an interrupted episode, or the one before steps that a tuple filter
+                left out. Learners that find episodes by their flags (d3rlpy, D4RL) would join two episodes
+                otherwise. False gives the flags as they were recorded.
+        """
+        columns = self._own(FIVE)
+        if mark_cuts:
+            convert.mark_cuts(columns, self._choice())
+        return (
+            columns["states"],
+            columns["actions"],
+            columns["rewards"],
+            columns["terminals"],
+            columns["timeouts"],
+        )
+
+    def convert_to_tensors(
+        self, parser: type[BaseTupleParser] = NumpyTupleParser, *, mark_cuts: bool = True
+    ) -> tuple[Any, ...]:
+        """What a parser makes of the five columns of `convert_to_numpy`.
+
+        Raises:
+            MissingExtraError: the library the parser needs is not installed.
+        """
+        return parser.parse_lists(*self.convert_to_numpy(mark_cuts=mark_cuts))
+
+    def convert_to_d4rl_format(self, *, mark_cuts: bool = True) -> dict[str, Any]:
+        """Columns named as in D4RL: observations, actions, next_observations, rewards, terminals, timeouts.
+
+        `next_observations` are `next_states`; `terminals` are true terminals only. `mark_cuts` is that of
+        `convert_to_numpy`.
+        """
+        columns = self._own((*FIVE, "next_states"))
+        if mark_cuts:
+            convert.mark_cuts(columns, self._choice())
+        return {name: columns[field] for name, field in convert.D4RL_NAMES.items()}
+
+    def convert_to_dataframe(self) -> pd.DataFrame:
+        """A pandas DataFrame with a row a step: the episode (its place in `preview()`), the step (from 0 in
+        its episode), and the columns of `convert_to_d4rl_format`, flags as they were recorded.
+
+        Columns of numbers keep their dtype; a value of several numbers is one object in its cell.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        convert.import_pandas()
+        columns = self._own((*FIVE, "next_states", "steps"))
+        return convert.dataframe(columns, self._choice())
+
+    # --- batches and samples ---
+
+    def set_seed(self, seed: int | None) -> None:
+        """Seed what `as_batch_generator` and `sample_episodes` draw; no other randomness is touched.
+
+        Datasets derived from this one by filters start from the same seed. None is a seed of the system's.
+
+        Raises:
+            DatasetError: it is no integer from 0.
+        """
+        if seed is not None and (
+            isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0
+        ):
+            raise DatasetError(f"expected a seed that is an integer from 0, found {seed!r:.80}")
+        self._seed = None if seed is None else int(seed)
+        self._random = np.random.default_rng(self._seed)
+
+    def as_batch_generator(
+        self, batch_size: int, shuffle: bool = False, parser: type[BaseTupleParser] | None = None
+    ) -> Iterator[Any]:
+        """Batches of `batch_size` steps, the last one as long as is left; the steps are loaded first.
+
+        Args:
+            shuffle: in an order drawn anew each time, see `set_seed`.
+            parser: makes five columns of each batch; without one, a batch is a list of `RLTuple`.
+
+        Raises:
+            DatasetError: the batch size is no integer from 1.
+        """
+        size = _count(batch_size, 1, "a batch size")
+        fields = FIVE if parser else (*FIVE, "infos")
+        columns = self._read(fields)
+        order = self._random.permutation(len(columns["terminals"])) if shuffle else None
+        return convert.batches(columns, self._layout, size, order, parser)
+
+    def sample_episodes(self, n_samples: int) -> list[EpisodeItem]:
+        """Up to `n_samples` different episodes, drawn at random, with all their steps: the tuple filter is
+        for steps.
+
+        Only their steps are read. See `set_seed`.
+
+        Raises:
+            DatasetError: the number is no integer from 0.
+        """
+        headers = self._listed()
+        n = min(_count(n_samples, 0, "a number of episodes"), len(headers))
+        drawn = self._random.choice(len(headers), n, replace=False)
+        in_order = np.sort(drawn)
+        chosen = [headers[i] for i in in_order]
+        columns, selected, layout = read_columns(self._source, chosen, (*FIVE, "infos"))
+        items = items_of(chosen, columns, selected.lengths, layout)
+        return [items[i] for i in np.searchsorted(in_order, drawn)]
+
+    # --- display ---
+
+    def _facts(self) -> display.Facts:
+        return display.Facts(
+            repr(self._source),
+            self._headers,
+            None if self._selected is None else self._selected.steps,
+            {
+                "benchmarks": self._benchmark_filter,
+                "episodes": self._episode_filter,
+                "tuples": self._tuple_filter,
+            },
+        )
+
+    def __repr__(self) -> str:
+        return display.text(type(self).__name__, self._facts())
+
+    def _repr_html_(self) -> str:
+        self._listed()
+        return display.html(type(self).__name__, self._facts())
+
+
+def _checked(filter: AnyFilter, model: type[BenchmarkHeader] | type[EpisodeHeader]) -> AnyFilter:
+    if filter is None:
+        return filter
+    if not isinstance(filter, BaseFilter):
+        raise FilterError(
+            f"expected a filter, such as FilterEQ(key=..., value=...) or F(...) > 3, found {filter!r:.80}"
+        )
+    check_keys(filter, model)
+    return filter
+
+
+def _count(value: int, least: int, what: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise DatasetError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
+    return int(value)
+
+
+def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
+    """What the columns of some episodes depend on."""
+    return [(header.id, header.n_tuples, header.recording) for header in headers]
+
+
+def _frozen(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,60 @@
+"""A progress bar on stderr for work that takes longer than a second."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import Any
+
+__all__ = ["Progress", "progress"]
+
+_PATIENCE = 1.0  # seconds without a bar
+
+
+class Progress:
+    """Counts steps; shows a bar once it is worth it, where somebody can see it."""
+
+    def __init__(self, total: int, what: str) -> None:
+        self._total = total
+        self._what = what
+        self._done = 0
+        self._started = time.monotonic()
+        self._bar: Any = None
+        self._task: Any = None
+
+    def advance(self, steps: int) -> None:
+        """`steps` more are done."""
+        self._done += steps
+        if self._bar is None:
+            if time.monotonic() - self._started < _PATIENCE or not _visible():
+                return
+            from rich.console import Console
+            from rich.progress import Progress as Bar
+
+            self._bar = Bar(console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task(self._what, total=self._total)
+            self._bar.start()
+        self._bar.update(self._task, completed=self._done)
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+
+@contextmanager
+def progress(total: int, what: str) -> Iterator[Progress]:
+    """A `Progress` that is gone when the block ends."""
+    shown = Progress(total, what)
+    try:
+        yield shown
+    finally:
+        shown.close()
+
+
+def _visible() -> bool:
+    # In a notebook, rich needs ipywidgets; without them it would print a warning instead of a bar.
+    in_notebook = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
+    return in_notebook or sys.stderr.isatty()

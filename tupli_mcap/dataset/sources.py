@@ -1,0 +1,215 @@
+"""Where a dataset's episodes come from: a storage, or files."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import os
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+from pydantic import ValidationError
+
+from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.recording import Recording
+from tupli_mcap.schema import (
+    BaseFilter,
+    BenchmarkHeader,
+    BenchmarkMetadata,
+    EpisodeHeader,
+    FilterIN,
+    compile_predicate,
+)
+from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage.sidecar import Sidecar
+
+__all__ = ["DatasetError", "FilesSource", "Source", "StorageSource"]
+
+_ENDS = ("terminal", "timeout", "interrupted")
+_HEADER_FIELDS = set(EpisodeHeader.model_fields)
+
+
+class DatasetError(TupliError, ValueError):
+    """A dataset was asked for something that has no meaning: batches of no steps, a negative seed."""
+
+
+class Source(Protocol):
+    """Lists episodes and opens the recordings they lie in."""
+
+    def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]: ...
+
+    def episodes(
+        self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None
+    ) -> list[EpisodeHeader]:
+        """The episodes both filters are true of; those of one recording follow each other."""
+        ...
+
+    def open(self, recording: str) -> Recording:
+        """The recording that a header names; the caller closes it."""
+        ...
+
+
+class StorageSource:
+    """The episodes of a storage."""
+
+    def __init__(self, storage: TupliStorage) -> None:
+        self.storage = storage
+
+    def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
+        return self.storage.list_benchmarks(filter)
+
+    def episodes(
+        self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None
+    ) -> list[EpisodeHeader]:
+        wanted = episode_filter
+        if benchmark_filter is not None:
+            ids = [header.id for header in self.benchmarks(benchmark_filter)]
+            wanted = FilterIN(key="benchmark_id", value=ids)
+            if episode_filter is not None:
+                wanted = wanted & episode_filter
+        return cast("list[EpisodeHeader]", self.storage.list_episodes(wanted))
+
+    def open(self, recording: str) -> Recording:
+        return self.storage.open_recording(recording)
+
+    def __repr__(self) -> str:
+        return repr(self.storage)
+
+
+class FilesSource:
+    """The episodes of recordings given by path or URL. Episodes a storage has deleted stay out.
+
+    Args:
+        files: a path, a pattern ("runs/*.mcap", "**" for any depth), a URL, or several of those; a pattern's
+            files are taken in the order of their names.
+
+    Raises:
+        RecordingError: nothing was given, a pattern matches nothing, or a path does not exist.
+    """
+
+    def __init__(self, files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> None:
+        given = [files] if isinstance(files, str | os.PathLike) else list(files)
+        names = [name for item in given for name in _expand(item)]
+        if not names:
+            raise RecordingError(
+                "expected at least one recording, found an empty list; give paths or a pattern"
+            )
+        self.names = list(dict.fromkeys(names))
+
+    def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
+        matches = compile_predicate(filter, BenchmarkHeader)
+        found: dict[tuple[str, str], BenchmarkHeader] = {}
+        for name in self.names:
+            with Recording(name) as recording:
+                header = _benchmark_header(recording)
+            if matches(header):
+                found.setdefault((header.id, header.metadata.name), header)
+        return list(found.values())
+
+    def episodes(
+        self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None
+    ) -> list[EpisodeHeader]:
+        of_benchmark = compile_predicate(benchmark_filter, BenchmarkHeader)
+        matches = compile_predicate(episode_filter, EpisodeHeader)
+        files: dict[str, str] = {}  # episode id -> file
+        found: list[EpisodeHeader] = []
+        for name in self.names:
+            with Recording(name) as recording:
+                if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
+                    continue
+                headers = list(_episode_headers(recording, name))
+            copies = [header for header in headers if header.id in files]
+            if copies:
+                warnings.warn(
+                    f"{name} holds {len(copies)} episodes of {files[copies[0].id]} again; they are left out",
+                    stacklevel=2,
+                )
+            new = [header for header in headers if header.id not in files]
+            files.update((header.id, name) for header in new)
+            found += [header for header in new if episode_filter is None or matches(header)]
+        return found
+
+    def open(self, recording: str) -> Recording:
+        return Recording(recording)
+
+    def __repr__(self) -> str:
+        return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} files"
+
+
+def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
+    if not isinstance(item, str | os.PathLike):
+        raise RecordingError(f"expected the path of a recording or a pattern, found {item!r:.80}")
+    name = os.fspath(item)
+    if "://" in name:
+        return [name]
+    path = Path(name).expanduser()
+    if path.is_dir():
+        raise RecordingError(
+            f"{name} is a directory; give a pattern such as {str(path / '*.mcap')!r}, or open a storage with "
+            f"TupliDataset(FileStorage({name!r}))"
+        )
+    if path.exists():
+        return [str(path)]
+    matches = sorted(glob.glob(str(path), recursive=True))  # noqa: PTH207 - Path.glob takes no absolute pattern
+    files = [match for match in matches if not Path(match).is_dir()]
+    if not files:
+        what = "no file matches" if glob.has_magic(name) else "there is no file"
+        raise RecordingError(f"{what} {name!r}; give the path of a recording (.mcap)")
+    return files
+
+
+def _episode_headers(recording: Recording, name: str) -> Iterator[EpisodeHeader]:
+    """Headers as a storage would list them; `recording` of each is the name the file was opened by."""
+    deleted = set() if recording.path is None else Sidecar.read(recording.path).deleted
+    index = recording.index
+    times = np.datetime_as_string(index["end_time"].astype("datetime64[ns]"), unit="us", casting="unsafe")
+    columns: list[Any] = [
+        index[field].tolist() for field in ("episode", "env", "length", "end", "return", "has_seed", "seed")
+    ]
+    for number, env, length, end, total, has_seed, seed, time, metadata in zip(
+        *columns, times.tolist(), recording.all_metadata(), strict=True
+    ):
+        if number in deleted:
+            continue
+        # Built without validation, which would cost more than all the rest.
+        yield EpisodeHeader.model_construct(
+            _HEADER_FIELDS,
+            id=f"{recording.uuid}-{number}",
+            created_by="",
+            published_in=[],
+            created_at=f"{time}+00:00",
+            benchmark_id=recording.benchmark_id,
+            metadata={} if metadata == "{}" else jsonvalue.loads(metadata),
+            n_tuples=length,
+            terminated=_ENDS[end] == "terminal",
+            timeout=_ENDS[end] == "timeout",
+            end=_ENDS[end],
+            episode_return=total,
+            seed=seed if has_seed else None,
+            env=env,
+            episode=number,
+            recording=name,
+        )
+
+
+def _benchmark_header(recording: Recording) -> BenchmarkHeader:
+    """What a recording says of its benchmark; without one, the id is empty."""
+    metadata = BenchmarkMetadata(name="")
+    if "benchmark.json" in recording.attachments:
+        record = recording.benchmark.record
+        metadata = BenchmarkMetadata(name=record.name)
+        told = (record.benchmark or {}).get("metadata")
+        if isinstance(told, dict):
+            with contextlib.suppress(ValidationError):  # somebody else's words
+                metadata = BenchmarkMetadata.model_validate(told)
+    return BenchmarkHeader(
+        id=recording.benchmark_id,
+        created_by="",
+        created_at=f"{np.datetime64(recording.created_ns // 1000, 'us')}+00:00",
+        hash=recording.benchmark_id,
+        metadata=metadata,
+    )
