@@ -451,7 +451,7 @@ class TestConstruction:
             (lambda: F('a."x') == 1, "needs a name at character 2"),
             (lambda: F('a."x"y') == 1, "needs a dot or its end at character 5"),
             (lambda: F(r'a."\x"') == 1, "not a JSON string"),
-            (lambda: nested(101), "nest at most 100 deep"),
+            (lambda: nested(33), "nest at most 32 deep"),
             (lambda: bool(F("a") == 1), "no truth value"),
             (lambda: 1 < F("a") < 3, "no truth value"),
         ],
@@ -515,8 +515,8 @@ class TestParser:
             ("and = 1", "needs a key .* at character 0, found 'and'"),
             ("a = 'x", "at character 4"),
             ("a = " + "9" * 5000, "a shorter number at character 4"),
-            ("(" * 10_000 + "a = 1" + ")" * 10_000, "nests deeper than 50 at character 51"),
-            ("not " * 10_000 + "a = 1", "nests deeper than 50"),
+            ("(" * 10_000 + "a = 1" + ")" * 10_000, "nests deeper than 64 at character 65"),
+            ("not " * 10_000 + "a = 1", "nests deeper than 64"),
         ],
     )
     def test_errors_say_where(self, text: str, message: str) -> None:

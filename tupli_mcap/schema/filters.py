@@ -58,7 +58,7 @@ class FilterType(StrEnum):
 
 COMBINING: Final = frozenset({FilterType.AND, FilterType.OR, FilterType.NOT})
 ORDERING: Final = frozenset({FilterType.GT, FilterType.GEQ, FilterType.LT, FilterType.LEQ})
-MAX_DEPTH: Final = 100
+MAX_DEPTH: Final = 32
 _MAX_INT_BITS: Final = 13_000  # Python neither writes nor reads decimal integers much longer
 
 _SYMBOL: Final[Mapping[FilterType, str]] = {

@@ -21,7 +21,6 @@ from typing import Any, Final, NamedTuple
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.filters import (
-    MAX_DEPTH,
     BaseFilter,
     FilterAND,
     FilterEQ,
@@ -38,6 +37,7 @@ from tupli_mcap.schema.filters import (
 )
 from tupli_mcap.schema.values import tag_float
 
+_MAX_PARENTHESES: Final = 64
 _TOKEN: Final = re.compile(
     r"""\s*(?:
       (?P<number>[-+]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|inf\b|nan\b))
@@ -124,8 +124,10 @@ class _Parser:
         return parts[0] if len(parts) == 1 else FilterAND(filters=parts)
 
     def _negation(self, depth: int) -> BaseFilter:
-        if depth > MAX_DEPTH // 2:
-            raise FilterError(f"filter nests deeper than {MAX_DEPTH // 2} at character {self._next.position}")
+        if depth > _MAX_PARENTHESES:
+            raise FilterError(
+                f"filter nests deeper than {_MAX_PARENTHESES} at character {self._next.position}"
+            )
         if self._next.says("not"):
             self._take()
             return FilterNOT(filters=[self._negation(depth + 1)])

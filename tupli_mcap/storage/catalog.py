@@ -119,7 +119,7 @@ class Catalog:
             (number,) = added.inserted_primary_key or (0,)
             chunk = first
             while chunk:
-                connection.exec_driver_sql(_INSERT, [tuple(store_row(number, row)) for row in chunk])
+                connection.exec_driver_sql(_INSERT, [store_row(number, row) for row in chunk])
                 chunk = list(itertools.islice(remaining, _ROWS_AT_ONCE))
 
     def remove_recording(self, relpath: str) -> None:
