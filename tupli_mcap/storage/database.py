@@ -20,6 +20,7 @@ from tupli_mcap.storage.sqlite import register_functions
 from tupli_mcap.storage.tables import APPLICATION_ID, METADATA, VERSION
 
 _BUSY_MS: Final = 30_000
+_CACHE_KIB: Final = 32 * 1024  # rows come in no order of a declared key: its index has to stay in memory
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _TOO_LARGE: Final = ("too many SQL variables", "Expression tree is too large", "parser stack overflow")
 
@@ -130,6 +131,7 @@ def _engine(path: Path) -> Engine:
         connection.isolation_level = None  # transactions are begun below
         connection.execute(f"PRAGMA busy_timeout = {_BUSY_MS}")
         connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
         register_functions(connection)
 
     @event.listens_for(engine, "begin")
