@@ -462,6 +462,10 @@ def test_flush_in_any_state(tmp_path: Path) -> None:
             state, _ = env.reset(seed=seed)
             env.flush()
             env.flush()
+            if seed % 2:
+                env.reset(seed=99)
+                env.flush()
+                state, _ = env.reset(seed=seed)
             for _ in range(3):
                 after, reward, terminal, timeout, _ = env.step(0)
                 taken.append((state, np.int64(0), reward, terminal, timeout, after))

@@ -110,7 +110,7 @@ def pick(column: Any, rows: Any) -> Any:
         if isinstance(rows, slice):
             return column[rows]
         return [column[i] for i in (np.flatnonzero(rows) if rows.dtype == np.bool_ else rows)]
-    return np.array(column[rows])
+    return column[rows].copy() if isinstance(rows, slice) else column[rows]
 
 
 def check_layouts(first: StepLayout, first_name: str, other: StepLayout, other_name: str) -> None:

@@ -4,28 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from tupli_mcap.dataset import convert, display
-from tupli_mcap.dataset.columns import pick
 from tupli_mcap.dataset.episodes import EpisodeItems, items_of
-from tupli_mcap.dataset.loading import Selected, read_columns
-from tupli_mcap.dataset.parsers import BaseTupleParser, NumpyTupleParser, map_columns
-from tupli_mcap.dataset.selection import TupleFilter, selector_of
+from tupli_mcap.dataset.loading import read_columns
+from tupli_mcap.dataset.parsers import BaseTupleParser, NumpyTupleParser
+from tupli_mcap.dataset.query import Query
+from tupli_mcap.dataset.selection import TupleFilter
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
 from tupli_mcap.dataset.tuples import Tuples
-from tupli_mcap.errors import FilterError
-from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.schema import (
-    BaseFilter,
-    BenchmarkHeader,
-    EpisodeHeader,
-    EpisodeItem,
-    RLTuple,
-    check_keys,
-)
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage import TupliStorage
 
 if TYPE_CHECKING:
@@ -34,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["TupliDataset"]
 
 FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
-AnyFilter = TypeVar("AnyFilter", bound="BaseFilter | None")
+SIX = (*FIVE, "infos")
 
 
 class TupliDataset:
@@ -61,6 +52,11 @@ class TupliDataset:
     """
 
     def __init__(self, storage: TupliStorage, info: dict[str, Any] | None = None) -> None:
+        if not isinstance(storage, TupliStorage):
+            raise DatasetError(
+                f"expected a storage, such as FileStorage('lab'), found {storage!r:.80}; recordings that are in no "
+                "storage are opened with TupliDataset.from_files(...)"
+            )
         self._setup(StorageSource(storage), info)
 
     @classmethod
@@ -82,25 +78,14 @@ class TupliDataset:
 
     def _setup(self, source: Source, info: dict[str, Any] | None) -> None:
         self.info = info
-        self._source = source
-        self._benchmark_filter: BaseFilter | None = None
-        self._episode_filter: BaseFilter | None = None
-        self._tuple_filter: TupleFilter | None = None
-        self._seed: int | None = None
-        self._forget()
-
-    def _forget(self) -> None:
-        self._random = np.random.default_rng(self._seed)
-        self._benchmarks: list[BenchmarkHeader] | None = None
-        self._headers: list[EpisodeHeader] | None = None
-        self._selected: Selected | None = None
-        self._columns: dict[str, Any] = {}
-        self._layout: StepLayout | None = None
+        self._query = Query(source)
+        self.set_seed(None)
 
     @property
     def storage(self) -> TupliStorage | None:
         """The storage; None for a dataset of files."""
-        return self._source.storage if isinstance(self._source, StorageSource) else None
+        source = self._query.source
+        return source.storage if isinstance(source, StorageSource) else None
 
     # --- filters ---
 
@@ -111,7 +96,7 @@ class TupliDataset:
         Raises:
             FilterError: the filter names an unknown field.
         """
-        return self._with("_benchmark_filter", _checked(filter, BenchmarkHeader))
+        return self._with(benchmark_filter=filter)
 
     def with_episode_filter(self, filter: BaseFilter | None) -> Self:
         """The dataset of episodes a filter over `EpisodeHeader` fields (`metadata.score`, `n_tuples`, `end`,
@@ -120,7 +105,7 @@ class TupliDataset:
         Raises:
             FilterError: the filter names an unknown field.
         """
-        return self._with("_episode_filter", _checked(filter, EpisodeHeader))
+        return self._with(episode_filter=filter)
 
     def with_tuple_filter(self, filter: TupleFilter | None) -> Self:
         """The dataset of steps a filter is true of, in place of any such filter.
@@ -133,27 +118,20 @@ class TupliDataset:
         Raises:
             FilterError: it is neither, or names an unknown field.
         """
-        if filter is not None:
-            selector_of(filter)
-        return self._with("_tuple_filter", filter)
+        return self._with(tuple_filter=filter)
 
-    def _with(self, name: str, filter: Any) -> Self:
+    def _with(self, **filters: Any) -> Self:
         made = type(self).__new__(type(self))
         made.__dict__.update(self.__dict__)
-        setattr(made, name, filter)
-        made._forget()
+        made._query = self._query.with_filters(**filters)
+        made.set_seed(self._seed)
         return made
 
     # --- looking and loading ---
 
     def preview(self) -> list[EpisodeHeader]:
         """The episodes, listed anew; no step is read."""
-        headers = self._source.episodes(self._benchmark_filter, self._episode_filter)
-        if self._headers is None or _identity(headers) != _identity(self._headers):
-            self._selected, self._layout = None, None
-            self._columns = {}
-        self._headers, self._benchmarks = headers, None
-        return list(headers)
+        return list(self._query.refresh())
 
     def load(self) -> None:
         """List the episodes anew and read their steps (states, actions, rewards, terminals, timeouts) into
@@ -162,52 +140,15 @@ class TupliDataset:
         Raises:
             SpaceError: the steps of two recordings do not fit into one array; the message says which.
         """
-        self.preview()
-        self._read(FIVE)
-
-    def _listed(self) -> list[EpisodeHeader]:
-        if self._headers is None:
-            self.preview()
-        return self._headers or []
-
-    def _read(self, fields: Sequence[str], *, keep: bool = True) -> dict[str, Any]:
-        """Columns by field: kept ones (read-only), and others that are kept only if asked."""
-        missing = [field for field in fields if field not in self._columns]
-        found: dict[str, Any] = {}
-        if missing:
-            selector = None if self._tuple_filter is None else selector_of(self._tuple_filter)
-            found, self._selected, layout = read_columns(
-                self._source, self._listed(), missing, selector, self._selected
-            )
-            self._layout = layout or self._layout
-        if keep:
-            self._columns.update({field: map_columns(_frozen, column) for field, column in found.items()})
-            return {field: self._columns[field] for field in fields}
-        return {field: found[field] if field in found else self._columns[field] for field in fields}
-
-    def _own(self, fields: Sequence[str]) -> dict[str, Any]:
-        """Columns that are the caller's own."""
-        kept = set(self._columns)
-        columns = self._read(fields, keep=False)
-        return {
-            field: pick(column, slice(None)) if field in kept else column for field, column in columns.items()
-        }
-
-    def _choice(self) -> Selected:
-        if self._selected is None:
-            self._read(["terminals"])
-        if self._selected is None:
-            raise AssertionError("reading says which steps are selected")
-        return self._selected
+        self._query.refresh()
+        self._query.read(FIVE)
 
     # --- what is in it ---
 
     @property
     def benchmarks(self) -> list[BenchmarkHeader]:
         """The benchmarks the benchmark filter is true of."""
-        if self._benchmarks is None:
-            self._benchmarks = self._source.benchmarks(self._benchmark_filter)
-        return list(self._benchmarks)
+        return list(self._query.benchmarks)
 
     @property
     def episodes(self) -> Sequence[EpisodeItem]:
@@ -216,22 +157,18 @@ class TupliDataset:
 
         Steps are read at the first access to an item. Use `preview()` for facts about episodes only.
         """
-        headers = self._listed()
-        return EpisodeItems(headers, self._episode_columns)
-
-    def _episode_columns(self) -> tuple[dict[str, Any], np.ndarray[Any, Any], StepLayout | None]:
-        columns = self._read((*FIVE, "infos"))
-        return columns, self._choice().lengths, self._layout
+        query = self._query
+        return EpisodeItems(query.headers, lambda: (query.read(SIX), query.selected.lengths, query.layout))
 
     @property
     def tuples(self) -> Sequence[RLTuple]:
         """The steps; each is made when it is asked for."""
-        return Tuples(self._read((*FIVE, "infos")), self._layout)
+        return Tuples(self._query.read(SIX), self._query.layout)
 
     @property
     def observations(self) -> Any:
         """The state of each step, the observation its action was chosen on: a read-only column."""
-        return self._read(["states"])["states"]
+        return self._query.read(["states"])["states"]
 
     @property
     def next_states(self) -> Any:
@@ -239,41 +176,41 @@ class TupliDataset:
 
         Where it was not recorded (the last step of an episode built by hand), the step's own state.
         """
-        return self._read(["next_states"])["next_states"]
+        return self._query.read(["next_states"])["next_states"]
 
     @property
     def actions(self) -> Any:
         """The action of each step: a read-only column."""
-        return self._read(["actions"])["actions"]
+        return self._query.read(["actions"])["actions"]
 
     @property
     def rewards(self) -> Any:
         """The reward of each step: a read-only column, float64 unless the rewards have a space of their
         own."""
-        return self._read(["rewards"])["rewards"]
+        return self._query.read(["rewards"])["rewards"]
 
     @property
     def terminals(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """Whether the environment ended with the step (read-only, of bools)."""
-        found: np.ndarray[Any, np.dtype[np.bool_]] = self._read(["terminals"])["terminals"]
+        found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["terminals"])["terminals"]
         return found
 
     @property
     def timeouts(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """Whether the episode was truncated with the step, as it was recorded (read-only, of bools)."""
-        found: np.ndarray[Any, np.dtype[np.bool_]] = self._read(["timeouts"])["timeouts"]
+        found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["timeouts"])["timeouts"]
         return found
 
     @property
     def infos(self) -> list[dict[str, Any]]:
         """The info of each step; empty where none was recorded."""
-        return list(self._read(["infos"])["infos"])
+        return list(self._query.read(["infos"])["infos"])
 
     def __len__(self) -> int:
         """The number of steps, after all filters; with a tuple filter, this evaluates it."""
-        if self._tuple_filter is None:
-            return sum(header.n_tuples for header in self._listed())
-        return self._choice().steps
+        if self._query.tuple_filter is None:
+            return sum(header.n_tuples for header in self._query.headers)
+        return self._query.selected.steps
 
     def __iter__(self) -> Iterator[RLTuple]:
         return iter(self.tuples)
@@ -290,9 +227,9 @@ class TupliDataset:
                 left out. Learners that find episodes by their flags (d3rlpy, D4RL) would join two episodes
                 otherwise. False gives the flags as they were recorded.
         """
-        columns = self._own(FIVE)
+        columns = self._query.own(FIVE)
         if mark_cuts:
-            convert.mark_cuts(columns, self._choice())
+            convert.mark_cuts(columns, self._query.selected)
         return (
             columns["states"],
             columns["actions"],
@@ -317,9 +254,9 @@ class TupliDataset:
         `next_observations` are `next_states`; `terminals` are true terminals only. `mark_cuts` is that of
         `convert_to_numpy`.
         """
-        columns = self._own((*FIVE, "next_states"))
+        columns = self._query.own((*FIVE, "next_states"))
         if mark_cuts:
-            convert.mark_cuts(columns, self._choice())
+            convert.mark_cuts(columns, self._query.selected)
         return {name: columns[field] for name, field in convert.D4RL_NAMES.items()}
 
     def convert_to_dataframe(self) -> pd.DataFrame:
@@ -332,8 +269,8 @@ class TupliDataset:
             MissingExtraError: pandas is not installed.
         """
         convert.import_pandas()
-        columns = self._own((*FIVE, "next_states", "steps"))
-        return convert.dataframe(columns, self._choice())
+        columns = self._query.own((*FIVE, "next_states", "steps"))
+        return convert.dataframe(columns, self._query.selected)
 
     # --- batches and samples ---
 
@@ -365,10 +302,9 @@ class TupliDataset:
             DatasetError: the batch size is no integer from 1.
         """
         size = _count(batch_size, 1, "a batch size")
-        fields = FIVE if parser else (*FIVE, "infos")
-        columns = self._read(fields)
+        columns = self._query.read(FIVE if parser else SIX)
         order = self._random.permutation(len(columns["terminals"])) if shuffle else None
-        return convert.batches(columns, self._layout, size, order, parser)
+        return convert.batches(columns, self._query.layout, size, order, parser)
 
     def sample_episodes(self, n_samples: int) -> list[EpisodeItem]:
         """Up to `n_samples` different episodes, drawn at random, with all their steps: the tuple filter is
@@ -379,59 +315,35 @@ class TupliDataset:
         Raises:
             DatasetError: the number is no integer from 0.
         """
-        headers = self._listed()
+        headers = self._query.headers
         n = min(_count(n_samples, 0, "a number of episodes"), len(headers))
         drawn = self._random.choice(len(headers), n, replace=False)
         in_order = np.sort(drawn)
         chosen = [headers[i] for i in in_order]
-        columns, selected, layout = read_columns(self._source, chosen, (*FIVE, "infos"))
+        columns, selected, layout = read_columns(self._query.source, chosen, SIX)
         items = items_of(chosen, columns, selected.lengths, layout)
         return [items[i] for i in np.searchsorted(in_order, drawn)]
 
     # --- display ---
 
     def _facts(self) -> display.Facts:
-        return display.Facts(
-            repr(self._source),
-            self._headers,
-            None if self._selected is None else self._selected.steps,
-            {
-                "benchmarks": self._benchmark_filter,
-                "episodes": self._episode_filter,
-                "tuples": self._tuple_filter,
-            },
-        )
+        headers, selected = self._query.known
+        filters = {
+            "benchmarks": self._query.benchmark_filter,
+            "episodes": self._query.episode_filter,
+            "tuples": self._query.tuple_filter,
+        }
+        return display.Facts(repr(self._query.source), headers, selected and selected.steps, filters)
 
     def __repr__(self) -> str:
         return display.text(type(self).__name__, self._facts())
 
     def _repr_html_(self) -> str:
-        self._listed()
+        _ = self._query.headers
         return display.html(type(self).__name__, self._facts())
-
-
-def _checked(filter: AnyFilter, model: type[BenchmarkHeader] | type[EpisodeHeader]) -> AnyFilter:
-    if filter is None:
-        return filter
-    if not isinstance(filter, BaseFilter):
-        raise FilterError(
-            f"expected a filter, such as FilterEQ(key=..., value=...) or F(...) > 3, found {filter!r:.80}"
-        )
-    check_keys(filter, model)
-    return filter
 
 
 def _count(value: int, least: int, what: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise DatasetError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
     return int(value)
-
-
-def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
-    """What the columns of some episodes depend on."""
-    return [(header.id, header.n_tuples, header.recording) for header in headers]
-
-
-def _frozen(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    array.flags.writeable = False
-    return array

@@ -30,6 +30,7 @@ from tupli_mcap.storage.sidecar import Sidecar
 __all__ = ["DatasetError", "FilesSource", "Source", "StorageSource"]
 
 _ENDS = ("terminal", "timeout", "interrupted")
+_CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two blocks share it
 _HEADER_FIELDS = set(EpisodeHeader.model_fields)
 
 
@@ -134,7 +135,7 @@ class FilesSource:
         return found
 
     def open(self, recording: str) -> Recording:
-        return Recording(recording)
+        return Recording(recording, cache_bytes=_CACHE_BYTES)
 
     def __repr__(self) -> str:
         return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} files"

@@ -13,12 +13,11 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import lz4.frame
 import numpy as np
-import zstandard
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import BODY
+from tupli_mcap.recording.compression import decompress
 from tupli_mcap.recording.container import COMPRESSIONS
 from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.source import Source
@@ -28,7 +27,6 @@ __all__ = ["IN_MEMORY", "ChunkStore", "Span"]
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
 MAX_CHUNK = 1 << 31
 _CHUNK_HEAD = struct.Struct("<BQQQQII")  # opcode, length, start, end, uncompressed size, crc, compression length
-_local = threading.local()
 
 
 class Span(NamedTuple):
@@ -37,33 +35,6 @@ class Span(NamedTuple):
     chunk: int
     begin: int
     end: int
-
-
-def _decompressor() -> zstandard.ZstdDecompressor:
-    if not hasattr(_local, "zstd"):
-        _local.zstd = zstandard.ZstdDecompressor()
-    found: zstandard.ZstdDecompressor = _local.zstd
-    return found
-
-
-def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
-    """`size` bytes, or FormatError: neither more is produced nor allocated than `size`."""
-    try:
-        if name == "zstd":
-            if zstandard.frame_content_size(data) not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-                raise FormatError(f"{where}: expected {size} bytes, the zstd frame says {zstandard.frame_content_size(data)}")
-            found: Any = _decompressor().decompress(data, max_output_size=size)
-        elif name == "lz4":
-            found = lz4.frame.LZ4FrameDecompressor().decompress(bytes(data), max_length=size + 1)
-        elif name == "":
-            found = data
-        else:
-            raise FormatError(f"{where}: expected compression zstd, lz4 or none, found {name[:20]!r}")
-    except (zstandard.ZstdError, RuntimeError, MemoryError) as err:
-        raise FormatError(f"{where}: the compressed data is damaged: {err}") from err
-    if len(found) != size:
-        raise FormatError(f"{where}: expected {size} bytes after decompression, found {len(found)}")
-    return found
 
 
 class ChunkStore:

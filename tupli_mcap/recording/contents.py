@@ -52,9 +52,12 @@ def read_contents(source: Source) -> Contents:
     """
     check_magic(source)
     if not has_summary(source):
-        from tupli_mcap.recording.recover import recover_contents
+        from tupli_mcap.recording.recover import find_journal, recover_contents
 
-        return recover_contents(source)
+        journal = find_journal(source)
+        source.refresh()  # a writer that closed in between has left a summary, and no journal
+        if not has_summary(source):
+            return recover_contents(source, journal)
     summary = read_summary(source)
     if RECORDING_METADATA not in summary.metadata:
         raise foreign(source, f"it has no metadata {RECORDING_METADATA!r}")

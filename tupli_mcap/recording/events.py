@@ -120,7 +120,8 @@ class EpisodeEnd(NamedTuple):
     metadata: str
 
     def encode(self) -> bytes:
-        return _END.pack(*self[:7]) + _strings(_END.size, self.metadata.encode())
+        fixed = _END.pack(*self[:7])
+        return fixed + (_PLAIN_END if self.metadata == "{}" else _strings(_END.size, self.metadata.encode()))
 
     @classmethod
     def decode(cls, body: memoryview) -> EpisodeEnd:
@@ -131,3 +132,6 @@ class EpisodeEnd(NamedTuple):
         if fixed[5] >= len(END_NAMES):
             raise FormatError(f"/episode_end: expected an end of 0, 1 or 2, found {fixed[5]}")
         return cls(*fixed, metadata)
+
+
+_PLAIN_END = _strings(_END.size, b"{}")

@@ -9,8 +9,10 @@ import struct
 from typing import Any, NamedTuple
 
 import numpy as np
+import zstandard
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.compression import decompress
 from tupli_mcap.recording.container import CHUNK_ROWS
 
 __all__ = ["EPISODE_ROWS", "INDEX_NAME", "EpisodeIndex", "IndexBuilder"]
@@ -19,7 +21,9 @@ INDEX_NAME = "episodes.index"
 INDEX_MEDIA_TYPE = "application/x-tupli-mcap-index"
 _HEAD = struct.Struct("<8sQQQ")
 _MAGIC = b"TMIDX\0\0\1"
+_SIZE = struct.Struct("<Q")
 _MAX_METADATA = 1 << 26
+_MAX_RATIO = 1 << 16  # zstd cannot compress further than about 1 : 32,000
 
 EPISODE_ROWS = np.dtype(
     [
@@ -60,10 +64,14 @@ class IndexBuilder:
 
     def add(self, row: EpisodeRow, metadata: str) -> None:
         text = b"" if metadata == "{}" else metadata.encode()
-        seed = row.seed if row.seed is not None and -(2**63) <= row.seed < 2**63 else None
+        first, length, total, start, end, seed, start_row, end_row, final_row, number, env, how = row
+        if seed is None or not -(2**63) <= seed < 2**63:  # larger ones are in `/episode_start`
+            has_seed, seed = False, 0
+        else:
+            has_seed = True
         self.rows += _ROW.pack(
-            row.first_row, row.length, row.episode_return, row.start_time, row.end_time, seed or 0, row.start_row,
-            row.end_row, row.final_row, len(self.metadata), len(text), row.episode, row.env, row.end, seed is not None,
+            first, length, total, start, end, seed, start_row, end_row, final_row, len(self.metadata), len(text),
+            number, env, how, has_seed,
         )  # fmt: skip
         self.metadata += text
         self.count += 1
@@ -73,7 +81,25 @@ class IndexBuilder:
         rows = np.frombuffer(bytes(self.rows), EPISODE_ROWS)
         rows = rows[np.argsort(rows["episode"], kind="stable")]
         head = _HEAD.pack(_MAGIC, self.count, len(chunk_rows) // CHUNK_ROWS.itemsize, len(self.metadata))
-        return b"".join([head, rows.tobytes(), bytes(chunk_rows), bytes(self.metadata)])
+        return head + _compress(rows.tobytes()) + _compress(bytes(chunk_rows)) + _compress(bytes(self.metadata))
+
+
+def _compress(data: bytes) -> bytes:
+    packed = zstandard.ZstdCompressor(level=1).compress(data)
+    return _SIZE.pack(len(packed)) + packed
+
+
+def _decompress(data: bytes, at: int, size: int, where: str) -> tuple[bytes, int]:
+    """A part of `size` bytes and where the next one starts; a claim that zstd could not have made is refused."""
+    if at + _SIZE.size > len(data):
+        raise FormatError(f"{where}: expected a part of the episode index at byte {at}, found {len(data)} bytes")
+    (packed,) = _SIZE.unpack_from(data, at)
+    start = at + _SIZE.size
+    end = start + packed
+    if end > len(data) or size > _MAX_RATIO * packed:
+        raise FormatError(f"{where}: the episode index claims {packed} bytes that hold {size} at byte {at}")
+    part = decompress("zstd", memoryview(data)[start:end], size, f"{where}: episode index")
+    return bytes(part), end
 
 
 class EpisodeIndex(NamedTuple):
@@ -89,16 +115,14 @@ class EpisodeIndex(NamedTuple):
         if len(data) < _HEAD.size:
             raise FormatError(f"{where}: expected an episode index of at least {_HEAD.size} bytes, found {len(data)}")
         magic, episodes, chunks, metadata = _HEAD.unpack_from(data)
-        sizes = (episodes * EPISODE_ROWS.itemsize, chunks * CHUNK_ROWS.itemsize, metadata)
-        if magic != _MAGIC or _HEAD.size + sum(sizes) != len(data):
-            raise FormatError(
-                f"{where}: expected an episode index of version 1 with {episodes} episodes and {chunks} chunks, "
-                f"found {magic!r} and {len(data)} bytes"
-            )
-        start = _HEAD.size
-        rows = np.frombuffer(data, EPISODE_ROWS, episodes, start)
-        table = np.frombuffer(data, CHUNK_ROWS, chunks, start + sizes[0])
-        return cls(rows, table, data[start + sizes[0] + sizes[1] :])
+        if magic != _MAGIC:
+            raise FormatError(f"{where}: expected an episode index of version 1, found {magic!r}")
+        rows, at = _decompress(data, _HEAD.size, episodes * EPISODE_ROWS.itemsize, where)
+        table, at = _decompress(data, at, chunks * CHUNK_ROWS.itemsize, where)
+        texts, at = _decompress(data, at, metadata, where)
+        if at != len(data):
+            raise FormatError(f"{where}: expected an episode index of {at} bytes, found {len(data)}")
+        return cls(np.frombuffer(rows, EPISODE_ROWS), np.frombuffer(table, CHUNK_ROWS), texts)
 
     def metadata_text(self, i: int) -> str:
         """The JSON text of an episode's metadata."""

@@ -48,7 +48,7 @@ class InfoRecorder:
         if writer.infos is None or writer.channels.info is None:
             return
         body = self.encode(episode, step, info)
-        writer.infos.append(writer.channels.info, time.time_ns(), body)
+        writer.infos.append(time.time_ns(), (writer.channels.info, body))
 
     def encode(self, episode: int, step: int, info: Mapping[str, Any]) -> bytes:
         """The CDR body of a step's info."""

@@ -5,11 +5,14 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import time
 from pathlib import Path
 
 from tupli_mcap.errors import RecordingError
 
 __all__ = ["FileLock", "is_locked"]
+
+_ATTEMPTS = 5
 
 
 class FileLock:
@@ -34,11 +37,16 @@ class FileLock:
             raise RecordingError(f"{path} cannot be recorded to: {hint}") from err
         except OSError as err:
             raise RecordingError(f"{path} cannot be recorded to: {err.strerror}; choose a writable place") from err
-        try:
-            fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as err:
-            os.close(self.fd)
-            raise RecordingError(f"{path} is being recorded by another writer; close it first") from err
+        for attempt in range(_ATTEMPTS):  # a reader that asks whether the writer lives holds the lock for a moment
+            try:
+                fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError as err:
+                if attempt + 1 < _ATTEMPTS:
+                    time.sleep(0.01)
+                    continue
+                os.close(self.fd)
+                raise RecordingError(f"{path} is being recorded by another writer; close it first") from err
         self._open = True
 
     def release(self) -> None:

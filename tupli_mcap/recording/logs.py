@@ -19,7 +19,6 @@ from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
-from tupli_mcap.recording.events import record
 from tupli_mcap.recording.journal import LogArea
 
 __all__ = ["EventLog", "StepLog", "group_records", "iter_records", "leaf_encoders"]
@@ -27,7 +26,7 @@ __all__ = ["EventLog", "StepLog", "group_records", "iter_records", "leaf_encoder
 Sink = Callable[[Rows], None]
 Encoder = Callable[[Any, bytearray, int], None]
 _HEADER = 64
-_LENGTH = struct.Struct("<Q")
+_EVENT = struct.Struct("<BQHIQQ4s")
 
 
 def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
@@ -64,41 +63,17 @@ def group_records(data: memoryview) -> list[Rows]:
 
 
 class EventLog:
-    """Records of several channels in one half; when it is full they go to the file, a chunk a channel."""
+    """Records of several channels in one half; when it is full they go to the file, a chunk a channel.
 
-    def __init__(self, area: LogArea, buffer: memoryview, sink: Sink, sequences: dict[int, int]) -> None:
-        self._records = buffer[_HEADER : _HEADER + area.capacity]
-        self._commit = buffer[:8].cast("Q")
-        self._capacity = area.capacity
-        self._sink = sink
-        self._position = 0
-        self._commit[0] = 0
+    `sequences` counts the messages of each channel, those of earlier sessions included.
+    """
+
+    def __init__(self, area: LogArea, buffer: memoryview, sink: Sink, sequences: dict[int, int], time_ns: int) -> None:
         self.sequences = sequences
-        self._times: dict[int, int] = dict.fromkeys(sequences, 0)
-
-    def append(self, channel: int, time_ns: int, body: bytes) -> int:
-        """Adds a message; returns the position before it, for `rewind`."""
-        time_ns = max(time_ns, self._times[channel])
-        self._times[channel] = time_ns
-        data = record(channel, self.sequences[channel], time_ns, body)
-        if self._position + len(data) > self._capacity:
-            self.flush()
-        self.sequences[channel] += 1
-        start = self._position
-        if len(data) > self._capacity:
-            for rows in group_records(memoryview(data)):
-                self._sink(rows)
-            return start
-        self._position = start + len(data)
-        self._records[start : self._position] = data
-        self._commit[0] = self._position
-        return start
-
-    def rewind(self, position: int, channel: int) -> None:
-        """Takes back the last message, which began at `position`."""
-        self._position = position
-        self._commit[0] = position
-        self.sequences[channel] -= 1
+        self._sink = sink
+        self._time = time_ns
+        self._last = 0  # where the last message began
+        self.move(area, buffer)
 
     def move(self, area: LogArea, buffer: memoryview) -> None:
         """Goes on in another journal; everything must have been flushed."""
@@ -106,13 +81,49 @@ class EventLog:
         self._commit = buffer[:8].cast("Q")
         self._capacity = area.capacity
         self._position = 0
-
-    def flush(self) -> None:
-        """Writes the records to the file."""
-        for rows in group_records(self._records[: self._position]):
-            self._sink(rows)
-        self._position = 0
         self._commit[0] = 0
+
+    def append(self, time_ns: int, *messages: tuple[int, bytes]) -> int:
+        """Adds messages (channel, CDR body), all or none of them after a crash; returns their log_time."""
+        if time_ns > self._time:
+            self._time = time_ns
+        time_ns, parts = self._time, []
+        for channel, body in messages:
+            sequence = self.sequences[channel]
+            self.sequences[channel] = sequence + 1
+            parts.append(_EVENT.pack(5, _EVENT.size - 9 + len(body), channel, sequence, time_ns, time_ns, CDR_HEADER))
+            parts.append(body)
+        data = b"".join(parts)
+        end = self._position + len(data)
+        if end > self._capacity:
+            self.flush()
+            end = len(data)
+            if end > self._capacity:
+                for rows in group_records(memoryview(data)):
+                    self._sink(rows)
+                return time_ns
+        self._last = self._position
+        self._records[self._last : end] = data
+        self._position = end
+        self._commit[0] = end
+        return time_ns
+
+    def drop_last(self, channel: int) -> None:
+        """Takes back the message of the last `append`, which was one of `channel`."""
+        self._position = self._last
+        self._commit[0] = self._last
+        self.sequences[channel] -= 1
+
+    def flush(self, *, keep_last: bool = False) -> None:
+        """Writes the records to the file; with `keep_last` the last one stays, so that it can still be dropped."""
+        end = self._last if keep_last else self._position
+        last = bytes(self._records[end : self._position])
+        for rows in group_records(self._records[:end]):
+            self._sink(rows)
+        self._commit[0] = 0
+        self._records[: len(last)] = last
+        self._last, self._position = 0, len(last)
+        self._commit[0] = len(last)
 
 
 def leaf_encoders(layout: StepLayout, leaves: Sequence[Leaf]) -> list[tuple[Leaf, Encoder]]:

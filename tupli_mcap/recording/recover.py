@@ -37,7 +37,7 @@ from tupli_mcap.recording.scan import Scan, is_ours, scan
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import foreign, records
 
-__all__ = ["recover_contents"]
+__all__ = ["find_journal", "recover_contents"]
 
 
 @dataclass
@@ -48,12 +48,7 @@ class _Tail:
     pending: dict[int, bytes] = field(default_factory=dict)
 
 
-def recover_contents(source: Source) -> Contents:
-    """The contents of a recording that has no summary.
-
-    Raises:
-        FormatError: it is no recording of ours, or its first records are damaged.
-    """
+def _head(source: Source) -> dict[str, str]:
     head = scan(source, only_metadata=True)
     if RECORDING_METADATA not in head.metadata:
         if is_ours(head) or head.profile == "":
@@ -61,8 +56,24 @@ def recover_contents(source: Source) -> Contents:
                 f"{source.name}: the file is cut off or damaged before its first step; nothing can be read from it"
             )
         raise foreign(source, f"its profile is {head.profile!r}")
-    metadata = check_version(source, head.metadata[RECORDING_METADATA])
-    journal = _find_journal(source, metadata)  # before the chunks: a live writer moves rows from there to here
+    return check_version(source, head.metadata[RECORDING_METADATA])
+
+
+def recover_contents(source: Source, journal: JournalContents | Exception | None) -> Contents:
+    """The contents of a recording that has no summary.
+
+    `journal` is what `find_journal` found. It must be read before the chunks are: a live writer moves rows from there
+    to here.
+
+    Raises:
+        FormatError: it is no recording of ours, or its first records are damaged.
+    """
+    metadata = _head(source)
+    if isinstance(journal, Exception):
+        warnings.warn(_missing(source, journal), UserWarning, stacklevel=6)
+        journal = None
+    elif journal is not None and journal.info.get("uuid") != metadata["uuid"]:
+        journal = None  # a stale journal of another recording with this name is not ours to merge
     found = scan(source)
     if journal is not None:
         _define(found, journal, source)
@@ -87,25 +98,25 @@ def recover_contents(source: Source) -> Contents:
     return contents
 
 
-def _find_journal(source: Source, metadata: dict[str, str]) -> JournalContents | None:
+def find_journal(source: Source) -> JournalContents | Exception | None:
+    """The journal of an unfinished recording, or why it cannot be read; None where there can be none."""
     if source.path is None:
         return None
+    metadata = _head(source)
     path = Path(metadata["journal"]) if "journal" in metadata else journal_path(source.path)
     try:
-        journal = read_journal(path)
-    except FileNotFoundError:
-        warnings.warn(
-            f"{source.name} was not finished and has no journal {path.name} beside it: steps not yet in a chunk cannot "
-            "be recovered; keep the two files together",
-            UserWarning,
-            stacklevel=6,
-        )
-        return None
+        return read_journal(path)
     except (OSError, FormatError) as err:
-        warnings.warn(f"{source.name}: its journal cannot be read ({err})", UserWarning, stacklevel=6)
-        return None
-    # a stale journal of another recording with this name is not ours to merge
-    return journal if journal.info.get("uuid") == metadata["uuid"] else None
+        return err
+
+
+def _missing(source: Source, err: Exception) -> str:
+    if isinstance(err, FileNotFoundError):
+        return (
+            f"{source.name} was not finished and has no journal {Path(str(err.filename)).name} beside it: steps not yet "
+            "in a chunk cannot be recovered; keep the two files together"
+        )
+    return f"{source.name}: its journal cannot be read ({err})"
 
 
 def _define(found: Scan, journal: JournalContents, source: Source) -> None:

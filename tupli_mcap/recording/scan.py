@@ -10,7 +10,8 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.chunks import MAX_CHUNK, decompress
+from tupli_mcap.recording.chunks import MAX_CHUNK
+from tupli_mcap.recording.compression import decompress
 from tupli_mcap.recording.container import COMPRESSIONS, MAGIC, PROFILE, Rows
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.logs import group_records

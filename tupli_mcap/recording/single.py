@@ -60,6 +60,7 @@ class SingleRecorder:
         self._episode: StartedEpisode | None = None
         self.put: Put = self._unreset
         writer.on_abandon = self._abandon
+        writer.start_is_droppable = lambda: self._episode is not None and self.step_index == 0
 
     def _abandon(self) -> None:
         self.put = self._closed
@@ -93,7 +94,7 @@ class SingleRecorder:
             return
         length = rows.count - episode.first_row
         if length == 0:
-            self._writer.drop_start(episode)
+            self._writer.drop_start()
             return
         total = rows.cursor.total if hasattr(rows, "cursor") else rows.total
         final = None

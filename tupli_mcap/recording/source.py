@@ -24,6 +24,10 @@ class Source(Protocol):
         """Exactly `length` bytes, or FormatError."""
         ...
 
+    def refresh(self) -> None:
+        """Takes note of what was written since."""
+        ...
+
     def close(self) -> None: ...
 
 
@@ -53,6 +57,9 @@ class PathSource:
                 f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
             )
         return data
+
+    def refresh(self) -> None:
+        self.size = os.fstat(self._fd).st_size
 
     def close(self) -> None:
         if self._fd >= 0:
@@ -87,6 +94,10 @@ class FileSource:
         if len(data) != length:
             raise FormatError(f"{self.name}: expected {length} bytes at offset {offset}, found {len(data)}")
         return data
+
+    def refresh(self) -> None:
+        with self._lock:
+            self.size = self._file.seek(0, os.SEEK_END)
 
     def close(self) -> None:
         if self._owned:

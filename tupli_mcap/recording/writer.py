@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import struct
 import time
 import uuid
 import weakref
@@ -35,6 +36,7 @@ __all__ = ["FORMAT_VERSION", "RECORDING_METADATA", "Mode", "RecordingWriter", "W
 FORMAT_VERSION = "1"
 RECORDING_METADATA = "tupli_mcap.recording"
 Mode = Literal["x", "w", "a"]
+_NUMBERS = struct.Struct("<II")
 LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
 
 
@@ -82,6 +84,7 @@ class RecordingWriter:
         self.events: EventLog | None = None
         self.infos: EventLog | None = None
         self.on_abandon: Callable[[], None] | None = None  # tells the recorder, whose encoder knows only its buffer
+        self.start_is_droppable: Callable[[], bool] = lambda: False  # the last event is a start without a step
         self.num_envs = 1
         self.is_vector = False
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
@@ -237,9 +240,10 @@ class RecordingWriter:
                 [sinks[0] for sinks in self.images], counts[channels.steps[0]], RowDeriver(time_ns=before_ns),
             )  # type: ignore[arg-type]  # fmt: skip
         events = {c: counts[c] for c in (channels.final_state, channels.start, channels.end)}
-        self.events = EventLog(by_name["events"], buffer("events"), self.add_chunk, events)  # type: ignore[arg-type]
+        self.events = EventLog(by_name["events"], buffer("events"), self.add_chunk, events, before_ns)  # type: ignore[arg-type]
         if channels.info is not None:
-            self.infos = EventLog(by_name["info"], buffer("info"), self.add_chunk, {channels.info: counts[channels.info]})  # type: ignore[arg-type]
+            info = {channels.info: counts[channels.info]}
+            self.infos = EventLog(by_name["info"], buffer("info"), self.add_chunk, info, before_ns)  # type: ignore[arg-type]
 
     # ---- episodes
 
@@ -258,14 +262,14 @@ class RecordingWriter:
             reset.info,
         )
         row = self.events.sequences[self.channels.start]
-        position = self.events.append(self.channels.start, reset.time_ns, message.encode())
+        start_time = self.events.append(reset.time_ns, (self.channels.start, message.encode()))
         self.next_episode += 1
-        return StartedEpisode(message.episode, env, first_row, reset.time_ns, seed, row, position)
+        return StartedEpisode(message.episode, env, first_row, start_time, seed, row)
 
-    def drop_start(self, episode: StartedEpisode) -> None:
-        """Takes back the last `/episode_start`: a reset without a step is no episode."""
+    def drop_start(self) -> None:
+        """Takes back the last `/episode_start`, the last event: a reset without a step is no episode."""
         assert self.events is not None
-        self.events.rewind(episode.position, self.channels.start)
+        self.events.drop_last(self.channels.start)
         self.next_episode -= 1
 
     def end_episode(
@@ -273,25 +277,23 @@ class RecordingWriter:
     ) -> None:
         """Writes `/final_state` and `/episode_end`, and the episode's row of the index."""
         assert self.events is not None
+        channels, sequences = self.channels, self.events.sequences
+        total = total if type(total) is float else float(np.sum(total))
+        number, env, first_row = episode.number, episode.env, episode.first_row
+        message = EpisodeEnd(number, env, first_row, length, total, end, final_state is not None, metadata).encode()
+        end_row, final_row = sequences[channels.end], -1
         now = time.time_ns()
-        total = float(total) if isinstance(total, float) else float(np.sum(total))
-        row = self.events.sequences[self.channels.end]
-        final_row = -1
-        if final_state is not None:
-            final_row = self.events.sequences[self.channels.final_state]
-            head = episode.number.to_bytes(4, "little") + episode.env.to_bytes(4, "little")
-            self.events.append(self.channels.final_state, now, head + final_state)
-        message = EpisodeEnd(
-            episode.number, episode.env, episode.first_row, length, total, end, final_state is not None, metadata
-        )
-        self.events.append(self.channels.end, now, message.encode())
-        self.index.add(
-            EpisodeRow(
-                episode.first_row, length, total, episode.start_time, now, episode.seed, episode.start_row, row,
-                final_row, episode.number, episode.env, end,
-            ),  # fmt: skip
-            metadata,
-        )
+        if final_state is None:
+            now = self.events.append(now, (channels.end, message))
+        else:
+            final_row = sequences[channels.final_state]
+            body = _NUMBERS.pack(number, env) + final_state
+            now = self.events.append(now, (channels.final_state, body), (channels.end, message))
+        row = (
+            first_row, length, total, episode.start_time, now, episode.seed, episode.start_row, end_row, final_row,
+            number, env, end,
+        )  # fmt: skip
+        self.index.add(EpisodeRow._make(row), metadata)
         if self.options.flush_seconds is not None and time.monotonic() - self._flushed_at > self.options.flush_seconds:
             self.flush()
 
@@ -334,15 +336,20 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Writes everything recorded so far into chunks (the file still has no summary)."""
+        self._flush(keep_last=self.start_is_droppable())
+
+    def _flush(self, *, keep_last: bool) -> None:
         self._flushed_at = time.monotonic()
-        stores = [*self._step_stores(), *(sink for sinks in self.images for sink in sinks), self.infos, self.events]
+        stores = [*self._step_stores(), *(sink for sinks in self.images for sink in sinks), self.infos]
         for store in stores:
             if store is not None:
                 store.flush()
+        if self.events is not None:
+            self.events.flush(keep_last=keep_last)
 
     def _grow(self, size: int) -> None:
         """Makes a larger journal for steps of `size` bytes; the running states move into it."""
-        self.flush()
+        self._flush(keep_last=False)
         areas = self._areas(2 * size)
         journal = self._new_journal(areas)
         logs = self.vector if isinstance(self.vector, list) else [self.rows]
@@ -420,7 +427,6 @@ class StartedEpisode(NamedTuple):
     start_time: int
     seed: int | None
     start_row: int
-    position: int
 
 
 def _abandon_all() -> None:

@@ -1,0 +1,134 @@
+"""The application: its commands, and the one place where errors become a line and an exit code.
+
+Exit codes: 0, 1 (the operation failed), 2 (usage). Only light modules are imported here; each command imports
+what it calls, so that help and completion stay quick.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from tupli_mcap.cli import recordings, sharing, storages
+from tupli_mcap.cli.output import warnings_in_one_line
+from tupli_mcap.errors import FilterError, TupliError
+
+__all__ = ["app", "main"]
+
+FAILED, USAGE = 1, 2
+
+
+class _Group(TyperGroup):
+    """Errors are one line on stderr; `--debug`, anywhere before `--`, adds the traceback."""
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        windows_expand_args: bool = True,
+        **extra: Any,
+    ) -> Any:
+        words = list(sys.argv[1:] if args is None else args)
+        given = words[: words.index("--")] if "--" in words else words
+        debug = "--debug" in given
+        words = [word for word in given if word != "--debug"] + words[len(given) :]
+        try:
+            with warnings_in_one_line():
+                code = super().main(words, prog_name, complete_var, False, windows_expand_args, **extra)
+            sys.stdout.flush()
+        except BaseException as err:  # noqa: BLE001 - what is no error of ours is raised again
+            if debug and not isinstance(err, SystemExit):
+                traceback.print_exc()
+            code = _report(err)
+        if not standalone_mode:
+            return code
+        sys.exit(code if isinstance(code, int) else 0)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as err:  # before typer makes something else of it
+            raise _InterruptedError from err
+
+
+class _InterruptedError(TupliError):
+    """The user pressed Ctrl-C."""
+
+
+def _report(err: BaseException) -> int:
+    """Print the line of an error; returns the exit code. What is no error of a user's is raised again."""
+    message = str(err)
+    code = FAILED
+    if isinstance(err, OSError) and err.errno == errno.EPIPE:
+        # The reader of our output has seen enough. Nothing may be written to it at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return FAILED
+    if isinstance(err, _InterruptedError):
+        message = "interrupted"
+    elif isinstance(err, FilterError):
+        code = USAGE  # filters come from the command line only
+    elif isinstance(err, OSError):
+        name = "" if err.filename is None else f"{os.fsdecode(err.filename)}: "
+        message = f"{name}{err.strerror or err}"
+    elif hasattr(err, "format_message"):  # typer's own, wherever it has its classes from
+        message, code = err.format_message(), getattr(err, "exit_code", USAGE)
+        context = getattr(err, "ctx", None)
+        if context is not None:
+            message = f"{message.rstrip('.')}; see {context.command_path} --help"
+    elif not isinstance(err, TupliError):
+        raise err
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+app = typer.Typer(
+    name="tupli-mcap",
+    cls=_Group,
+    invoke_without_command=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"tupli-mcap {version('tupli-mcap')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Record reinforcement-learning episodes as MCAP files, look at them, share them.
+
+    Commands that print tables print JSON with --json. Exit codes: 0, 1 (the operation failed), 2 (usage).
+    """
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+recordings.register(app)
+storages.register(app)
+sharing.register(app)
+
+
+def main() -> None:
+    """The console entry point."""
+    app()

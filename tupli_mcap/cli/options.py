@@ -1,0 +1,58 @@
+"""Options that several commands have in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tupli_mcap.errors import NotFoundError, StorageError
+
+if TYPE_CHECKING:
+    from tupli_mcap.schema import BaseFilter
+    from tupli_mcap.storage import FileStorage
+
+__all__ = [
+    "FilterText", "Json", "Limit", "StoragePath", "filter_of", "full_id", "open_storage"
+]  # fmt: skip
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead.")]
+Limit = Annotated[int | None, typer.Option(min=0, help="Print at most so many.")]
+FilterText = Annotated[
+    str | None,
+    typer.Option("--filter", metavar="FILTER", help="Such as 'metadata.score > -200 and end = \"terminal\"'."),
+]
+StoragePath = Annotated[
+    Path, typer.Option("--storage", envvar="TUPLI_MCAP_STORAGE", help="The storage's directory.")
+]
+DEFAULT_STORAGE = Path("_local_storage")
+_SHORTEST_ID = 4
+
+
+def filter_of(text: str | None) -> BaseFilter | None:
+    """The filter that an option's text describes."""
+    from tupli_mcap.schema import parse_filter
+
+    return None if text is None else parse_filter(text)
+
+
+def open_storage(path: Path, *, create: bool = False) -> FileStorage:
+    """The storage in a directory; only commands that put something into it make the directory."""
+    from tupli_mcap.storage import FileStorage
+
+    if not create and not path.is_dir():
+        raise StorageError(
+            f"there is no storage at {str(path)!r}; give its directory with --storage, or in TUPLI_MCAP_STORAGE"
+        )
+    return FileStorage(path)
+
+
+def full_id(storage: FileStorage, text: str) -> str:
+    """The benchmark id that starts with `text`, as tables show ids in short; `text` itself if none does."""
+    if len(text) < _SHORTEST_ID or len(text) >= 64 or not set(text) <= set("0123456789abcdef"):
+        return text
+    found = [header.id for header in storage.list_benchmarks() if header.id.startswith(text)]
+    if len(found) > 1:
+        raise NotFoundError(f"{len(found)} benchmarks have an id that starts with {text!r}; give more of it")
+    return found[0] if found else text

@@ -1,0 +1,232 @@
+"""How results are printed: tables that fit the terminal, facts, JSON, progress, warnings."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from typing import Any, Literal, NamedTuple
+
+__all__ = [
+    "Column",
+    "bytes_of",
+    "number",
+    "numbers",
+    "print_facts",
+    "print_json",
+    "print_table",
+    "short_ids",
+    "step_progress",
+    "time_of",
+    "warnings_in_one_line",
+]
+
+_GAP = "  "
+_ANSI = re.compile(r"\x1b\[[0-9;]*m")
+_LONG_ID = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{20,52}\b")
+
+
+class Column(NamedTuple):
+    """A column of a table; `shrink` says which end of its values goes where the terminal is too narrow."""
+
+    title: str
+    align: Literal["left", "right"] = "left"
+    shrink: Literal["start", "end"] | None = None
+
+
+def terminal_width() -> int | None:
+    """The width that output has to fit (columns); None where it is no terminal: then nothing is cut."""
+    if os.environ.get("COLUMNS", "").isdecimal():
+        return int(os.environ["COLUMNS"])
+    try:
+        return os.get_terminal_size(sys.stdout.fileno()).columns
+    except (OSError, ValueError):
+        return None
+
+
+def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], *, empty: str) -> None:
+    """Print rows under titles, or the sentence `empty` if there are none."""
+    from rich.cells import cell_len
+
+    cells = [[_visible(cell) for cell in row] for row in rows]
+    if not cells:
+        print(empty)
+        return
+    # A column without any value says nothing.
+    shown = [i for i in range(len(columns)) if any(row[i] for row in cells)]
+    columns = [columns[i] for i in shown]
+    cells = [[row[i] for i in shown] for row in cells]
+    widths = [
+        max(cell_len(text) for text in (column.title, *(row[i] for row in cells)))
+        for i, column in enumerate(columns)
+    ]
+    _fit(columns, widths)
+    lines = [_line(columns, widths, [column.title for column in columns])]
+    lines += [_line(columns, widths, row) for row in cells]
+    _print_lines(lines)
+
+
+def print_facts(facts: Iterable[tuple[str, str]]) -> None:
+    """Print `label  value` lines; long values go on below themselves."""
+    import textwrap
+
+    pairs = [(label, _visible(value)) for label, value in facts]
+    indent = max(len(label) for label, _ in pairs) + len(_GAP)
+    width = terminal_width()
+    for label, value in pairs:
+        lines = [value]
+        if width is not None:
+            lines = textwrap.wrap(value, max(20, width - indent), break_on_hyphens=False) or [""]
+        for i, line in enumerate(lines):
+            print(f"{label if i == 0 else '':<{indent}}{line}")
+
+
+def print_json(value: Any) -> None:
+    """Print a value as one JSON document: NumPy values as numbers and lists, NaN as `{"$float": "nan"}`."""
+    import json
+
+    from tupli_mcap.messages.jsonvalue import dumps_plain
+
+    print(json.dumps(json.loads(dumps_plain(value)), indent=2, ensure_ascii=False))
+
+
+@contextlib.contextmanager
+def step_progress(total: int) -> Iterator[Callable[[int], None] | None]:
+    """Gives a function to be told of the steps done; None where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("recording"), BarColumn(), MofNCompleteColumn(), TextColumn("steps"), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("steps", total=total)
+        yield lambda done: progress.update(task, completed=min(done, total))
+
+
+@contextlib.contextmanager
+def warnings_in_one_line() -> Iterator[None]:
+    """Warnings become `warning: ...` on stderr, each once; those for programmers are not shown."""
+    said: set[str] = set()
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        text = " ".join(_ANSI.sub("", str(message)).removeprefix("WARN: ").split())
+        if text not in said:
+            said.add(text)
+            print(f"warning: {text}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        for ignored in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
+            warnings.simplefilter("ignore", ignored)
+        warnings.showwarning = show
+        yield
+
+
+# --- values as text ---
+
+
+def short_ids(text: str) -> str:
+    """On a terminal, the first 12 digits of every long id in a text; elsewhere the text as it is."""
+    return text if terminal_width() is None else _LONG_ID.sub(r"\1…", text)
+
+
+def number(value: float | None, decimals: int = 2) -> str:
+    """A number for people: thousands separated, at most so many decimals."""
+    if value is None:
+        return ""
+    if not math.isfinite(value):
+        return str(value)
+    if value == int(value) and abs(value) < 1e15:
+        return f"{int(value):,}"
+    if abs(value) >= 1e9 or abs(value) < 10.0**-decimals:
+        return f"{value:.3g}"
+    return f"{value:,.{decimals}f}"
+
+
+def numbers(values: Sequence[float | None], decimals: int = 2) -> list[str]:
+    """Numbers of one column: with decimals if one of them has some."""
+    whole = all(value is None or not math.isfinite(value) or value == int(value) for value in values)
+    if whole:
+        return [number(value) for value in values]
+    texts = [number(value, decimals) for value in values]
+    return [
+        f"{text}.{'0' * decimals}" if text.lstrip("-").replace(",", "").isdecimal() else text for text in texts
+    ]
+
+
+def bytes_of(size: int) -> str:
+    """A size: `512 B`, `18.3 kB`, `2.0 GB`."""
+    value, unit = float(size), "B"
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if value < 999.95 or unit == "TB":
+            break
+        value /= 1000
+    return f"{size} B" if unit == "B" else f"{value:.1f} {unit}"
+
+
+def time_of(time_ns: int) -> str:
+    """A wall clock time (ns) in the local time zone, to the second; empty for 0."""
+    if not time_ns:
+        return ""
+    return datetime.fromtimestamp(time_ns // 10**9, UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _visible(text: str) -> str:
+    """Without what would move the cursor or break the line: texts come from files."""
+    return "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text)
+
+
+def _fit(columns: Sequence[Column], widths: list[int]) -> None:
+    """Narrow the columns that may shrink until the table fits, the widest first."""
+    limit = terminal_width()
+    if limit is None:
+        return
+    shrinkable = [i for i, column in enumerate(columns) if column.shrink]
+    excess = sum(widths) + len(_GAP) * (len(widths) - 1) - limit
+    while excess > 0 and shrinkable:
+        widest = max(shrinkable, key=lambda i: widths[i])
+        least = max(len(columns[widest].title), 8)
+        if widths[widest] <= least:
+            shrinkable.remove(widest)
+            continue
+        widths[widest] -= 1
+        excess -= 1
+
+
+def _line(columns: Sequence[Column], widths: Sequence[int], cells: Sequence[str]) -> str:
+    from rich.cells import cell_len
+
+    parts = []
+    for column, width, cell in zip(columns, widths, cells, strict=True):
+        text = _cut(cell, width, column.shrink or "end")
+        padding = " " * (width - cell_len(text))
+        parts.append(padding + text if column.align == "right" else text + padding)
+    return _GAP.join(parts).rstrip()
+
+
+def _cut(text: str, width: int, end: Literal["start", "end"]) -> str:
+    from rich.cells import cell_len
+
+    if cell_len(text) <= width:
+        return text
+    while cell_len(text) > width - 1:
+        text = text[1:] if end == "start" else text[:-1]
+    return "…" + text if end == "start" else text + "…"
+
+
+def _print_lines(lines: Sequence[str]) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
+    width = terminal_width()
+    console = Console(width=width or 10_000, highlight=False, soft_wrap=width is None)
+    console.print(Text(lines[0], style="bold", no_wrap=True, overflow="ellipsis"))
+    for line in lines[1:]:
+        console.print(Text(line, no_wrap=True, overflow="ellipsis"))

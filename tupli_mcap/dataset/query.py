@@ -1,0 +1,131 @@
+"""A query: three filters over a source, the episodes they give, and the columns read so far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from tupli_mcap.dataset.columns import pick
+from tupli_mcap.dataset.loading import Selected, read_columns
+from tupli_mcap.dataset.parsers import map_columns
+from tupli_mcap.dataset.selection import TupleFilter, selector_of
+from tupli_mcap.dataset.sources import Source
+from tupli_mcap.errors import FilterError
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_keys
+
+__all__ = ["Query"]
+
+
+class Query:
+    """What a dataset asks for. The filters never change; what has been read always belongs to `headers`.
+
+    `layout` is that of the steps read last, None before.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        benchmark_filter: BaseFilter | None = None,
+        episode_filter: BaseFilter | None = None,
+        tuple_filter: TupleFilter | None = None,
+    ) -> None:
+        _check(benchmark_filter, BenchmarkHeader)
+        _check(episode_filter, EpisodeHeader)
+        self.source = source
+        self.benchmark_filter = benchmark_filter
+        self.episode_filter = episode_filter
+        self.tuple_filter = tuple_filter
+        self.layout: StepLayout | None = None
+        self._selector = None if tuple_filter is None else selector_of(tuple_filter)
+        self._benchmarks: list[BenchmarkHeader] | None = None
+        self._headers: list[EpisodeHeader] | None = None
+        self._selected: Selected | None = None
+        self._columns: dict[str, Any] = {}
+
+    def with_filters(self, **filters: Any) -> Self:
+        """A query that has read nothing, with some filters replaced; named as the constructor's arguments."""
+        mine = {
+            "benchmark_filter": self.benchmark_filter,
+            "episode_filter": self.episode_filter,
+            "tuple_filter": self.tuple_filter,
+        }
+        return type(self)(self.source, **{**mine, **filters})
+
+    @property
+    def benchmarks(self) -> list[BenchmarkHeader]:
+        """The benchmarks the benchmark filter is true of."""
+        if self._benchmarks is None:
+            self._benchmarks = self.source.benchmarks(self.benchmark_filter)
+        return self._benchmarks
+
+    @property
+    def headers(self) -> list[EpisodeHeader]:
+        """The episodes; listed when they are first asked for."""
+        return self.refresh() if self._headers is None else self._headers
+
+    @property
+    def known(self) -> tuple[list[EpisodeHeader] | None, Selected | None]:
+        """The episodes and the wanted steps, as far as they are known without reading anything."""
+        return self._headers, self._selected
+
+    @property
+    def selected(self) -> Selected:
+        """The steps the tuple filter is true of."""
+        if self._selected is None:
+            self.read(["terminals"])
+        if self._selected is None:
+            raise AssertionError("reading leaves the selection behind")
+        return self._selected
+
+    def refresh(self) -> list[EpisodeHeader]:
+        """Lists the episodes anew; columns stay if the episodes are the same."""
+        headers = self.source.episodes(self.benchmark_filter, self.episode_filter)
+        if self._headers is None or _identity(headers) != _identity(self._headers):
+            self._selected, self.layout, self._columns = None, None, {}
+        self._headers, self._benchmarks = headers, None
+        return headers
+
+    def read(self, fields: Sequence[str]) -> dict[str, Any]:
+        """Columns by field, which are kept and cannot be written to."""
+        found = self._missing(fields)
+        self._columns.update({field: map_columns(_frozen, column) for field, column in found.items()})
+        return {field: self._columns[field] for field in fields}
+
+    def own(self, fields: Sequence[str]) -> dict[str, Any]:
+        """Columns by field that are the caller's own; what has to be read for them is not kept."""
+        found = self._missing(fields)
+        copies = {field: pick(self._columns[field], slice(None)) for field in fields if field not in found}
+        return {field: found[field] if field in found else copies[field] for field in fields}
+
+    def _missing(self, fields: Sequence[str]) -> dict[str, Any]:
+        missing = [field for field in fields if field not in self._columns]
+        if not missing:
+            return {}
+        found, self._selected, layout = read_columns(
+            self.source, self.headers, missing, self._selector, self._selected
+        )
+        self.layout = layout or self.layout
+        return found
+
+
+def _check(filter: BaseFilter | None, model: type[BenchmarkHeader] | type[EpisodeHeader]) -> None:
+    if filter is None:
+        return
+    if not isinstance(filter, BaseFilter):
+        raise FilterError(
+            f"expected a filter, such as FilterEQ(key=..., value=...) or F(...) > 3, found {filter!r:.80}"
+        )
+    check_keys(filter, model)
+
+
+def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
+    """What the columns of some episodes depend on."""
+    return [(header.id, header.n_tuples, header.recording) for header in headers]
+
+
+def _frozen(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    array.flags.writeable = False
+    return array

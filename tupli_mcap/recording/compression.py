@@ -1,0 +1,42 @@
+"""Decompression that believes nothing: neither more is produced nor allocated than was announced."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import lz4.frame
+import zstandard
+
+from tupli_mcap.errors import FormatError
+
+__all__ = ["decompress"]
+
+_local = threading.local()
+
+
+def _decompressor() -> zstandard.ZstdDecompressor:
+    if not hasattr(_local, "zstd"):
+        _local.zstd = zstandard.ZstdDecompressor()
+    found: zstandard.ZstdDecompressor = _local.zstd
+    return found
+
+
+def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
+    """`size` bytes, or FormatError: neither more is produced nor allocated than `size`."""
+    try:
+        if name == "zstd":
+            if zstandard.frame_content_size(data) not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+                raise FormatError(f"{where}: expected {size} bytes, the zstd frame says {zstandard.frame_content_size(data)}")
+            found: Any = _decompressor().decompress(data, max_output_size=size)
+        elif name == "lz4":
+            found = lz4.frame.LZ4FrameDecompressor().decompress(bytes(data), max_length=size + 1)
+        elif name == "":
+            found = data
+        else:
+            raise FormatError(f"{where}: expected compression zstd, lz4 or none, found {name[:20]!r}")
+    except (zstandard.ZstdError, RuntimeError, MemoryError) as err:
+        raise FormatError(f"{where}: the compressed data is damaged: {err}") from err
+    if len(found) != size:
+        raise FormatError(f"{where}: expected {size} bytes after decompression, found {len(found)}")
+    return found

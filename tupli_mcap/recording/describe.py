@@ -1,0 +1,147 @@
+"""What there is to say about a recording without reading a step: counts, sizes, spaces, channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from tupli_mcap.recording.events import END_NAMES
+from tupli_mcap.recording.lock import is_locked
+from tupli_mcap.recording.reader import Recording
+
+__all__ = ["ChannelFacts", "RecordingDescription", "Spread", "describe", "describe_space", "state_of"]
+
+
+class Spread(NamedTuple):
+    """Of one number an episode: mean, population standard deviation, smallest, largest."""
+
+    mean: float
+    std: float
+    min: float
+    max: float
+
+
+class ChannelFacts(NamedTuple):
+    """A channel: `size` is what its messages take in memory, `stored` in the file (bytes)."""
+
+    topic: str
+    schema: str
+    messages: int
+    size: int
+    stored: int
+
+
+@dataclass(frozen=True)
+class RecordingDescription:
+    """Facts about a recording; spaces and spreads are None where there is no step or no episode.
+
+    state: "complete", "recording" (a writer is at work) or "recovered" (a writer was killed).
+    size: bytes of the file. created_ns, start_ns, end_ns: wall clock; the latter two are 0 without an episode.
+    compression: bytes of messages for one byte of chunks in the file; None without a chunk.
+    ends: episodes by how they ended. environment: the name its benchmark says, None if it carries none.
+    """
+
+    name: str
+    uuid: str
+    state: str
+    size: int
+    library: str
+    created_ns: int
+    start_ns: int
+    end_ns: int
+    benchmark_id: str
+    environment: str | None
+    num_envs: int
+    episodes: int
+    steps: int
+    ends: dict[str, int]
+    lengths: Spread | None
+    returns: Spread | None
+    observation_space: str | None
+    action_space: str | None
+    compression: float | None
+    channels: list[ChannelFacts]
+    attachments: list[dict[str, Any]]
+
+
+def describe(recording: Recording) -> RecordingDescription:
+    """The facts; only the summary, the episode index and `benchmark.json` are read.
+
+    Raises:
+        FormatError: the environment that the recording carries is damaged.
+    """
+    rows = recording.index
+    channels = _channels(recording)
+    stored = sum(channel.stored for channel in channels)
+    carried = "benchmark.json" in recording.attachments
+    return RecordingDescription(
+        name=recording.name,
+        uuid=recording.uuid,
+        state=state_of(recording),
+        size=recording._source.size,
+        library=recording.metadata.get("library", ""),
+        created_ns=recording.created_ns,
+        start_ns=int(rows["start_time"].min()) if len(rows) else 0,
+        end_ns=int(rows["end_time"].max()) if len(rows) else 0,
+        benchmark_id=recording.benchmark_id,
+        environment=recording.benchmark.record.name if carried else None,
+        num_envs=recording.num_envs,
+        episodes=len(rows),
+        steps=recording.num_steps,
+        ends={name: int((rows["end"] == i).sum()) for i, name in enumerate(END_NAMES)},
+        lengths=_spread(rows["length"]),
+        returns=_spread(rows["return"]),
+        observation_space=describe_space(recording.observation_space) if recording.num_envs else None,
+        action_space=describe_space(recording.action_space) if recording.num_envs else None,
+        compression=sum(channel.size for channel in channels) / stored if stored else None,
+        channels=channels,
+        attachments=[info._asdict() for info in recording.attachments.values()],
+    )
+
+
+def state_of(recording: Recording) -> str:
+    """ "complete", "recording" (a writer is at work) or "recovered" (a writer was killed)."""
+    if recording.complete:
+        return "complete"
+    return "recording" if recording.path is not None and is_locked(recording.path) else "recovered"
+
+
+def describe_space(space: gym.Space[Any]) -> str:
+    """A space in one line: `Box(-inf, inf, (4,), float32)`; bounds that differ are given as their range."""
+    if isinstance(space, gym.spaces.Box):
+        low, high = _bound(space.low), _bound(space.high)
+        return f"Box({low}, {high}, {space.shape}, {space.dtype})"
+    if isinstance(space, gym.spaces.Dict):
+        return f"Dict({', '.join(f'{key!r}: {describe_space(inner)}' for key, inner in space.items())})"
+    if isinstance(space, gym.spaces.Tuple):
+        return f"Tuple({', '.join(describe_space(inner) for inner in space)})"
+    return " ".join(str(space).split())
+
+
+def _bound(values: np.ndarray[Any, Any]) -> str:
+    if values.size == 0:
+        return "-"
+    low, high = values.min(), values.max()
+    return f"{low:g}" if low == high else f"{low:g}..{high:g}"
+
+
+def _spread(values: np.ndarray[Any, Any]) -> Spread | None:
+    if len(values) == 0:
+        return None
+    numbers = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # infinite returns have no spread
+        return Spread(float(numbers.mean()), float(numbers.std()), float(numbers.min()), float(numbers.max()))
+
+
+def _channels(recording: Recording) -> list[ChannelFacts]:
+    contents = recording._contents
+    facts = []
+    for channel in contents.channels.values():
+        chunks = contents.table[contents.table["channel"] == channel.id]
+        schema = contents.schemas.get(channel.schema_id)
+        sizes = (int(chunks[name].sum()) for name in ("rows", "uncompressed", "length"))
+        facts.append(ChannelFacts(channel.topic, "" if schema is None else schema.name, *sizes))
+    return facts

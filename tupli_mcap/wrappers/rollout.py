@@ -1,0 +1,212 @@
+"""Rollouts recorded in one call: make the environment, run a policy, write one file."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+
+from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.recording.infos import RecordInfo
+from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.writer import Mode
+from tupli_mcap.wrappers.benchmark import benchmark_attachments
+from tupli_mcap.wrappers.single import RecordEpisodes
+from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
+
+__all__ = ["Policy", "RolloutSummary", "load_policy", "record_rollouts"]
+
+Policy = Callable[[Any], Any]
+"""From one observation (never a batch) to one action."""
+
+_REPORTS = 200  # progress is told about so often in a rollout
+
+
+class RolloutSummary(NamedTuple):
+    """What one call recorded; `return_mean` is over the episodes that ended, None if none did.
+
+    `episodes` counts interrupted ones too, `size` is the whole file's (bytes).
+    """
+
+    path: Path
+    episodes: int
+    steps: int
+    return_mean: float | None
+    seconds: float
+    size: int
+
+
+def record_rollouts(
+    env_id: str,
+    path: str | os.PathLike[str],
+    *,
+    steps: int = 1000,
+    seed: int | None = None,
+    num_envs: int = 1,
+    policy: Policy | None = None,
+    mode: Mode = "x",
+    compression: str = "zstd",
+    record_info: RecordInfo = False,
+    progress: Callable[[int], None] | None = None,
+) -> RolloutSummary:
+    """Records `steps` steps of a registered environment into the MCAP file `path`.
+
+    Args:
+        env_id: as `gymnasium.make` takes it; "module:Name-v0" imports the module first.
+        steps: in total; with several sub-environments at least so many. The last episode may end "interrupted".
+        seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
+        num_envs: more than 1 records a SyncVectorEnv.
+        policy: called with one observation, returns one action; random actions by default.
+        mode, compression, record_info: as `RecordEpisodes` has them.
+        progress: called with the number of steps so far, a few hundred times.
+
+    Raises:
+        RecordingError: the environment cannot be made, the policy or the environment failed (what was recorded
+            before is in the file), or the file cannot be written.
+        SpaceError: a space that cannot be recorded.
+    """
+    if steps < 1 or num_envs < 1:
+        raise RecordingError(f"expected at least 1 step and 1 environment, found {steps} and {num_envs}")
+    began = time.perf_counter()
+    known = _episodes_in(Path(path)) if mode == "a" else 0
+    report = _every(max(1, steps // _REPORTS), progress)
+    with contextlib.closing(_make(env_id, num_envs)) as made:
+        if isinstance(made, gym.vector.VectorEnv):
+            attachments = benchmark_attachments(made.envs[0]) if hasattr(made, "envs") else {}
+            vector = RecordVectorEpisodes(
+                made, path, mode=mode, compression=compression, record_info=record_info, attachments=attachments
+            )
+            with vector:
+                done = _run_vector(vector, steps, seed, policy, report)
+        else:
+            with RecordEpisodes(made, path, mode=mode, compression=compression, record_info=record_info) as single:
+                done = _run(single, steps, seed, policy, report)
+    with Recording(path) as recording:
+        rows = recording.index[known:]
+        ended = rows["return"][rows["end"] != 2]
+        mean = float(ended.mean()) if len(ended) else None
+    return RolloutSummary(
+        Path(path), len(rows), done, mean, time.perf_counter() - began, Path(path).stat().st_size
+    )
+
+
+def load_policy(name: str) -> Policy:
+    """The function that "module:function" names; the module is imported.
+
+    Raises:
+        RecordingError: there is no such module or function, or importing it failed.
+    """
+    module_name, _, function_name = name.partition(":")
+    if not module_name or not function_name:
+        raise RecordingError(f"the policy {name!r} must have the form module:function")
+    try:
+        value: Any = importlib.import_module(module_name)
+        for part in function_name.split("."):
+            value = getattr(value, part)
+    except Exception as err:  # whatever the module does when it is imported
+        raise RecordingError(f"the policy {name!r} cannot be imported: {_reason(err)}") from err
+    if not callable(value):
+        raise RecordingError(f"the policy {name!r} must be a function, found {type(value).__name__}")
+    policy: Policy = value
+    return policy
+
+
+def _make(env_id: str, num_envs: int) -> gym.Env[Any, Any] | gym.vector.SyncVectorEnv:
+    try:
+        if num_envs == 1:
+            return gym.make(env_id)
+        return gym.vector.SyncVectorEnv([lambda: gym.make(env_id)] * num_envs)
+    except Exception as err:  # an environment's constructor may raise anything
+        raise RecordingError(f"the environment {env_id!r} cannot be made: {_reason(err)}") from err
+
+
+def _run(
+    env: RecordEpisodes, steps: int, seed: int | None, policy: Policy | None, report: Callable[[int], None]
+) -> int:
+    env.action_space.seed(seed)
+    ended, again = True, seed
+    state: Any = None
+    for done in range(steps):
+        with _failures(done, env.path):
+            if ended:
+                state, _ = env.reset(seed=again)
+                again = None
+            action = env.action_space.sample() if policy is None else policy(state)
+            state, _, terminal, timeout, _ = env.step(action)
+            ended = bool(terminal or timeout)
+        report(done + 1)
+    return steps
+
+
+def _run_vector(
+    env: RecordVectorEpisodes,
+    steps: int,
+    seed: int | None,
+    policy: Policy | None,
+    report: Callable[[int], None],
+) -> int:
+    env.action_space.seed(seed)
+    done = 0
+    with _failures(done, env.path):
+        states, _ = env.reset(seed=seed)
+    resetting = np.zeros(env.num_envs, dtype=np.bool_)
+    next_step = "next" in str(env.metadata.get("autoreset_mode", "next")).lower()
+    while done < steps:
+        with _failures(done, env.path):
+            actions = env.action_space.sample() if policy is None else _actions(env, policy, states)
+            states, _, terminals, timeouts, _ = env.step(actions)
+            done += env.num_envs - int(resetting.sum())
+            if next_step:  # the step after an end is a reset, which is not recorded
+                resetting = np.logical_or(terminals, timeouts)
+        report(done)
+    return done
+
+
+def _actions(env: RecordVectorEpisodes, policy: Policy, states: Any) -> Any:
+    space = env.single_action_space
+    chosen = [policy(state) for state in iterate(env.observation_space, states)]
+    return concatenate(space, chosen, create_empty_array(space, env.num_envs))
+
+
+@contextlib.contextmanager
+def _failures(done: int, path: Path) -> Iterator[None]:
+    """Says at which step somebody else's code failed."""
+    try:
+        yield
+    except (TupliError, OSError):
+        raise
+    except Exception as err:
+        raise RecordingError(
+            f"the policy or the environment failed at step {done}: {_reason(err)}; {path} holds the steps before it"
+        ) from err
+
+
+def _every(interval: int, progress: Callable[[int], None] | None) -> Callable[[int], None]:
+    if progress is None:
+        return lambda done: None
+    told = 0
+
+    def report(done: int) -> None:
+        nonlocal told
+        if done >= told + interval:
+            told = done
+            progress(done)
+
+    return report
+
+
+def _episodes_in(path: Path) -> int:
+    with Recording(path) as recording:
+        return len(recording)
+
+
+def _reason(err: Exception) -> str:
+    return f"{type(err).__name__}: {' '.join(str(err).split())[:300]}"
