@@ -216,17 +216,20 @@ def _cut(text: str, width: int, end: Literal["start", "end"]) -> str:
 
     if cell_len(text) <= width:
         return text
+    text = text[-4 * width :] if end == "start" else text[: 4 * width]
     while cell_len(text) > width - 1:
         text = text[1:] if end == "start" else text[:-1]
     return "…" + text if end == "start" else text + "…"
 
 
 def _print_lines(lines: Sequence[str]) -> None:
+    """The first in bold; rich takes too long for the many others."""
     from rich.console import Console
     from rich.text import Text
 
     width = terminal_width()
-    console = Console(width=width or 10_000, highlight=False, soft_wrap=width is None)
-    console.print(Text(lines[0], style="bold", no_wrap=True, overflow="ellipsis"))
-    for line in lines[1:]:
-        console.print(Text(line, no_wrap=True, overflow="ellipsis"))
+    if width is not None:
+        lines = [_cut(line, width, "end") for line in lines]
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(Text(lines[0], style="bold"))
+    print("\n".join(lines[1:]))

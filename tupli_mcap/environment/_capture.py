@@ -51,6 +51,7 @@ class Snapshot:
             self._copy = InProcessCopy(env)
         except Exception as err:  # noqa: BLE001 - any class may fail to pickle in its own way
             self._failure = err
+        _renew_attributes(env)
 
     def restore(self) -> gym.Env[Any, Any]:
         """A new environment of the same classes in the captured state.
@@ -176,6 +177,19 @@ def _layers(env: gym.Env[Any, Any]) -> Iterator[gym.Env[Any, Any]]:
         if not isinstance(env, gym.Wrapper):
             return
         env = env.env
+
+
+def _renew_attributes(env: gym.Env[Any, Any]) -> None:
+    """Make attribute access of a pickled environment as quick as it was before.
+
+    Until 3.13, Python keeps an instance's attributes outside a dict until somebody asks for `__dict__`, as pickling
+    does; from then on each of them is slower to reach (0.6 us a step of CartPole). An equal new dict mends that.
+    """
+    if sys.version_info >= (3, 13):
+        return
+    for layer in _layers(env):
+        with contextlib.suppress(AttributeError, TypeError):
+            layer.__dict__ = dict(layer.__dict__)
 
 
 def _forget_cached_specs(env: gym.Env[Any, Any]) -> None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from tupli_mcap.recording.chunks import IN_MEMORY
 from tupli_mcap.recording.events import END_NAMES
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
@@ -75,7 +76,9 @@ def describe(recording: Recording) -> RecordingDescription:
     """
     rows = recording.index
     channels = _channels(recording)
-    stored = sum(channel.stored for channel in channels)
+    table = recording._contents.table
+    chunks = table[table["offset"] < IN_MEMORY]
+    stored = int(chunks["length"].sum())
     carried = "benchmark.json" in recording.attachments
     return RecordingDescription(
         name=recording.name,
@@ -96,7 +99,7 @@ def describe(recording: Recording) -> RecordingDescription:
         returns=_spread(rows["return"]),
         observation_space=describe_space(recording.observation_space) if recording.num_envs else None,
         action_space=describe_space(recording.action_space) if recording.num_envs else None,
-        compression=sum(channel.size for channel in channels) / stored if stored else None,
+        compression=int(chunks["uncompressed"].sum()) / stored if stored else None,
         channels=channels,
         attachments=[info._asdict() for info in recording.attachments.values()],
     )
@@ -142,6 +145,7 @@ def _channels(recording: Recording) -> list[ChannelFacts]:
     for channel in contents.channels.values():
         chunks = contents.table[contents.table["channel"] == channel.id]
         schema = contents.schemas.get(channel.schema_id)
-        sizes = (int(chunks[name].sum()) for name in ("rows", "uncompressed", "length"))
-        facts.append(ChannelFacts(channel.topic, "" if schema is None else schema.name, *sizes))
+        rows, size = int(chunks["rows"].sum()), int(chunks["uncompressed"].sum())
+        stored = int(chunks["length"][chunks["offset"] < IN_MEMORY].sum())
+        facts.append(ChannelFacts(channel.topic, "" if schema is None else schema.name, rows, size, stored))
     return facts
