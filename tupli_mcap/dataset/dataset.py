@@ -54,8 +54,8 @@ class TupliDataset:
     def __init__(self, storage: TupliStorage, info: dict[str, Any] | None = None) -> None:
         if not isinstance(storage, TupliStorage):
             raise DatasetError(
-                f"expected a storage, such as FileStorage('lab'), found {storage!r:.80}; recordings that are in no "
-                "storage are opened with TupliDataset.from_files(...)"
+                f"expected a storage, such as FileStorage('lab'), found {storage!r:.80}; recordings "
+                "that are in no storage are opened with TupliDataset.from_files(...)"
             )
         self._setup(StorageSource(storage), info)
 
@@ -157,8 +157,8 @@ class TupliDataset:
 
         Steps are read at the first access to an item. Use `preview()` for facts about episodes only.
         """
-        query = self._query
-        return EpisodeItems(query.headers, lambda: (query.read(SIX), query.selected.lengths, query.layout))
+        query, headers = self._query, self._query.headers
+        return EpisodeItems(headers, lambda: query.columns_of(headers, SIX))
 
     @property
     def tuples(self) -> Sequence[RLTuple]:
@@ -333,7 +333,9 @@ class TupliDataset:
             "episodes": self._query.episode_filter,
             "tuples": self._query.tuple_filter,
         }
-        return display.Facts(repr(self._query.source), headers, selected and selected.steps, filters)
+        return display.Facts(
+            repr(self._query.source), headers, None if selected is None else selected.steps, filters
+        )
 
     def __repr__(self) -> str:
         return display.text(type(self).__name__, self._facts())

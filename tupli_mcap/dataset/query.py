@@ -18,6 +18,8 @@ from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_
 
 __all__ = ["Query"]
 
+Array = np.ndarray[Any, Any]
+
 
 class Query:
     """What a dataset asks for. The filters never change; what has been read always belongs to `headers`.
@@ -100,6 +102,16 @@ class Query:
         copies = {field: pick(self._columns[field], slice(None)) for field in fields if field not in found}
         return {field: found[field] if field in found else copies[field] for field in fields}
 
+    def columns_of(
+        self, headers: Sequence[EpisodeHeader], fields: Sequence[str]
+    ) -> tuple[dict[str, Any], Array, StepLayout | None]:
+        """Columns of episodes that were listed some time, the number of steps of each, and their layout."""
+        if _identity(headers) == _identity(self.headers):
+            columns = self.read(fields)
+            return columns, self.selected.lengths, self.layout
+        columns, selected, layout = read_columns(self.source, headers, fields, self._selector)
+        return columns, selected.lengths, layout
+
     def _missing(self, fields: Sequence[str]) -> dict[str, Any]:
         missing = [field for field in fields if field not in self._columns]
         if not missing:
@@ -126,6 +138,6 @@ def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
     return [(header.id, header.n_tuples, header.recording) for header in headers]
 
 
-def _frozen(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def _frozen(array: Array) -> Array:
     array.flags.writeable = False
     return array
