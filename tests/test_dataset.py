@@ -802,6 +802,7 @@ def test_a_bar_after_a_second(
     dataset.with_tuple_filter(None).load()
     assert capsys.readouterr() == ("", ""), "nobody is looking"
     monkeypatch.setattr(progress, "_visible", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")  # what makes rich believe in a terminal
     threads = set(threading.enumerate())
     dataset.with_tuple_filter(None).load()
     out, err = capsys.readouterr()
