@@ -181,13 +181,12 @@ def _read_block(
     found = recording.read(None if everything else positions, fields=recorded)  # type: ignore[arg-type]
     columns = {field: getattr(found, field) for field in recorded}
     now = found.episode_lengths
-    steps = _steps_within(now)
     if "steps" in fields:
-        columns["steps"] = steps
+        columns["steps"] = _steps_within(now)
     if "infos" in fields:
         columns["infos"] = [info for i in positions.tolist() for info in _infos(recording, i)]
     if (now > lengths).any():
-        listed = steps < np.repeat(lengths, now)
+        listed = _steps_within(now) < np.repeat(lengths, now)
         columns = {field: pick(column, listed) for field, column in columns.items()}
     return columns
 
