@@ -52,6 +52,7 @@ class ChunkStore:
         self._cached = 0
         self._lock = threading.Lock()
         self._offsets: dict[int, list[tuple[int, int]]] = {}
+        self._views: dict[int, np.ndarray[Any, Any]] = {}  # of cached chunks, their headers checked
         self._by_channel: dict[int, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
         for channel in np.unique(table["channel"]):
             chosen = np.flatnonzero(table["channel"] == channel)
@@ -108,6 +109,7 @@ class ChunkStore:
                 while self._cached > self._budget and len(self._cache) > 1:
                     old, dropped = self._cache.popitem(last=False)
                     self._offsets.pop(old, None)
+                    self._views.pop(old, None)
                     self._cached -= len(dropped)
         return data
 
@@ -134,6 +136,9 @@ class ChunkStore:
 
     def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> np.ndarray[Any, Any]:
         """The rows of a chunk of constant layout as one structured array; their headers are checked."""
+        view = self._views.get(i)
+        if view is not None:
+            return view
         data = self.load(i, keep=keep)
         row = self.table[i]
         n = int(row["rows"])
@@ -145,6 +150,8 @@ class ChunkStore:
         good = (rows["#opcode"] == 5).all() and (rows["#length"] == dtype.itemsize - 9).all()
         if not (good and (rows["#channel"] == row["channel"]).all()):
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
+        if i in self._cache:
+            self._views[i] = rows
         return rows
 
     def messages(self, i: int) -> list[tuple[int, int]]:

@@ -20,6 +20,7 @@ __all__ = ["FIELDS", "ColumnReader", "Columns", "Run", "runs_of"]
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states")
 Array = np.ndarray[Any, Any]
+_FEW_TASKS = 4  # fewer are done before a thread pool has started
 
 
 @dataclass
@@ -111,7 +112,7 @@ class ColumnReader:
             if leaf.kind == "image":
                 moved = [run._replace(channel=self._images[leaf.name][run.channel]) for run in runs]
                 tasks += self._tasks(moved, ["data"], {"data": out[leaf.name]}, layout.image_messages[leaf.name].dtype, keep)
-        if threads > 1 and len(tasks) > 1:
+        if threads > 1 and len(tasks) > _FEW_TASKS:
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(lambda task: task(), tasks))
         else:

@@ -49,9 +49,12 @@ def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, i
 def group_records(data: memoryview) -> list[Rows]:
     """The records in `data` by channel, in their order."""
     groups: dict[int, tuple[list[bytes], list[int], list[int], int]] = {}
+    whole = bytes(data)
     for start, end, channel, sequence, log_time in iter_records(data):
-        parts, sizes, times, _ = groups.setdefault(channel, ([], [], [], sequence))
-        parts.append(bytes(data[start:end]))
+        if channel not in groups:
+            groups[channel] = ([], [], [], sequence)
+        parts, sizes, times, _ = groups[channel]
+        parts.append(whole[start:end])
         sizes.append(end - start)
         times.append(log_time)
     rows = []
@@ -87,13 +90,12 @@ class EventLog:
         """Adds messages (channel, CDR body), all or none of them after a crash; returns their log_time."""
         if time_ns > self._time:
             self._time = time_ns
-        time_ns, parts = self._time, []
+        time_ns, data, sequences = self._time, b"", self.sequences
         for channel, body in messages:
-            sequence = self.sequences[channel]
-            self.sequences[channel] = sequence + 1
-            parts.append(_EVENT.pack(5, _EVENT.size - 9 + len(body), channel, sequence, time_ns, time_ns, CDR_HEADER))
-            parts.append(body)
-        data = b"".join(parts)
+            sequence = sequences[channel]
+            sequences[channel] = sequence + 1
+            head = _EVENT.pack(5, _EVENT.size - 9 + len(body), channel, sequence, time_ns, time_ns, CDR_HEADER)
+            data += head + body
         end = self._position + len(data)
         if end > self._capacity:
             self.flush()

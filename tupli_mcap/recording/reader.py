@@ -27,6 +27,7 @@ from tupli_mcap.recording.summary import read_attachment
 __all__ = ["AttachmentInfo", "RecordedBenchmark", "Recording"]
 
 CACHE_BYTES = 512 << 20
+_THREADS = min(4, os.cpu_count() or 1)
 
 
 class AttachmentInfo(NamedTuple):
@@ -272,7 +273,7 @@ class Recording:
         columns = Columns(lengths)
         if self._layout is None:
             return columns
-        threads = threads or min(4, os.cpu_count() or 1)
+        threads = threads or _THREADS
         keep = episodes is not None
         needed = [field for field in fields if field != "next_states"]
         if "next_states" in fields and "states" not in needed:

@@ -59,12 +59,15 @@ class VectorRecorder:
         self._actions = batch_space(spaces.action_space, num_envs)
         self._first: Any = None
         self._facts: list[ResetFacts | None] = [None] * num_envs
-        self._fresh = False
+        self._fresh = False  # some sub-environments have no episode:
+        self._waiting = set(range(num_envs))
         self._episodes: list[StartedEpisode | None] = [None] * num_envs
         self._numbers = np.zeros(num_envs, dtype=np.uint32)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
         self._totals: Array = np.zeros(num_envs)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
+        self._any_ended = False
+        self._everybody = np.ones(num_envs, dtype=np.bool_)
         self._texts = ["{}"] * num_envs
         self._was_reset = False
         self._refused = False
@@ -79,10 +82,12 @@ class VectorRecorder:
             StepError: a state cannot be stored exactly.
         """
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
+        ended = self._ended.copy()
         for i in chosen:
             self._end(int(i), INTERRUPTED)
             self._facts[int(i)] = facts[int(i)]
-            self._ended[int(i)] = False
+            ended[int(i)] = False
+        self._ended, self._any_ended = ended, bool(ended.any())
         self._fresh = True
         self._was_reset = True
         self._refused = False
@@ -129,23 +134,30 @@ class VectorRecorder:
         terminals, timeouts = np.asarray(terminals, dtype=np.bool_), np.asarray(timeouts, dtype=np.bool_)
         if self._writer.vector is None:
             self._begin(actions, states, rewards)
-        holes = self._ended if self._autoreset == "NextStep" and self._ended.any() else None
+        done = terminals | timeouts
+        any_done = bool(done.any())
+        holes = self._ended if self._any_ended and self._autoreset == "NextStep" else None
         active = None if holes is None else ~holes
         try:
-            finals = self._finals(states, terminals | timeouts, infos)
+            finals = self._finals(done, infos) if any_done and self._autoreset == "SameStep" else {}
             if self._fresh:
                 self._start(active)
             self._store(actions, states, rewards, terminals, timeouts, active, finals)
         except StepError:
             self.refuse()
             raise
-        stepped = np.ones(self._n, dtype=np.bool_) if active is None else active
-        self._lengths += stepped
-        self._totals += rewards.reshape(self._n, -1).sum(axis=1) * stepped if rewards.ndim > 1 else rewards * stepped
-        if holes is not None:
-            self._note_resets(holes, infos)
-        self._ended = (terminals | timeouts) & stepped
-        return stepped
+        totals = rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1)
+        if active is None:
+            self._lengths += 1
+            self._totals += totals
+            self._ended, self._any_ended = done, any_done
+            return self._everybody
+        self._lengths += active
+        self._totals += totals * active
+        self._note_resets(~active, infos)
+        self._ended = done & active
+        self._any_ended = bool(self._ended.any())
+        return active
 
     def note_metadata(self, texts: Sequence[str]) -> None:
         """The metadata (JSON texts) of the running episodes, by sub-environment."""
@@ -153,10 +165,10 @@ class VectorRecorder:
 
     def finish(self, terminals: Any) -> None:
         """Ends the episodes that ended in the batch just put."""
-        if not self._ended.any():
+        if not self._any_ended:
             return
-        for i in np.flatnonzero(self._ended):
-            self._end(int(i), TERMINAL if terminals[i] else TIMEOUT)
+        for i in np.flatnonzero(self._ended).tolist():
+            self._end(i, TERMINAL if terminals[i] else TIMEOUT)
         if self._autoreset == "SameStep":
             self._after_same_step()
 
@@ -199,19 +211,17 @@ class VectorRecorder:
             self._spaces.observation_space, self._spaces.action_space, self._spaces.reward_space, dtypes
         )
 
-    def _finals(self, states: Any, done: Array, infos: Mapping[str, Any]) -> dict[int, Any]:
+    def _finals(self, done: Array, infos: Mapping[str, Any]) -> dict[int, Any]:
         """The final states of a same-step autoreset."""
-        if self._autoreset != "SameStep" or not done.any():
-            return {}
         given = infos.get("final_obs", infos.get("final_observation"))
         if given is None:
             raise StepError("expected infos['final_obs'] for episodes that end under same-step autoreset, found none")
         return {int(i): given[i] for i in np.flatnonzero(done)}
 
     def _start(self, active: Array | None) -> None:
-        for i, facts in enumerate(self._facts):
-            if self._episodes[i] is not None or (active is not None and not active[i]):
-                continue
+        waiting = sorted(i for i in self._waiting if active is None or active[i])
+        for i in waiting:
+            facts = self._facts[i]
             if facts is None:  # stepped on after an end, without a reset
                 facts = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
             episode = self._writer.start_episode(i, self._count(i), facts)
@@ -222,7 +232,8 @@ class VectorRecorder:
             self._totals[i] = 0.0
             if isinstance(self._writer.vector, list):
                 self._writer.vector[i].begin_episode(episode.number)
-        self._fresh = any(episode is None for episode in self._episodes)
+        self._waiting -= set(waiting)
+        self._fresh = bool(self._waiting)
 
     def _count(self, i: int) -> int:
         store = self._writer.vector
@@ -268,8 +279,8 @@ class VectorRecorder:
 
     def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
         now = time.time_ns()
-        for i in np.flatnonzero(holes):
-            info = info_of(infos, int(i))
+        for i in np.flatnonzero(holes).tolist():
+            info = info_of(infos, i) if infos else None
             text = jsonvalue.dumps(info, fallback=repr) if info else "{}"
             self._facts[i] = ResetFacts(None, None, "", text, now)
         self._fresh = True
@@ -279,7 +290,7 @@ class VectorRecorder:
         for i in np.flatnonzero(self._ended):
             self._facts[i] = ResetFacts(None, None, "", "{}", now)
         self._fresh = True
-        self._ended = np.zeros(self._n, dtype=np.bool_)
+        self._any_ended = False
 
     # ---- ends
 
@@ -289,6 +300,7 @@ class VectorRecorder:
         if episode is None:
             return
         self._fresh = True
+        self._waiting.add(i)
         final = self._final_bytes.pop(i, None)
         if final is None:
             store: Any = self._writer.vector

@@ -57,6 +57,7 @@ class VectorRows:
         self._state = [self._writer(leaf) for leaf in layout.state if leaf.kind != "image"]
         self._action = [self._writer(leaf) for leaf in layout.action]
         self._reward = [self._writer(leaf) for leaf in layout.reward]
+        self._nested = any(leaf.keys for leaf in layout.leaves)
         self._flags = (self._rows["terminal"], self._rows["timeout"])
         self._episode = self._rows["episode"]
         self._time = self._rows["#log_time"]
@@ -82,8 +83,9 @@ class VectorRows:
 
     def check(self, action: Any, state: Any, reward: Any) -> Any:
         """A batch as `put` takes it; StepError if it cannot be stored."""
-        check_structure(self._layout.action_space, action, "action")
-        check_structure(self._layout.observation_space, state, "state")
+        if self._nested:
+            check_structure(self._layout.action_space, action, "action")
+            check_structure(self._layout.observation_space, state, "state")
         return self._checked(self._action, action), self._checked(self._reward, reward), self._checked(self._state, state)
 
     def put_state(self, state: Any, mask: Array | None = None) -> None:
