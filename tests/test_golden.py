@@ -1,0 +1,261 @@
+"""Frozen recordings, one a feature: today's code reads them, writes them, and other readers agree.
+
+`tools/make_golden.py` wrote them; the values beside them are from the environments, not from the files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.container import PROFILE
+from tupli_mcap.recording.contents import read_contents
+from tupli_mcap.recording.source import PathSource
+from tupli_mcap.recording.writer import RecordingWriter, WriterOptions
+
+ROOT = Path(__file__).parents[1]
+GOLDEN = ROOT / "tests" / "golden"
+NAMES = sorted(path.stem for path in GOLDEN.glob("*.mcap"))
+UNFINISHED = [name for name in NAMES if name.startswith("unfinished")]
+UNCOMPRESSED = [name for name in NAMES if name not in ("constant_zstd", "constant_lz4")]
+COLUMNS = ("states", "actions", "rewards", "terminals", "timeouts")
+
+
+def load_tool() -> Any:
+    spec = importlib.util.spec_from_file_location("make_golden", ROOT / "tools" / "make_golden.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["make_golden"] = module  # dataclasses and pickles look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def expected(name: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = jsonvalue.loads((GOLDEN / f"{name}.json").read_text(encoding="utf-8"))
+    return found
+
+
+def place(name: str, directory: Path) -> Path:
+    """A copy of a golden recording, its journal beside it."""
+    path = Path(shutil.copy(GOLDEN / f"{name}.mcap", directory))
+    if name in UNFINISHED:
+        (directory / f"{name}.mcap.journal").write_bytes(unpacked_journal(name, GOLDEN))
+    return path
+
+
+def unpacked_journal(name: str, directory: Path) -> bytes:
+    packed = (directory / f"{name}.mcap.journal.zst").read_bytes()
+    return zstandard.ZstdDecompressor().decompress(packed)
+
+
+def finished(name: str, directory: Path) -> Path:
+    """The same, with a summary: an unfinished one is recovered."""
+    path = place(name, directory)
+    if name in UNFINISHED:
+        RecordingWriter(path, WriterOptions(mode="a", compression="none")).close()
+    return path
+
+
+def as_read(recording: Recording) -> Iterator[dict[str, Any]]:
+    """What `expected` has, from a recording: by sub-environment, in the order of its rows."""
+    for episode in sorted(recording.episodes, key=lambda e: (e.env, e.number)):
+        steps = list(episode)
+        columns = {name: [step[i] for step in steps] for i, name in enumerate(COLUMNS)}
+        yield {
+            **columns,
+            "seed": episode.seed,
+            "options": episode.options,
+            "reset_info": episode.reset_info,
+            "final_state": episode.final_state,
+            "end": episode.end,
+            "env": episode.env,
+            "metadata": episode.metadata,
+            "return": episode.return_,
+            "infos": episode.infos,
+        }
+
+
+def assert_same(found: list[dict[str, Any]], wanted: list[dict[str, Any]]) -> None:
+    """The same types, dtypes, shapes and bytes: compared as exact JSON, entry by entry."""
+    assert len(found) == len(wanted)
+    for number, (one, other) in enumerate(zip(found, wanted, strict=True)):
+        assert one.keys() == other.keys()
+        for key, value in one.items():
+            assert jsonvalue.dumps(value) == jsonvalue.dumps(other[key]), (number, key)
+
+
+def test_there_is_one_for_each_feature_and_all_are_small() -> None:
+    assert set(NAMES) == set(load_tool().FEATURES)
+    assert sum(path.stat().st_size for path in GOLDEN.iterdir()) < 300 * 1024
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reads_what_the_environment_returned(name: str, tmp_path: Path) -> None:
+    with Recording(place(name, tmp_path)) as recording:
+        assert recording.complete == (name not in UNFINISHED)
+        assert_same(list(as_read(recording)), expected(name))
+        number = load_tool().FEATURES
+        assert int(recording.uuid, 16) == 1 + list(number).index(name) or name == "rewritten"
+        assert recording.num_steps == sum(len(episode["rewards"]) for episode in expected(name))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_columns_are_the_steps(name: str, tmp_path: Path) -> None:
+    with Recording(place(name, tmp_path)) as recording:
+        columns = recording.read()
+        wanted = [step for episode in recording.episodes for step in episode]
+        layout = recording.layout
+        for leaf in layout.state:
+            column = leaf.get(columns.states)
+            assert len(column) == len(wanted)
+            for value, step in zip(column, wanted, strict=True):
+                assert jsonvalue.dumps(
+                    np.asarray(value) if leaf.kind != "variable" else value
+                ) == jsonvalue.dumps(
+                    np.asarray(leaf.get(step.state)) if leaf.kind != "variable" else leaf.get(step.state)
+                )
+        assert columns.terminals.tolist() == [step.terminal for step in wanted]
+        assert columns.timeouts.tolist() == [step.timeout for step in wanted]
+
+
+@pytest.mark.parametrize("name", UNFINISHED)
+def test_finishing_an_unfinished_one_loses_nothing(name: str, tmp_path: Path) -> None:
+    with Recording(finished(name, tmp_path)) as recording:
+        assert recording.complete
+        assert_same(list(as_read(recording)), expected(name))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_other_readers_decode_every_message(name: str, tmp_path: Path) -> None:
+    path = finished(name, tmp_path)
+    with Recording(path) as recording:
+        layout, steps, episodes = recording.layout, recording.num_steps, len(recording)
+        lengths = {episode.number: len(episode) for episode in recording.episodes}
+        states = {e.number: [step.state for step in e] for e in recording.episodes}
+    seen: dict[str, int] = {}
+    places = set()
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == PROFILE
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            topic = channel.topic.rpartition("/")[2] if channel.topic.endswith("/step") else channel.topic
+            seen[topic] = seen.get(topic, 0) + 1
+            assert message.log_time == message.publish_time
+            if topic != "step":
+                continue
+            places.add((decoded.episode, decoded.step))
+            for leaf in layout.state:
+                if leaf.kind not in ("variable", "image") and leaf.size:
+                    value = np.asarray(leaf.get(states[decoded.episode][decoded.step]))
+                    raw = value.view(np.uint16) if value.dtype == np.float16 else value
+                    stored = getattr(decoded, leaf.name)
+                    stored = np.asarray(list(stored) if isinstance(stored, bytes) else stored)
+                    stored = stored.reshape(value.shape)
+                    np.testing.assert_array_equal(stored, raw, err_msg=leaf.path)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == sum(seen.values())
+        assert {a.name for a in summary.attachment_indexes} >= {"episodes.index"}
+        assert sum(1 for _ in reader.iter_attachments()) == len(summary.attachment_indexes)
+    assert seen["step"] == steps
+    assert seen["/episode_start"] == seen["/episode_end"] == episodes
+    assert places == {(number, step) for number, length in lengths.items() for step in range(length)}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rerun_converts_without_a_warning(name: str, tmp_path: Path) -> None:
+    target = tmp_path / "golden.rrd"
+    command = [
+        Path(sys.executable).parent / "rerun",
+        "mcap",
+        "convert",
+        finished(name, tmp_path),
+        "-o",
+        target,
+    ]
+    done = subprocess.run(
+        [*map(str, command), "--application-id", "golden"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said
+    assert "WARN" not in said, said
+    assert "ERROR" not in said, said
+    assert target.stat().st_size > 1000
+
+
+def parts(path: Path) -> list[bytes]:
+    """The bytes of a recording, its index uncompressed: versions of zstd may write other bytes."""
+    with contextlib.closing(PathSource(path)) as source:
+        contents = read_contents(source)
+        before = source.read(0, contents.data_end)
+    index = contents.index
+    return [before, index.episodes.tobytes(), index.chunks.tobytes(), bytes(index.metadata)]
+
+
+@pytest.mark.parametrize("name", UNCOMPRESSED)
+@pytest.mark.filterwarnings("ignore:.*is declared float32:UserWarning")
+def test_the_writer_writes_the_same_bytes(name: str, tmp_path: Path) -> None:
+    load_tool().make(name, tmp_path)
+    hint = "the format changed: say so in schemas/README.md and run tools/make_golden.py"
+    assert (tmp_path / f"{name}.json").read_text() == (GOLDEN / f"{name}.json").read_text()
+    if name in UNFINISHED:
+        assert (tmp_path / f"{name}.mcap").read_bytes() == (GOLDEN / f"{name}.mcap").read_bytes(), hint
+        journals = [unpacked_journal(name, directory) for directory in (tmp_path, GOLDEN)]
+        assert journals[0] == journals[1], hint
+    else:
+        assert parts(tmp_path / f"{name}.mcap") == parts(GOLDEN / f"{name}.mcap"), hint
+
+
+def test_attachments_and_benchmark() -> None:
+    with Recording(GOLDEN / "constant_zstd.mcap") as recording:
+        assert recording.benchmark_id == "b" * 64
+        assert recording.created_ns == load_tool().START_NS
+        assert list(recording.attachments) == ["benchmark.json", "note"]
+        assert recording.read_attachment("note") == b"golden"
+        assert recording.benchmark.record.name == "Pole-v0"
+    with Recording(GOLDEN / "rewritten.mcap") as recording:
+        assert [episode.number for episode in recording.episodes] == [0, 2]
+        assert recording.read_attachment("note") == b"rewritten"
+
+
+def test_the_three_compressions_hold_the_same() -> None:
+    for name in ("constant_lz4", "constant_none"):
+        assert (GOLDEN / f"{name}.json").read_text() == (GOLDEN / "constant_zstd.json").read_text()
+
+
+@pytest.mark.parametrize("version", [b"0", b"2", b"9"])
+def test_another_version_is_refused(version: bytes, tmp_path: Path) -> None:
+    data = (GOLDEN / "unfinished.mcap").read_bytes()
+    key = b"format_version" + (1).to_bytes(4, "little")
+    assert data.count(key + b"1") == 1
+    path = tmp_path / "other.mcap"
+    path.write_bytes(data.replace(key + b"1", key + version))
+    with pytest.raises(FormatError, match=f"expected format version '1', found '{version.decode()}'"):
+        Recording(path)
+
+
+def test_expected_values_are_strict_json() -> None:
+    for name in NAMES:
+        json.loads((GOLDEN / f"{name}.json").read_text(), parse_constant=pytest.fail)
