@@ -12,14 +12,18 @@ import numpy as np
 class Sampler(gym.Env[Any, Any]):
     """Returns samples of its spaces; an episode has `length` steps, every third one ends by timeout."""
 
-    def __init__(self, observation_space: gym.Space[Any], action_space: gym.Space[Any], length: int = 7) -> None:
+    def __init__(
+        self, observation_space: gym.Space[Any], action_space: gym.Space[Any], length: int = 7
+    ) -> None:
         self.observation_space = observation_space
         self.action_space = action_space
         self.length = length
         self.steps = 0
         self.episodes = 0
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         if seed is not None:
             self.observation_space.seed(seed)
@@ -52,7 +56,9 @@ class Scripted(gym.Env[Any, Any]):
         self._observe, self._reward, self._info, self._length = observe, reward, info, length
         self._step = 0
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self._step = 0
         return self._observe(0), {}

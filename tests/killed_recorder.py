@@ -37,7 +37,9 @@ def main(kind: str, path: str, mode: str, chunk_size: int) -> None:
         env = RecordVector(envs, path, mode=mode, chunk_size=chunk_size)  # type: ignore[arg-type]
     else:
         info = kind == "info"
-        env = RecordEpisodes(Sampler(space, actions), path, mode=mode, chunk_size=chunk_size, record_info=info)  # type: ignore[arg-type]
+        env = RecordEpisodes(
+            Sampler(space, actions), path, mode=mode, chunk_size=chunk_size, record_info=info
+        )  # type: ignore[arg-type]
     env.reset(seed=1)
     send("ready")
     while True:

@@ -49,11 +49,18 @@ def test_every_space_comes_back_exactly(tmp_path: Path, space: gym.Space[Any], s
         taken = roll(recorded, 23)
     recording = check_against(tmp_path / "r.mcap", taken)
     assert (recording.observation_space, recording.action_space) == (env.observation_space, env.action_space)
-    assert [episode.end for episode in recording.episodes] == ["terminal", "terminal", "timeout", "interrupted"]
+    assert [episode.end for episode in recording.episodes] == [
+        "terminal",
+        "terminal",
+        "timeout",
+        "interrupted",
+    ]
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "MountainCarContinuous-v0", "FrozenLake-v1", "Blackjack-v1"])
+@pytest.mark.parametrize(
+    "env_id", ["CartPole-v1", "MountainCarContinuous-v0", "FrozenLake-v1", "Blackjack-v1"]
+)
 def test_real_environments(tmp_path: Path, env_id: str, compression: str) -> None:
     path = tmp_path / "r.mcap"
     with warnings.catch_warnings():
@@ -156,7 +163,9 @@ def test_python_scalars_are_fine(tmp_path: Path) -> None:
 
 def test_values_outside_the_bounds_and_nan_are_kept(tmp_path: Path) -> None:
     odd = np.array([0x7FC01234, 0xFF800000], np.uint32).view(np.float32)  # a NaN with a payload, and -inf
-    with RecordEpisodes(Scripted(lambda step: odd, BOX, reward=lambda step: np.nan), tmp_path / "r.mcap") as env:
+    with RecordEpisodes(
+        Scripted(lambda step: odd, BOX, reward=lambda step: np.nan), tmp_path / "r.mcap"
+    ) as env:
         taken = roll(env, 3)
     episode = Recording(tmp_path / "r.mcap").episodes[0]
     assert episode.states[0].tobytes() == odd.tobytes()
@@ -171,10 +180,18 @@ BAD_STATES = [
     (BOX, None, r"state: expected float32\[2\], found None"),
     (spaces.Discrete(3), 1.5, r"state: expected values that int64 holds exactly, found float64 1.5"),
     (spaces.Discrete(3), 2**70, r"state: expected"),
-    (spaces.Dict({"a": BOX}), {"b": np.zeros(2, np.float32)}, r"state: expected an entry for each of \['a'\], found"),
+    (
+        spaces.Dict({"a": BOX}),
+        {"b": np.zeros(2, np.float32)},
+        r"state: expected an entry for each of \['a'\], found",
+    ),
     (spaces.Tuple((BOX, BOX)), (np.zeros(2, np.float32),), r"state: expected a tuple of 2 entries"),
     (spaces.Tuple((BOX,)), [np.zeros(2, np.float32)], r"state: expected a tuple of 1 entries, found \["),
-    (spaces.Box(0, 255, (4, 4, 3), np.uint8), np.zeros((4, 4), np.uint8), r"state: expected shape \(4, 4, 3\)"),
+    (
+        spaces.Box(0, 255, (4, 4, 3), np.uint8),
+        np.zeros((4, 4), np.uint8),
+        r"state: expected shape \(4, 4, 3\)",
+    ),
     (spaces.Text(5), 7, r"state: expected"),
 ]
 
@@ -232,10 +249,16 @@ def test_unknown_spaces_are_refused_before_a_file_is_made(tmp_path: Path) -> Non
         pass
 
     space = spaces.Dict({"ok": BOX, "mine": spaces.Tuple((MyBox(0, 1, (2,)),))})
-    with pytest.raises(SpaceError, match=r"state\['mine'\]\[0\]: expected a space of Gymnasium itself, found .*MyBox"):
+    with pytest.raises(
+        SpaceError, match=r"state\['mine'\]\[0\]: expected a space of Gymnasium itself, found .*MyBox"
+    ):
         RecordEpisodes(Scripted(lambda step: None, space), tmp_path / "r.mcap")
-    with pytest.raises(SpaceError, match=r"state: dtype 'longdouble' cannot be stored|state: dtype 'float128'"):
-        RecordEpisodes(Scripted(lambda step: None, spaces.Box(0, 1, (2,), np.longdouble)), tmp_path / "r.mcap")
+    with pytest.raises(
+        SpaceError, match=r"state: dtype 'longdouble' cannot be stored|state: dtype 'float128'"
+    ):
+        RecordEpisodes(
+            Scripted(lambda step: None, spaces.Box(0, 1, (2,), np.longdouble)), tmp_path / "r.mcap"
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -296,7 +319,9 @@ def test_an_exception_out_of_step_leaves_a_valid_file(tmp_path: Path) -> None:
 
 
 def test_steps_after_an_end_are_an_episode_of_their_own(tmp_path: Path) -> None:
-    with RecordEpisodes(Scripted(lambda step: step, spaces.Discrete(99), length=3), tmp_path / "r.mcap") as env:
+    with RecordEpisodes(
+        Scripted(lambda step: step, spaces.Discrete(99), length=3), tmp_path / "r.mcap"
+    ) as env:
         env.reset()
         for _ in range(4):
             env.step(0)
@@ -361,7 +386,9 @@ INFOS = [
 ]
 
 
-@pytest.mark.parametrize("how", [True, ["x", "text"], lambda info: {"n": len(info)}], ids=["all", "named", "callable"])
+@pytest.mark.parametrize(
+    "how", [True, ["x", "text"], lambda info: {"n": len(info)}], ids=["all", "named", "callable"]
+)
 def test_infos(tmp_path: Path, how: Any) -> None:
     env = Scripted(lambda step: 0, spaces.Discrete(1), info=lambda step: INFOS[step - 1], length=4)
     with RecordEpisodes(env, tmp_path / "r.mcap", record_info=how) as recorded:
@@ -386,7 +413,9 @@ def test_infos_are_left_out_unless_asked_for(tmp_path: Path) -> None:
 
 def test_a_step_callback_adds_to_the_info(tmp_path: Path) -> None:
     with RecordEpisodes(
-        gym.make("CartPole-v1"), tmp_path / "r.mcap", step_callback=lambda step: {"angle": float(step.state[2])}
+        gym.make("CartPole-v1"),
+        tmp_path / "r.mcap",
+        step_callback=lambda step: {"angle": float(step.state[2])},
     ) as env:
         taken = roll(env, 30)
     infos = [info for episode in Recording(tmp_path / "r.mcap").episodes for info in episode.infos or []]
@@ -421,7 +450,9 @@ def test_metadata_callbacks(tmp_path: Path) -> None:
 def test_existing_files_and_bad_places_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     RecordEpisodes(gym.make("CartPole-v1"), path).close()
-    with pytest.raises(RecordingError, match='exists and is not overwritten; choose another path, or mode="a"'):
+    with pytest.raises(
+        RecordingError, match='exists and is not overwritten; choose another path, or mode="a"'
+    ):
         RecordEpisodes(gym.make("CartPole-v1"), path)
     with pytest.raises(RecordingError, match="its directory does not exist"):
         RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "no" / "r.mcap")

@@ -51,7 +51,10 @@ def kill_while_recording(kind: str, path: Path, mode: str, chunk_size: int, seco
 
 def check_single(recording: Recording, reports: list[Any], before: int) -> None:
     steps = [step for episode in recording.episodes for step in episode][before:]
-    finals = {len(e) + sum(len(x) for x in recording.episodes[:i]) - before: e.final_state for i, e in enumerate(recording.episodes)}
+    finals = {
+        len(e) + sum(len(x) for x in recording.episodes[:i]) - before: e.final_state
+        for i, e in enumerate(recording.episodes)
+    }
     assert len(steps) in (len(reports), len(reports) + 1)  # one more: committed, but not reported
     for i, (action, state, terminal, timeout) in enumerate(reports):
         assert same(steps[i].action, action)
@@ -85,10 +88,14 @@ def test_a_killed_process_loses_no_finished_step(tmp_path: Path, kind: str) -> N
         path = tmp_path / f"{round_}.mcap"
         before, mode = 0, "x"
         if round_ == 2 and kind != "vector":
-            with RecordEpisodes(Sampler(KINDS[kind], spaces.Discrete(9)), path, record_info=kind == "info") as env:
+            with RecordEpisodes(
+                Sampler(KINDS[kind], spaces.Discrete(9)), path, record_info=kind == "info"
+            ) as env:
                 roll(env, 10)
             before, mode = 10, "a"
-        reports = kill_while_recording(kind, path, mode, rng.choice([700, 4000, 500_000]), rng.random() * 0.15 + 0.01)
+        reports = kill_while_recording(
+            kind, path, mode, rng.choice([700, 4000, 500_000]), rng.random() * 0.15 + 0.01
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # killed before its first step: no journal
             recording = Recording(path)
@@ -236,7 +243,9 @@ def test_a_full_disk_is_one_clear_error_and_the_rest_stays(tmp_path: Path) -> No
         "    pass\n"
     )
     path = tmp_path / "r.mcap"
-    child = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, timeout=60)
+    child = subprocess.run(
+        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, timeout=60
+    )
     taken, message = child.stdout.split(" ", 1)
     assert "could not write" in message
     assert "stays readable" in message

@@ -28,7 +28,16 @@ def record(path: Path, space: gym.Space[Any]) -> list[tuple[Any, ...]]:
 
 def rerun_says(path: Path, out: Path) -> str:
     done = subprocess.run(
-        [str(Path(sys.executable).with_name("rerun")), "mcap", "convert", "--application-id", "test", str(path), "-o", str(out)],
+        [
+            str(Path(sys.executable).with_name("rerun")),
+            "mcap",
+            "convert",
+            "--application-id",
+            "test",
+            str(path),
+            "-o",
+            str(out),
+        ],
         capture_output=True,
         text=True,
         timeout=120,
@@ -65,7 +74,9 @@ def test_every_space_decodes_field_by_field(tmp_path: Path, space: gym.Space[Any
 
 
 def test_images_are_ros_images(tmp_path: Path) -> None:
-    space = spaces.Dict({"front": spaces.Box(0, 255, (6, 5, 3), np.uint8), "depth": spaces.Box(0, 255, (4, 3, 1), np.uint8)})
+    space = spaces.Dict(
+        {"front": spaces.Box(0, 255, (6, 5, 3), np.uint8), "depth": spaces.Box(0, 255, (4, 3, 1), np.uint8)}
+    )
     path = tmp_path / "r.mcap"
     taken = record(path, space)
     with path.open("rb") as file:
@@ -101,7 +112,10 @@ def test_summary_statistics_and_indexes(tmp_path: Path) -> None:
         times = [m.log_time for _, _, m in reader.iter_messages(topics=["/step"])]
         assert times == sorted(times)
         assert (summary.statistics.message_start_time, summary.statistics.message_end_time)[0] <= times[0]
-        part = [m.log_time for _, _, m in reader.iter_messages(topics=["/step"], start_time=times[5], end_time=times[9])]
+        part = [
+            m.log_time
+            for _, _, m in reader.iter_messages(topics=["/step"], start_time=times[5], end_time=times[9])
+        ]
         assert part == [t for t in times if times[5] <= t < times[9]]
 
 

@@ -30,7 +30,9 @@ N = 3
 SPACES: dict[str, gym.Space[Any]] = {
     "box": spaces.Box(-1, 1, (4,), np.float32),
     "discrete": spaces.Discrete(7, start=2),
-    "dict": spaces.Dict({"a": spaces.Box(0, 1, (2, 2)), "b": spaces.Tuple((spaces.Discrete(3), spaces.MultiBinary(2)))}),
+    "dict": spaces.Dict(
+        {"a": spaces.Box(0, 1, (2, 2)), "b": spaces.Tuple((spaces.Discrete(3), spaces.MultiBinary(2)))}
+    ),
     "image": spaces.Dict({"camera": spaces.Box(0, 255, (6, 5, 3), np.uint8), "x": spaces.Box(-1, 1, (1,))}),
     "text": spaces.Dict({"note": spaces.Text(8), "x": spaces.Discrete(5)}),
     "sequence": spaces.Sequence(spaces.Box(-1, 1, (2,))),
@@ -65,14 +67,23 @@ def run(env: Any, mode: Any, batches: int) -> list[list[list[tuple[Any, ...]]]]:
             if name_of(mode) == "NextStep" and ended[i]:
                 continue
             final = infos["final_obs"][i] if name_of(mode) == "SameStep" and done[i] else after[i]
-            step = (states[i], chosen[i], float(rewards[i]), bool(terminals[i]), bool(timeouts[i]), copy.deepcopy(final))
+            step = (
+                states[i],
+                chosen[i],
+                float(rewards[i]),
+                bool(terminals[i]),
+                bool(timeouts[i]),
+                copy.deepcopy(final),
+            )
             episodes[i][-1].append(step)
             if done[i]:
                 episodes[i].append([])
         ended = done & ~ended if name_of(mode) == "NextStep" else done
         states = after
         if name_of(mode) == "Disabled" and done.any():
-            states = copy.deepcopy(list(iterate(env.observation_space, env.reset(options={"reset_mask": done})[0])))
+            states = copy.deepcopy(
+                list(iterate(env.observation_space, env.reset(options={"reset_mask": done})[0]))
+            )
     return [[episode for episode in found if episode] for found in episodes]
 
 

@@ -150,7 +150,12 @@ def make_row_encoder(
         *next_state,
         *puts,
     ]
-    first_lines = [*state.lines, f"pack_state(buffer, offset, {', '.join(head.args)})", *state_stores, *firsts]
+    first_lines = [
+        *state.lines,
+        f"pack_state(buffer, offset, {', '.join(head.args)})",
+        *state_stores,
+        *firsts,
+    ]
     text = _render(put_lines, first_lines, size)
     namespace = dict(
         source.names,
@@ -204,7 +209,9 @@ def _structure_checks(source: _Source, space: Any, expression: str) -> None:
         return
     n = len(space.spaces)
     if type(space) is spaces.Tuple:
-        source.lines.append(f"if {expression}.__class__ is not tuple or len({expression}) != {n}: raise TypeError")
+        source.lines.append(
+            f"if {expression}.__class__ is not tuple or len({expression}) != {n}: raise TypeError"
+        )
         children = list(enumerate(space.spaces))
     else:
         source.lines.append(f"if len({expression}) != {n}: raise TypeError")
@@ -304,7 +311,9 @@ def _diagnose(layout: StepLayout, action: Any, state: Any, reward: Any, err: Exc
     """The StepError that names what the fast path stumbled over."""
     if isinstance(err, StepError):
         return err
-    groups: list[tuple[str, Any, Any, Sequence[Leaf]]] = [("state", layout.observation_space, state, layout.state)]
+    groups: list[tuple[str, Any, Any, Sequence[Leaf]]] = [
+        ("state", layout.observation_space, state, layout.state)
+    ]
     if reward is not None:
         groups.insert(0, ("action", layout.action_space, action, layout.action))
         groups.append(("reward", None, reward, layout.reward))
@@ -317,7 +326,9 @@ def _diagnose(layout: StepLayout, action: Any, state: Any, reward: Any, err: Exc
     except StepError as found:
         return found
     if reward is None:
-        return StepError(f"state: expected a value structured as {layout.observation_space}, found {shorten(state)}")
+        return StepError(
+            f"state: expected a value structured as {layout.observation_space}, found {shorten(state)}"
+        )
     return StepError(
         f"expected a step structured as state {layout.observation_space} and action {layout.action_space}, "
         f"found state {shorten(state)} and action {shorten(action)}"

@@ -37,7 +37,9 @@ def decide_dtype(leaf: Leaf, values: Sequence[Any]) -> DType:
     for value in values:
         dtype = _widen(dtype, value)
     if dtype.name not in ROS_TYPES:
-        raise StepError(f"{leaf.path}: expected values of dtype {leaf.dtype.name}, found {dtype.name}, which no message holds")
+        raise StepError(
+            f"{leaf.path}: expected values of dtype {leaf.dtype.name}, found {dtype.name}, which no message holds"
+        )
     if dtype != leaf.dtype:
         warnings.warn(
             f"{leaf.path} is declared {leaf.dtype.name}, but the values are {dtype.name}; "
@@ -83,7 +85,9 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
     if array.dtype.kind not in "biuf":
         raise StepError(f"{path}: expected {dtype.name}{list(shape)}, found {shorten(value)}")
     if array.shape != shape:
-        raise StepError(f"{path}: expected shape {shape}, found shape {array.shape}; nothing is reshaped in silence")
+        raise StepError(
+            f"{path}: expected shape {shape}, found shape {array.shape}; nothing is reshaped in silence"
+        )
     if array.dtype == dtype:
         return array
     with np.errstate(all="ignore"):
@@ -124,7 +128,9 @@ def check_structure(space: gym.Space[Any], value: Any, path: str) -> None:
             check_structure(sub, value[key], f"{path}[{key!r}]")
     elif type(space) is spaces.Tuple:
         if not isinstance(value, tuple) or len(value) != len(space.spaces):
-            raise StepError(f"{path}: expected a tuple of {len(space.spaces)} entries, found {shorten(value)}")
+            raise StepError(
+                f"{path}: expected a tuple of {len(space.spaces)} entries, found {shorten(value)}"
+            )
         for i, sub in enumerate(space.spaces):
             check_structure(sub, value[i], f"{path}[{i}]")
 

@@ -146,9 +146,7 @@ def _walk(
         )
 
 
-def _constant_leaf(
-    space: gym.Space[Any], keys: tuple[Any, ...], path: str, name: str, images: bool
-) -> Leaf:
+def _constant_leaf(space: gym.Space[Any], keys: tuple[Any, ...], path: str, name: str, images: bool) -> Leaf:
     if space.dtype is None or space.shape is None:
         raise SpaceError(f"{path}: expected a space with a shape and a dtype, found {space!r}")
     dtype = np.dtype(space.dtype)

@@ -66,7 +66,9 @@ class StepLayout:
             leaf.name: given.pop(leaf.name, leaf.dtype) for leaf in self.leaves if leaf.dtype is not None
         }
         if given:
-            raise SpaceError(f"dtypes are given for {sorted(given)}, which are no constant leaves of these spaces")
+            raise SpaceError(
+                f"dtypes are given for {sorted(given)}, which are no constant leaves of these spaces"
+            )
         self.nest_state = structure(observation_space)
         self.nest_action = structure(action_space)
         self.nest_reward = structure(reward)
@@ -177,10 +179,14 @@ class StepLayout:
         reward = space_from_json(jsonvalue.loads(reward_text)) if reward_text else None
         names = jsonvalue.loads(_entry(metadata, "dtypes"))
         if not isinstance(names, dict) or not all(name in ROS_TYPES for name in names.values()):
-            raise FormatError(f"channel metadata 'dtypes': expected ROS names with NumPy dtypes, found {names!r:.200}")
+            raise FormatError(
+                f"channel metadata 'dtypes': expected ROS names with NumPy dtypes, found {names!r:.200}"
+            )
         inner = jsonvalue.loads(_entry(metadata, "inner_dtypes"))
         if not isinstance(inner, dict) or not all(isinstance(found, dict) for found in inner.values()):
-            raise FormatError(f"channel metadata 'inner_dtypes': expected paths with dtypes, found {inner!r:.200}")
+            raise FormatError(
+                f"channel metadata 'inner_dtypes': expected paths with dtypes, found {inner!r:.200}"
+            )
         try:
             layout = cls(
                 space_from_json(jsonvalue.loads(_entry(metadata, "observation_space"))),

@@ -55,7 +55,9 @@ def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> Non
     container.schemas = dict(sorted(contents.schemas.items()))
     container.channels = dict(sorted(contents.channels.items()))
     if list(container.channels) != list(range(1, len(container.channels) + 1)):
-        raise FormatError(f"{writer.path}: expected channels numbered from 1, found {list(container.channels)}")
+        raise FormatError(
+            f"{writer.path}: expected channels numbered from 1, found {list(container.channels)}"
+        )
     container.counts = dict.fromkeys(container.channels, 0)
     container.attachment_indexes = list(contents.attachments.values())
     container.metadata_indexes = contents.metadata_indexes

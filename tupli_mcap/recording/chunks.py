@@ -26,7 +26,9 @@ __all__ = ["IN_MEMORY", "ChunkStore", "Span"]
 
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
 MAX_CHUNK = 1 << 31
-_CHUNK_HEAD = struct.Struct("<BQQQQII")  # opcode, length, start, end, uncompressed size, crc, compression length
+_CHUNK_HEAD = struct.Struct(
+    "<BQQQQII"
+)  # opcode, length, start, end, uncompressed size, crc, compression length
 
 
 class Span(NamedTuple):
@@ -43,7 +45,9 @@ class ChunkStore:
     `rows(i, dtype)` and `offsets(i)` are safe from several threads.
     """
 
-    def __init__(self, source: Source, table: np.ndarray[Any, Any], memory: list[bytes], cache_bytes: int) -> None:
+    def __init__(
+        self, source: Source, table: np.ndarray[Any, Any], memory: list[bytes], cache_bytes: int
+    ) -> None:
         self._source = source
         self.table = table
         self._memory = memory
@@ -63,7 +67,9 @@ class ChunkStore:
     def _check_chain(self, chosen: np.ndarray[Any, Any], channel: int) -> None:
         ends = np.cumsum(self.table["rows"][chosen], dtype=np.uint64)
         if (self.table["first"][chosen] != ends - self.table["rows"][chosen]).any():
-            raise FormatError(f"{self._source.name}: the chunks of channel {channel} do not hold its rows without gaps")
+            raise FormatError(
+                f"{self._source.name}: the chunks of channel {channel} do not hold its rows without gaps"
+            )
 
     def count(self, channel: int) -> int:
         """Rows of a channel."""
@@ -120,15 +126,24 @@ class ChunkStore:
             return self._memory[offset - IN_MEMORY]
         where = f"{self._source.name}: chunk at offset {offset}"
         skip = int(row["skip"])
-        if length < _CHUNK_HEAD.size + 8 or size > MAX_CHUNK or skip > size or int(row["compression"]) >= len(COMPRESSIONS):
-            raise FormatError(f"{where}: expected a chunk of at most {MAX_CHUNK} bytes, found {length} holding {size}")
+        if (
+            length < _CHUNK_HEAD.size + 8
+            or size > MAX_CHUNK
+            or skip > size
+            or int(row["compression"]) >= len(COMPRESSIONS)
+        ):
+            raise FormatError(
+                f"{where}: expected a chunk of at most {MAX_CHUNK} bytes, found {length} holding {size}"
+            )
         record = self._source.read(offset, length)
         opcode, claimed, _, _, found_size, crc, name_length = _CHUNK_HEAD.unpack_from(record)
         name = COMPRESSIONS[row["compression"]].replace("none", "")
         start = _CHUNK_HEAD.size + name_length + 8
         head_ok = opcode == 6 and claimed + 9 == length and found_size == size and name_length == len(name)
         if not head_ok or record[_CHUNK_HEAD.size : start - 8] != name.encode():
-            raise FormatError(f"{where}: expected a chunk of {size} bytes ({name or 'none'}), found another record")
+            raise FormatError(
+                f"{where}: expected a chunk of {size} bytes ({name or 'none'}), found another record"
+            )
         data = decompress(name, memoryview(record)[start:], size, where)
         if zlib.crc32(data) != crc:
             raise FormatError(f"{where}: its CRC differs, the chunk is damaged")
@@ -164,7 +179,9 @@ class ChunkStore:
                     raise FormatError(f"{self._source.name}: chunk {i} holds a message of channel {channel}")
                 spans.append((start, end))
             if len(spans) != self.table["rows"][i]:
-                raise FormatError(f"{self._source.name}: chunk {i} expected {self.table['rows'][i]} messages, found {len(spans)}")
+                raise FormatError(
+                    f"{self._source.name}: chunk {i} expected {self.table['rows'][i]} messages, found {len(spans)}"
+                )
             self._offsets[i] = spans
         return self._offsets[i]
 

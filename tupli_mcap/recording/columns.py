@@ -89,11 +89,15 @@ class ColumnReader:
         self._images = images  # leaf name -> step channel -> image channel
         self._decoder = None if layout.constant else MessageDecoder(layout)
 
-    def read(self, runs: Sequence[Run], total: int, fields: Sequence[str], threads: int, keep: bool) -> dict[str, Any]:
+    def read(
+        self, runs: Sequence[Run], total: int, fields: Sequence[str], threads: int, keep: bool
+    ) -> dict[str, Any]:
         """`fields` nested as their spaces are; `keep` puts the chunks read into the cache."""
         unknown = [field for field in fields if field not in FIELDS]
         if unknown:
-            raise RecordingError(f"expected fields from {', '.join(FIELDS)}, found {', '.join(map(repr, unknown))}")
+            raise RecordingError(
+                f"expected fields from {', '.join(FIELDS)}, found {', '.join(map(repr, unknown))}"
+            )
         layout = self._layout
         wanted = {
             "states": layout.state, "actions": layout.action, "rewards": layout.reward,
@@ -111,7 +115,9 @@ class ColumnReader:
         for leaf in leaves:
             if leaf.kind == "image":
                 moved = [run._replace(channel=self._images[leaf.name][run.channel]) for run in runs]
-                tasks += self._tasks(moved, ["data"], {"data": out[leaf.name]}, layout.image_messages[leaf.name].dtype, keep)
+                tasks += self._tasks(
+                    moved, ["data"], {"data": out[leaf.name]}, layout.image_messages[leaf.name].dtype, keep
+                )
         if threads > 1 and len(tasks) > _FEW_TASKS:
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(lambda task: task(), tasks))
@@ -120,7 +126,9 @@ class ColumnReader:
                 task()
         nest = {"states": layout.nest_state, "actions": layout.nest_action, "rewards": layout.nest_reward}
         columns = {
-            field: nest[field]([out[leaf.name] for leaf in group]) for field, group in wanted.items() if field in fields
+            field: nest[field]([out[leaf.name] for leaf in group])
+            for field, group in wanted.items()
+            if field in fields
         }
         columns.update({f"{name}s": out[name] for name in flags})
         return columns
@@ -188,16 +196,22 @@ class ColumnReader:
                 start, end = self._store.messages(span.chunk)[span.begin]
                 number, values = self._decoder.final(data[start + BODY : end])
             if number != row["episode"]:
-                raise FormatError(f"expected the final state of episode {row['episode']}, found that of {number}")
+                raise FormatError(
+                    f"expected the final state of episode {row['episode']}, found that of {number}"
+                )
             for leaf in self._layout.state:
                 if leaf.kind != "variable":
                     dtype = self._layout.dtypes[leaf.name]
                     value = values.get(leaf.name, np.empty(leaf.shape, dtype))
-                    values[leaf.name] = np.array(value, dtype).reshape(leaf.shape)[() if leaf.is_scalar else ...]
+                    values[leaf.name] = np.array(value, dtype).reshape(leaf.shape)[
+                        () if leaf.is_scalar else ...
+                    ]
             found.append(values)
         return found
 
 
 def _shaped(values: Array, target: Array) -> Array:
     """One-element dimensions of a structured field may be folded; the target's shape says what is meant."""
-    return values if values.shape[1:] == target.shape[1:] else values.reshape((len(values), *target.shape[1:]))
+    return (
+        values if values.shape[1:] == target.shape[1:] else values.reshape((len(values), *target.shape[1:]))
+    )

@@ -27,7 +27,9 @@ def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
     try:
         if name == "zstd":
             if zstandard.frame_content_size(data) not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-                raise FormatError(f"{where}: expected {size} bytes, the zstd frame says {zstandard.frame_content_size(data)}")
+                raise FormatError(
+                    f"{where}: expected {size} bytes, the zstd frame says {zstandard.frame_content_size(data)}"
+                )
             found: Any = _decompressor().decompress(data, max_output_size=size)
         elif name == "lz4":
             found = lz4.frame.LZ4FrameDecompressor().decompress(bytes(data), max_length=size + 1)

@@ -39,7 +39,9 @@ class Contents:
     table: np.ndarray = field(default_factory=lambda: np.empty(0, CHUNK_ROWS))  # type: ignore[type-arg]
     memory: list[bytes] = field(default_factory=list)
     tail: list[Rows] = field(default_factory=list)
-    index: EpisodeIndex = field(default_factory=lambda: EpisodeIndex(np.empty(0, EPISODE_ROWS), np.empty(0, CHUNK_ROWS), b""))
+    index: EpisodeIndex = field(
+        default_factory=lambda: EpisodeIndex(np.empty(0, EPISODE_ROWS), np.empty(0, CHUNK_ROWS), b"")
+    )
     complete: bool = True
     data_end: int = 0
 
@@ -63,7 +65,9 @@ def read_contents(source: Source) -> Contents:
         raise foreign(source, f"it has no metadata {RECORDING_METADATA!r}")
     metadata = check_version(source, read_metadata(source, summary.metadata[RECORDING_METADATA]))
     if INDEX_NAME not in summary.attachments:
-        raise FormatError(f"{source.name}: the recording has no episode index {INDEX_NAME!r}; recover it into a new file")
+        raise FormatError(
+            f"{source.name}: the recording has no episode index {INDEX_NAME!r}; recover it into a new file"
+        )
     attachment = summary.attachments.pop(INDEX_NAME)
     index = EpisodeIndex.decode(read_attachment(source, attachment), source.name)
     if len(index.chunks) != summary.chunks:
@@ -88,5 +92,7 @@ def check_version(source: Source, metadata: dict[str, str]) -> dict[str, str]:
     if version != "1":
         raise FormatError(f"{source.name}: expected format version '1', found {version!r}; update tupli-mcap")
     if len(metadata.get("uuid", "")) != 32:
-        raise FormatError(f"{source.name}: expected a uuid of 32 hex digits, found {metadata.get('uuid')!r:.60}")
+        raise FormatError(
+            f"{source.name}: expected a uuid of 32 hex digits, found {metadata.get('uuid')!r:.60}"
+        )
     return metadata

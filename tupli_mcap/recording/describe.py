@@ -40,7 +40,8 @@ class RecordingDescription:
     """Facts about a recording; spaces and spreads are None where there is no step or no episode.
 
     state: "complete", "recording" (a writer is at work) or "recovered" (a writer was killed).
-    size: bytes of the file. created_ns, start_ns, end_ns: wall clock; the latter two are 0 without an episode.
+    size: bytes of the file. created_ns, start_ns, end_ns: wall clock; the latter two are 0 without
+        an episode.
     compression: bytes of messages for one byte of chunks in the file; None without a chunk.
     ends: episodes by how they ended. environment: the name its benchmark says, None if it carries none.
     """

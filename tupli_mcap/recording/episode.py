@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 
+from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording.events import END_NAMES, EpisodeStart
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording.columns import Columns
     from tupli_mcap.recording.reader import Recording
 
 __all__ = ["Episode", "Episodes", "Step"]
@@ -42,6 +44,15 @@ class Episode:
     def __len__(self) -> int:
         return int(self._row["length"])
 
+    def __getitem__(self, steps: slice) -> Columns:
+        """The columns (without `next_states`) of some consecutive steps; only their rows are copied."""
+        start, stop, stride = steps.indices(len(self))
+        if stride != 1:
+            raise RecordingError(
+                f"expected consecutive steps, found a stride of {stride}; slice the columns instead"
+            )
+        return self._recording.read_steps(self._position, start, max(start, stop))
+
     @property
     def number(self) -> int:
         """The episode's number in its recording, counted from 0."""
@@ -59,7 +70,7 @@ class Episode:
 
     @property
     def end(self) -> str:
-        """"terminal", "timeout" or "interrupted"."""
+        """ "terminal", "timeout" or "interrupted"."""
         return END_NAMES[self._row["end"]]
 
     @property
@@ -167,7 +178,9 @@ def _item(space: Any, columns: Any) -> Any:
         items = [_item(sub, column) for sub, column in zip(space.spaces, columns, strict=True)]
         return lambda i: tuple(item(i) for item in items)
     if type(space) is spaces.Box and space.shape == () and columns.dtype.kind == "f":
-        return lambda i: np.asarray(columns[i])  # what Gymnasium samples here is an array, of integers a scalar
+        return lambda i: np.asarray(
+            columns[i]
+        )  # what Gymnasium samples here is an array, of integers a scalar
     return lambda i: columns[i]
 
 

@@ -52,7 +52,9 @@ def read_strings(body: memoryview, offset: int, count: int) -> list[str]:
         (length,) = _LENGTH.unpack_from(body, offset)
         offset += 4
         if length < 1 or offset + length > len(body) or body[offset + length - 1] != 0:
-            raise FormatError(f"expected a string of {length} bytes with its NUL at byte {offset} of a message")
+            raise FormatError(
+                f"expected a string of {length} bytes with its NUL at byte {offset} of a message"
+            )
         try:
             texts.append(str(body[offset : offset + length - 1], "utf-8"))
         except UnicodeDecodeError as err:

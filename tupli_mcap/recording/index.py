@@ -81,7 +81,9 @@ class IndexBuilder:
         rows = np.frombuffer(bytes(self.rows), EPISODE_ROWS)
         rows = rows[np.argsort(rows["episode"], kind="stable")]
         head = _HEAD.pack(_MAGIC, self.count, len(chunk_rows) // CHUNK_ROWS.itemsize, len(self.metadata))
-        return head + _compress(rows.tobytes()) + _compress(bytes(chunk_rows)) + _compress(bytes(self.metadata))
+        return (
+            head + _compress(rows.tobytes()) + _compress(bytes(chunk_rows)) + _compress(bytes(self.metadata))
+        )
 
 
 def _compress(data: bytes) -> bytes:
@@ -92,7 +94,9 @@ def _compress(data: bytes) -> bytes:
 def _decompress(data: bytes, at: int, size: int, where: str) -> tuple[bytes, int]:
     """A part of `size` bytes and where the next one starts; a claim that zstd could not have made is refused."""
     if at + _SIZE.size > len(data):
-        raise FormatError(f"{where}: expected a part of the episode index at byte {at}, found {len(data)} bytes")
+        raise FormatError(
+            f"{where}: expected a part of the episode index at byte {at}, found {len(data)} bytes"
+        )
     (packed,) = _SIZE.unpack_from(data, at)
     start = at + _SIZE.size
     end = start + packed
@@ -113,7 +117,9 @@ class EpisodeIndex(NamedTuple):
     def decode(cls, data: bytes, where: str) -> EpisodeIndex:
         """Raises FormatError if counts and sizes do not add up to the attachment."""
         if len(data) < _HEAD.size:
-            raise FormatError(f"{where}: expected an episode index of at least {_HEAD.size} bytes, found {len(data)}")
+            raise FormatError(
+                f"{where}: expected an episode index of at least {_HEAD.size} bytes, found {len(data)}"
+            )
         magic, episodes, chunks, metadata = _HEAD.unpack_from(data)
         if magic != _MAGIC:
             raise FormatError(f"{where}: expected an episode index of version 1, found {magic!r}")

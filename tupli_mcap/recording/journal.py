@@ -196,7 +196,9 @@ def read_journal(path: Path) -> JournalContents:
         start = offsets[area.name]
         data[area.name] = raw[start : start + area.size]
         if data[area.name].size != area.size:
-            raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {data[area.name].size}")
+            raise FormatError(
+                f"{path}: area {area.name!r} expected {area.size} bytes, found {data[area.name].size}"
+            )
     return JournalContents(info, {area.name: area for area in areas}, data)
 
 

@@ -33,11 +33,19 @@ class FileLock:
                 f'{path} exists and is not overwritten; choose another path, or mode="a" to append, "w" to replace'
             ) from err
         except FileNotFoundError as err:
-            hint = "its directory does not exist" if mode != "a" else 'it does not exist; use mode="x" to create it'
+            hint = (
+                "its directory does not exist"
+                if mode != "a"
+                else 'it does not exist; use mode="x" to create it'
+            )
             raise RecordingError(f"{path} cannot be recorded to: {hint}") from err
         except OSError as err:
-            raise RecordingError(f"{path} cannot be recorded to: {err.strerror}; choose a writable place") from err
-        for attempt in range(_ATTEMPTS):  # a reader that asks whether the writer lives holds the lock for a moment
+            raise RecordingError(
+                f"{path} cannot be recorded to: {err.strerror}; choose a writable place"
+            ) from err
+        for attempt in range(
+            _ATTEMPTS
+        ):  # a reader that asks whether the writer lives holds the lock for a moment
             try:
                 fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break

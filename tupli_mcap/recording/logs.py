@@ -41,7 +41,9 @@ def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, i
         opcode, length, channel, sequence, log_time, _ = RECORD_HEADER.unpack_from(data, start)
         end = start + 9 + length
         if opcode != 5 or length < BODY - 9 or end > len(data):
-            raise FormatError(f"expected a message record at byte {start}, found opcode {opcode} of {length} bytes")
+            raise FormatError(
+                f"expected a message record at byte {start}, found opcode {opcode} of {length} bytes"
+            )
         yield start, end, channel, sequence, log_time
         start = end
 
@@ -71,7 +73,9 @@ class EventLog:
     `sequences` counts the messages of each channel, those of earlier sessions included.
     """
 
-    def __init__(self, area: LogArea, buffer: memoryview, sink: Sink, sequences: dict[int, int], time_ns: int) -> None:
+    def __init__(
+        self, area: LogArea, buffer: memoryview, sink: Sink, sequences: dict[int, int], time_ns: int
+    ) -> None:
         self.sequences = sequences
         self._sink = sink
         self._time = time_ns
@@ -94,7 +98,9 @@ class EventLog:
         for channel, body in messages:
             sequence = sequences[channel]
             sequences[channel] = sequence + 1
-            head = _EVENT.pack(5, _EVENT.size - 9 + len(body), channel, sequence, time_ns, time_ns, CDR_HEADER)
+            head = _EVENT.pack(
+                5, _EVENT.size - 9 + len(body), channel, sequence, time_ns, time_ns, CDR_HEADER
+            )
             data += head + body
         end = self._position + len(data)
         if end > self._capacity:
@@ -154,7 +160,14 @@ class StepLog:
     """
 
     def __init__(
-        self, layout: StepLayout, area: LogArea, buffer: memoryview, channel: int, sink: Sink, images: Sequence[Any], first: int = 0
+        self,
+        layout: StepLayout,
+        area: LogArea,
+        buffer: memoryview,
+        channel: int,
+        sink: Sink,
+        images: Sequence[Any],
+        first: int = 0,
     ) -> None:
         self._layout = layout
         self._channel = channel
@@ -233,7 +246,8 @@ class StepLog:
         out += self._episode.to_bytes(4, "little") + step.to_bytes(4, "little")
         self._encode(out, self._state, state)
         images = [
-            sink.check(leaf_value(state, leaf)) for sink, leaf in zip(self._images, self._layout.images, strict=True)
+            sink.check(leaf_value(state, leaf))
+            for sink, leaf in zip(self._images, self._layout.images, strict=True)
         ]
         return out, images
 
@@ -247,7 +261,9 @@ class StepLog:
             self._switch()
         if size > self._area.capacity:
             if self.grow is None:
-                raise StepError(f"a step of {size} bytes does not fit into {self._area.capacity} bytes of journal")
+                raise StepError(
+                    f"a step of {size} bytes does not fit into {self._area.capacity} bytes of journal"
+                )
             self.grow(size)
 
     def _switch(self) -> None:

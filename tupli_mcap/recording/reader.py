@@ -16,7 +16,7 @@ from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns, runs_of
+from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns, Run, runs_of
 from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.events import EpisodeStart
@@ -102,10 +102,14 @@ class Recording:
                 schema = contents.schemas.get(channel.schema_id)
                 text = self._layout.step_schema.encode()
                 if schema is None or schema.name != STEP_SCHEMA or schema.data != text:
-                    raise FormatError(f"{self.name}: the schema of {channel.topic} is not the one its spaces have")
+                    raise FormatError(
+                        f"{self.name}: the schema of {channel.topic} is not the one its spaces have"
+                    )
             images = {
                 leaf.name: {
-                    channel.id: self._topics.get(f"{channel.topic.removesuffix('/step')}/image/{leaf.name}", 0)
+                    channel.id: self._topics.get(
+                        f"{channel.topic.removesuffix('/step')}/image/{leaf.name}", 0
+                    )
                     for channel in steps
                 }
                 for leaf in self._layout.images
@@ -134,7 +138,9 @@ class Recording:
     def layout(self) -> StepLayout:
         """The layout of the steps; RecordingError if there is none yet."""
         if self._layout is None:
-            raise RecordingError(f"{self.name} has no step yet, so its spaces are not known; record a step first")
+            raise RecordingError(
+                f"{self.name} has no step yet, so its spaces are not known; record a step first"
+            )
         return self._layout
 
     @property
@@ -164,7 +170,8 @@ class Recording:
     def attachments(self) -> Mapping[str, AttachmentInfo]:
         """The attachments, the episode index left out."""
         return {
-            name: AttachmentInfo(name, a.media_type, a.data_size) for name, a in self._contents.attachments.items()
+            name: AttachmentInfo(name, a.media_type, a.data_size)
+            for name, a in self._contents.attachments.items()
         }
 
     def read_attachment(self, name: str) -> bytes:
@@ -178,7 +185,9 @@ class Recording:
     def benchmark(self) -> RecordedBenchmark:
         """The environment that was recorded, as data; `make_env()` rebuilds it."""
         if "benchmark.json" not in self._contents.attachments:
-            raise RecordingError(f"{self.name} carries no environment; load its benchmark from the storage it is in")
+            raise RecordingError(
+                f"{self.name} carries no environment; load its benchmark from the storage it is in"
+            )
         pickle = None
         if "env.cloudpickle" in self._contents.attachments:
             pickle = self.read_attachment("env.cloudpickle")
@@ -192,7 +201,9 @@ class Recording:
         """The metadata of episode `i`."""
         value = jsonvalue.loads(self._contents.index.metadata_text(i))
         if not isinstance(value, dict):
-            raise FormatError(f"{self.name}: episode {i} expected metadata as a JSON object, found {value!r:.80}")
+            raise FormatError(
+                f"{self.name}: episode {i} expected metadata as a JSON object, found {value!r:.80}"
+            )
         return value
 
     def all_metadata(self) -> list[str]:
@@ -205,7 +216,9 @@ class Recording:
         (body,) = self._store.bodies(self._topics["/episode_start"], int(row["start_row"]), 1)
         start = EpisodeStart.decode(body)
         if start.episode != row["episode"]:
-            raise FormatError(f"{self.name}: expected the start of episode {row['episode']}, found {start.episode}")
+            raise FormatError(
+                f"{self.name}: expected the start of episode {row['episode']}, found {start.episode}"
+            )
         return start
 
     def final_state(self, i: int) -> Any:
@@ -263,7 +276,9 @@ class Recording:
         if episodes is not None:
             chosen = np.asarray(episodes, dtype=np.int64)
             if len(chosen) and (chosen.min() < 0 or chosen.max() >= len(rows)):
-                raise RecordingError(f"{self.name}: expected episodes from 0 to {len(rows) - 1}, found {episodes!r:.100}")
+                raise RecordingError(
+                    f"{self.name}: expected episodes from 0 to {len(rows) - 1}, found {episodes!r:.100}"
+                )
             rows = rows[chosen]
         lengths = rows["length"].astype(np.int64)
         total = int(lengths.sum())
@@ -286,6 +301,21 @@ class Recording:
                 setattr(columns, field, found[field])
         return columns
 
+    def read_steps(self, i: int, start: int, stop: int, fields: Sequence[str] = FIELDS[:5]) -> Columns:
+        """Columns of the steps `start:stop` of episode `i`; the chunks they lie in stay in the cache."""
+        row = self.index[i]
+        count = stop - start
+        if not 0 <= start <= stop <= int(row["length"]):
+            raise RecordingError(
+                f"{self.name}: expected steps from 0 to {row['length']}, found {start}:{stop}"
+            )
+        channel = self._step_channels[int(row["env"])]
+        run = Run(channel, int(row["first_row"]) + start, count, 0)
+        columns = Columns(np.array([count]))
+        for field, values in self._reader.read([run], count, fields, 1, True).items():
+            setattr(columns, field, values)
+        return columns
+
     def _next_states(self, states: Any, rows: Any, lengths: Any) -> Any:
         finals = self._finals(rows)
         layout = self.layout
@@ -301,7 +331,9 @@ class Recording:
             for end in ends[[values is None for values in finals]] if len(ends) else []:
                 shifted[end] = column[end]
             if known and not isinstance(shifted, list):
-                shifted[[end for end, _ in known]] = np.array([values[leaf.name] for _, values in known], shifted.dtype)
+                shifted[[end for end, _ in known]] = np.array(
+                    [values[leaf.name] for _, values in known], shifted.dtype
+                )
             else:
                 for end, values in known:
                     shifted[end] = values[leaf.name]
@@ -324,5 +356,3 @@ class Recording:
     def __repr__(self) -> str:
         state = "" if self.complete else ", recovered"
         return f"<Recording {self.name}: {len(self.index)} episodes, {self.num_steps} steps{state}>"
-
-

@@ -85,10 +85,17 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
             found.unindexed.offsets
         )
     contents = Contents(
-        metadata, found.schemas, found.channels, found.attachments, found.metadata_indexes, complete=False, data_end=end
+        metadata,
+        found.schemas,
+        found.channels,
+        found.attachments,
+        found.metadata_indexes,
+        complete=False,
+        data_end=end,
     )
     steps = sorted(
-        (c for c in found.channels.values() if c.topic.endswith("/step")), key=lambda c: int(c.metadata.get("env", "0"))
+        (c for c in found.channels.values() if c.topic.endswith("/step")),
+        key=lambda c: int(c.metadata.get("env", "0")),
     )
     if steps:
         layout = StepLayout.from_metadata(steps[0].metadata)
@@ -199,10 +206,14 @@ def _salvage_images(
 ) -> None:
     for leaf in layout.images:
         topic = next(
-            c.topic for c in found.channels.values() if c.topic.endswith("/step") and c.metadata.get("env") == str(env)
+            c.topic
+            for c in found.channels.values()
+            if c.topic.endswith("/step") and c.metadata.get("env") == str(env)
         )
         channel = next(
-            c.id for c in found.channels.values() if c.topic == f"{topic.removesuffix('/step')}/image/{leaf.name}"
+            c.id
+            for c in found.channels.values()
+            if c.topic == f"{topic.removesuffix('/step')}/image/{leaf.name}"
         )
         dtype = layout.image_messages[leaf.name].dtype
         salvage = Salvage(journal, _rows_area(journal, f"{leaf.name}/{env}"), 0, dtype, channel)
@@ -267,15 +278,25 @@ def _complete(
         if facts is None:
             continue  # a reset without a step is no episode
         length, total, end, end_time = facts
-        if number not in episodes.finals and start.env in tail.pending and _is_last(store, steps, start, length):
+        if (
+            number not in episodes.finals
+            and start.env in tail.pending
+            and _is_last(store, steps, start, length)
+        ):
             channel = topics["/final_state"]
             body = number.to_bytes(4, "little") + start.env.to_bytes(4, "little") + tail.pending[start.env]
-            made.append((channel, counts[channel], end_time, record(channel, counts[channel], end_time, body)))
+            made.append(
+                (channel, counts[channel], end_time, record(channel, counts[channel], end_time, body))
+            )
             episodes.finals[number] = counts[channel]
             counts[channel] += 1
         channel = topics["/episode_end"]
-        message = EpisodeEnd(number, start.env, start.first_row, length, total, end, number in episodes.finals, "{}")
-        made.append((channel, counts[channel], end_time, record(channel, counts[channel], end_time, message.encode())))
+        message = EpisodeEnd(
+            number, start.env, start.first_row, length, total, end, number in episodes.finals, "{}"
+        )
+        made.append(
+            (channel, counts[channel], end_time, record(channel, counts[channel], end_time, message.encode()))
+        )
         episodes.ends[number] = (counts[channel], end_time, message)
         counts[channel] += 1
     tail.rows += to_rows(made)

@@ -55,7 +55,9 @@ def rewrite_recording(
         raise RecordingError(f"{target} cannot be written: {err.strerror}; choose a writable place") from err
     try:
         try:
-            _Rewriter(source, Container(fd, str(target), compression)).run(episodes, attachments or {}, benchmark_id)
+            _Rewriter(source, Container(fd, str(target), compression)).run(
+                episodes, attachments or {}, benchmark_id
+            )
             os.fsync(fd)
         finally:
             os.close(fd)
@@ -76,7 +78,10 @@ class _Rewriter:
         self._index = IndexBuilder()
 
     def run(
-        self, numbers: Sequence[int] | None, attachments: Mapping[str, tuple[str, bytes]], benchmark_id: str | None
+        self,
+        numbers: Sequence[int] | None,
+        attachments: Mapping[str, tuple[str, bytes]],
+        benchmark_id: str | None,
     ) -> None:
         container, source = self._container, self._source
         metadata = {key: value for key, value in source.metadata.items() if key != "journal"}
@@ -114,7 +119,9 @@ class _Rewriter:
             self._copy(channel, spans, dtype)
             topic = self._contents.channels[channel].topic.removesuffix("/step")
             for leaf in layout.images:
-                self._copy(self._topics[f"{topic}/image/{leaf.name}"], spans, layout.image_messages[leaf.name].dtype)
+                self._copy(
+                    self._topics[f"{topic}/image/{leaf.name}"], spans, layout.image_messages[leaf.name].dtype
+                )
         self._events(rows, firsts)
         if "/info" in self._topics:
             self._infos({int(number) for number in rows["episode"]})
@@ -139,9 +146,12 @@ class _Rewriter:
     def _put(self, channel: int, batch: list[Any], first: int) -> int:
         if not batch:
             return 0
-        rows = np.concatenate(batch)
+        data = bytearray().join(
+            part.tobytes() for part in batch
+        )  # concatenating arrays would drop their padding
+        rows = np.frombuffer(data, batch[0].dtype)
         rows["#sequence"] = first + np.arange(len(rows))
-        self._container.add_chunk(even_rows(channel, first, rows.view(np.uint8).reshape(-1), rows))
+        self._container.add_chunk(even_rows(channel, first, data, rows))
         return len(rows)
 
     def _messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
@@ -168,7 +178,9 @@ class _Rewriter:
         starts, ends, finals = [], [], []
         for row, first in zip(rows, firsts, strict=True):
             ((start_time, body),) = self._messages(self._topics["/episode_start"], int(row["start_row"]), 1)
-            starts.append((start_time, EpisodeStart.decode(memoryview(body))._replace(first_row=int(first)).encode()))
+            starts.append(
+                (start_time, EpisodeStart.decode(memoryview(body))._replace(first_row=int(first)).encode())
+            )
             ((end_time, body),) = self._messages(self._topics["/episode_end"], int(row["end_row"]), 1)
             end = EpisodeEnd.decode(memoryview(body))._replace(first_row=int(first))
             final = -1
@@ -178,8 +190,18 @@ class _Rewriter:
             seed = int(row["seed"]) if row["has_seed"] else None
             self._index.add(
                 EpisodeRow(
-                    int(first), end.length, end.episode_return, int(row["start_time"]), int(row["end_time"]), seed,
-                    len(ends), len(ends), final, end.episode, end.env, end.end,
+                    int(first),
+                    end.length,
+                    end.episode_return,
+                    int(row["start_time"]),
+                    int(row["end_time"]),
+                    seed,
+                    len(ends),
+                    len(ends),
+                    final,
+                    end.episode,
+                    end.env,
+                    end.end,
                 ),  # fmt: skip
                 end.metadata,
             )

@@ -155,7 +155,14 @@ class ImageRows:
     """The images of one leaf: row j is the state of step j, so the running row is always one ahead of the steps."""
 
     def __init__(
-        self, leaf: Leaf, layout: ImageLayout, area: RowArea, buffer: memoryview, channel: int, sink: Sink, first: int = 0
+        self,
+        leaf: Leaf,
+        layout: ImageLayout,
+        area: RowArea,
+        buffer: memoryview,
+        channel: int,
+        sink: Sink,
+        first: int = 0,
     ) -> None:
         self._leaf = leaf
         self._layout = layout

@@ -25,13 +25,19 @@ Array = np.ndarray[Any, Any]
 class Salvage:
     """The rows of one RowArea's channel block, in both halves."""
 
-    def __init__(self, contents: JournalContents, area: RowArea, block: int, dtype: np.dtype[Any], channel: int) -> None:
+    def __init__(
+        self, contents: JournalContents, area: RowArea, block: int, dtype: np.dtype[Any], channel: int
+    ) -> None:
         shape = (2, area.channels, area.rows + 1, area.row_size)
         if area.row_size != dtype.itemsize or contents.data[area.name].size != np.prod(shape):
-            raise FormatError(f"the journal's area {area.name!r} has rows of {area.row_size} bytes, not {dtype.itemsize}")
+            raise FormatError(
+                f"the journal's area {area.name!r} has rows of {area.row_size} bytes, not {dtype.itemsize}"
+            )
         self._bytes = contents.data[area.name].reshape(shape)[:, block]
         self.rows: Array = np.ascontiguousarray(self._bytes).view(dtype)[..., 0]
-        committed = (self.rows["#opcode"] == 5) & (self.rows["#channel"] == channel) & (self.rows["#log_time"] != 0)
+        committed = (
+            (self.rows["#opcode"] == 5) & (self.rows["#channel"] == channel) & (self.rows["#log_time"] != 0)
+        )
         committed &= self.rows["#sequence"] != HOLE
         committed[:, area.rows] = False  # the spare row is never committed
         self._halves, self._places = np.nonzero(committed)
@@ -78,7 +84,9 @@ def image_rows(salvage: Salvage, first: int, steps: int, channel: int) -> Rows |
     return even_rows(channel, first, rows.view(np.uint8).tobytes(), rows) if len(rows) else None
 
 
-def log_records(contents: JournalContents, area: LogArea, counts: dict[int, int]) -> list[tuple[int, int, int, bytes]]:
+def log_records(
+    contents: JournalContents, area: LogArea, counts: dict[int, int]
+) -> list[tuple[int, int, int, bytes]]:
     """(channel, sequence, log_time, record) of the committed records that are not in the file, in order."""
     found: list[tuple[int, int, int, bytes]] = []
     for half in range(area.halves):
@@ -117,7 +125,9 @@ def to_rows(entries: Sequence[tuple[int, int, int, bytes]]) -> list[Rows]:
     return rows
 
 
-def running_record(contents: JournalContents, area: LogArea, sequence: int, layout: StepLayout) -> bytes | None:
+def running_record(
+    contents: JournalContents, area: LogArea, sequence: int, layout: StepLayout
+) -> bytes | None:
     """The state (CDR bytes after `episode` and `env`) of the running record, which will have `sequence`; None if it is
     not here."""
     for half in range(area.halves):

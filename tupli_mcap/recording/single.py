@@ -146,7 +146,9 @@ class SingleRecorder:
         raise StepError("expected a reset before the first step; call env.reset()")
 
     def _refused(self, *_: Any) -> None:
-        raise StepError("the step before this one could not be recorded; call env.reset() to go on with a new episode")
+        raise StepError(
+            "the step before this one could not be recorded; call env.reset() to go on with a new episode"
+        )
 
     def close(self, metadata: str = "{}") -> None:
         """Ends the running episode as interrupted and closes the recording."""
@@ -160,4 +162,6 @@ class SingleRecorder:
             self._writer.close()
 
     def _closed(self, *_: Any) -> None:
-        raise self._writer.failed or RecordingError(f"{self._writer.path} is closed; wrap the environment again to record")
+        raise self._writer.failed or RecordingError(
+            f"{self._writer.path} is closed; wrap the environment again to record"
+        )

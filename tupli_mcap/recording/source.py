@@ -46,7 +46,9 @@ class PathSource:
         self.size = os.fstat(self._fd).st_size
         if path.is_dir():
             self.close()
-            raise RecordingError(f"{path} is a directory; give a recording (.mcap), or open it as a FileStorage")
+            raise RecordingError(
+                f"{path} is a directory; give a recording (.mcap), or open it as a FileStorage"
+            )
 
     def read(self, offset: int, length: int) -> bytes:
         if self._fd < 0:
@@ -87,7 +89,9 @@ class FileSource:
 
     def read(self, offset: int, length: int) -> bytes:
         if offset + length > self.size:
-            raise FormatError(f"{self.name}: expected {length} bytes at offset {offset}, found the end at {self.size}")
+            raise FormatError(
+                f"{self.name}: expected {length} bytes at offset {offset}, found the end at {self.size}"
+            )
         with self._lock:
             self._file.seek(offset)
             data = self._file.read(length)

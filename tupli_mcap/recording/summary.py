@@ -17,7 +17,15 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.container import MAGIC, PROFILE
 from tupli_mcap.recording.source import Source
 
-__all__ = ["Summary", "has_summary", "parse_record", "read_attachment", "read_metadata", "read_summary", "records"]
+__all__ = [
+    "Summary",
+    "has_summary",
+    "parse_record",
+    "read_attachment",
+    "read_metadata",
+    "read_summary",
+    "records",
+]
 
 FOOTER_SIZE = 9 + 20
 _FOOTER = struct.Struct("<BQQQI")
@@ -60,7 +68,9 @@ def has_summary(source: Source) -> bool:
     if source.size < 2 * len(MAGIC) + FOOTER_SIZE:
         return False
     tail = source.read(source.size - len(MAGIC) - FOOTER_SIZE, FOOTER_SIZE + len(MAGIC))
-    return tail[FOOTER_SIZE:] == MAGIC and tail[0] == Opcode.FOOTER and tail[1:9] == (20).to_bytes(8, "little")
+    return (
+        tail[FOOTER_SIZE:] == MAGIC and tail[0] == Opcode.FOOTER and tail[1:9] == (20).to_bytes(8, "little")
+    )
 
 
 def read_summary(source: Source) -> Summary:
@@ -103,11 +113,15 @@ def records(data: bytes | memoryview, base: int, name: str) -> Iterator[tuple[in
     view, position = memoryview(data), 0
     while position < len(view):
         if position + 9 > len(view):
-            raise FormatError(f"{name}: expected a record at offset {base + position}, found {len(view) - position} bytes")
+            raise FormatError(
+                f"{name}: expected a record at offset {base + position}, found {len(view) - position} bytes"
+            )
         opcode, length = _RECORD.unpack_from(view, position)
         start, end = position + 9, position + 9 + length
         if end > len(view):
-            raise FormatError(f"{name}: the record at offset {base + position} claims {length} bytes, beyond its section")
+            raise FormatError(
+                f"{name}: the record at offset {base + position} claims {length} bytes, beyond its section"
+            )
         yield opcode, base + position, view[start:end]
         position = end
 
@@ -117,10 +131,22 @@ def parse_record(opcode: int, body: memoryview, offset: int, name: str) -> Any:
     stream = io.BytesIO(body)
     try:
         parsed = _PARSERS[opcode].read(ReadDataStream(stream))
-    except (McapError, struct.error, UnicodeDecodeError, EOFError, ValueError, MemoryError, OverflowError) as err:
-        raise FormatError(f"{name}: the record with opcode {opcode} at offset {offset} is damaged: {err}") from err
+    except (
+        McapError,
+        struct.error,
+        UnicodeDecodeError,
+        EOFError,
+        ValueError,
+        MemoryError,
+        OverflowError,
+    ) as err:
+        raise FormatError(
+            f"{name}: the record with opcode {opcode} at offset {offset} is damaged: {err}"
+        ) from err
     if stream.tell() != len(body):
-        raise FormatError(f"{name}: the record with opcode {opcode} at offset {offset} has {len(body)} bytes, not {stream.tell()}")
+        raise FormatError(
+            f"{name}: the record with opcode {opcode} at offset {offset} has {len(body)} bytes, not {stream.tell()}"
+        )
     return parsed
 
 
@@ -133,7 +159,9 @@ def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
         raise FormatError(f"{source.name}: expected the attachment {index.name!r} at offset {index.offset}")
     crc = int.from_bytes(record[-4:], "little")
     if crc and zlib.crc32(memoryview(record)[9:-4]) != crc:
-        raise FormatError(f"{source.name}: the attachment {index.name!r} at offset {index.offset} is damaged (its CRC differs)")
+        raise FormatError(
+            f"{source.name}: the attachment {index.name!r} at offset {index.offset} is damaged (its CRC differs)"
+        )
     return data
 
 

@@ -48,7 +48,12 @@ class VectorRecorder:
     """Records the episodes of `num_envs` sub-environments. `spaces` are those of one of them."""
 
     def __init__(
-        self, writer: RecordingWriter, spaces: StepLayout, num_envs: int, autoreset: Autoreset, infos: InfoRecorder | None
+        self,
+        writer: RecordingWriter,
+        spaces: StepLayout,
+        num_envs: int,
+        autoreset: Autoreset,
+        infos: InfoRecorder | None,
     ) -> None:
         self._writer = writer
         self._spaces = spaces
@@ -121,14 +126,20 @@ class VectorRecorder:
 
     # ---- steps
 
-    def put(self, actions: Any, states: Any, rewards: Any, terminals: Any, timeouts: Any, infos: Mapping[str, Any]) -> Array:
+    def put(
+        self, actions: Any, states: Any, rewards: Any, terminals: Any, timeouts: Any, infos: Mapping[str, Any]
+    ) -> Array:
         """Records a batch; returns which sub-environments took a step (bool, `num_envs`).
 
         Raises:
             StepError: something cannot be stored exactly; nothing of this batch is recorded.
         """
         if not self._was_reset or self._refused:
-            why = "the step before this one could not be recorded" if self._refused else "there was no reset yet"
+            why = (
+                "the step before this one could not be recorded"
+                if self._refused
+                else "there was no reset yet"
+            )
             raise StepError(f"{why}; call env.reset() to go on")
         rewards = np.asarray(rewards)
         terminals, timeouts = np.asarray(terminals, dtype=np.bool_), np.asarray(timeouts, dtype=np.bool_)
@@ -188,7 +199,11 @@ class VectorRecorder:
         else:
             firsts = [*self._each(self._observations, self._first), *self._each(self._observations, states)]
             layout = decide_layout(
-                self._spaces, firsts, list(self._each(self._actions, actions)), list(rewards), self._writer.layout
+                self._spaces,
+                firsts,
+                list(self._each(self._actions, actions)),
+                list(rewards),
+                self._writer.layout,
             )
         schema = None if self._infos is None else self._infos.schema()
         self._writer.begin(layout, self._n, vector=True, info_schema=schema)
@@ -200,7 +215,11 @@ class VectorRecorder:
         if self._writer.layout is not None:
             return self._writer.layout
         dtypes = {}
-        for leaves, roots in ((self._spaces.state, states), (self._spaces.action, actions), (self._spaces.reward, rewards)):
+        for leaves, roots in (
+            (self._spaces.state, states),
+            (self._spaces.action, actions),
+            (self._spaces.reward, rewards),
+        ):
             for leaf in leaves:
                 if leaf.dtype is None or leaf.kind == "image":
                     continue
@@ -215,7 +234,9 @@ class VectorRecorder:
         """The final states of a same-step autoreset."""
         given = infos.get("final_obs", infos.get("final_observation"))
         if given is None:
-            raise StepError("expected infos['final_obs'] for episodes that end under same-step autoreset, found none")
+            raise StepError(
+                "expected infos['final_obs'] for episodes that end under same-step autoreset, found none"
+            )
         return {int(i): given[i] for i in np.flatnonzero(done)}
 
     def _start(self, active: Array | None) -> None:
@@ -240,7 +261,14 @@ class VectorRecorder:
         return int(store.counts[i]) if isinstance(store, VectorRows) else store[i].count  # type: ignore[index]
 
     def _store(
-        self, actions: Any, states: Any, rewards: Array, terminals: Array, timeouts: Array, active: Array | None, finals: dict[int, Any]
+        self,
+        actions: Any,
+        states: Any,
+        rewards: Array,
+        terminals: Array,
+        timeouts: Array,
+        active: Array | None,
+        finals: dict[int, Any],
     ) -> None:
         store = self._writer.vector
         self._final_bytes = {i: self._encode_final(state) for i, state in finals.items()}
@@ -327,4 +355,3 @@ class VectorRecorder:
         finally:
             self._refused = True
             self._writer.close()
-

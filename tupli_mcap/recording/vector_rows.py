@@ -62,10 +62,12 @@ class VectorRows:
         self._episode = self._rows["episode"]
         self._time = self._rows["#log_time"]
         self._sequence = self._rows["#sequence"]
-        self._state_bytes: Array = (
-            np.frombuffer(buffer, np.uint8).reshape(2, n, area.rows + 1, area.row_size)
-        )
-        ends = [message.offset(f.name) + f.nbytes for f in message.fields if f.name in {leaf.name for leaf in layout.state}]
+        self._state_bytes: Array = np.frombuffer(buffer, np.uint8).reshape(2, n, area.rows + 1, area.row_size)
+        ends = [
+            message.offset(f.name) + f.nbytes
+            for f in message.fields
+            if f.name in {leaf.name for leaf in layout.state}
+        ]
         self._state_end = BODY + max(ends, default=8)
 
     def _writer(self, leaf: Leaf) -> tuple[Leaf, Array | None, np.dtype[Any], tuple[int, ...]]:
@@ -86,7 +88,11 @@ class VectorRows:
         if self._nested:
             check_structure(self._layout.action_space, action, "action")
             check_structure(self._layout.observation_space, state, "state")
-        return self._checked(self._action, action), self._checked(self._reward, reward), self._checked(self._state, state)
+        return (
+            self._checked(self._action, action),
+            self._checked(self._reward, reward),
+            self._checked(self._state, state),
+        )
 
     def put_state(self, state: Any, mask: Array | None = None) -> None:
         """The states of a reset: of all sub-environments, or of those in `mask`."""
@@ -153,4 +159,3 @@ class VectorRows:
                 self._derivers[i].fill(rows)
                 data = np.ascontiguousarray(rows).view(np.uint8)
                 self._sink(even_rows(channel, int(rows["#sequence"][0]), data, rows))
-

@@ -83,8 +83,12 @@ class RecordingWriter:
         self.images: list[list[ImageRows]] = []
         self.events: EventLog | None = None
         self.infos: EventLog | None = None
-        self.on_abandon: Callable[[], None] | None = None  # tells the recorder, whose encoder knows only its buffer
-        self.start_is_droppable: Callable[[], bool] = lambda: False  # the last event is a start without a step
+        self.on_abandon: Callable[[], None] | None = (
+            None  # tells the recorder, whose encoder knows only its buffer
+        )
+        self.start_is_droppable: Callable[[], bool] = lambda: (
+            False
+        )  # the last event is a start without a step
         self.num_envs = 1
         self.is_vector = False
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
@@ -128,7 +132,12 @@ class RecordingWriter:
     # ---- the first step
 
     def begin(
-        self, layout: StepLayout, num_envs: int, *, vector: bool, info_schema: tuple[str, Mapping[str, str]] | None = None
+        self,
+        layout: StepLayout,
+        num_envs: int,
+        *,
+        vector: bool,
+        info_schema: tuple[str, Mapping[str, str]] | None = None,
     ) -> None:
         """Fixes the layout: registers the channels, makes the journal and the row stores."""
         self.layout = layout
@@ -162,7 +171,12 @@ class RecordingWriter:
         ]
         images = [
             [
-                channel(f"{top}/image/{leaf.name}", "sensor_msgs/msg/Image", IMAGE_SCHEMA, {"env": str(i), "leaf": leaf.name})
+                channel(
+                    f"{top}/image/{leaf.name}",
+                    "sensor_msgs/msg/Image",
+                    IMAGE_SCHEMA,
+                    {"env": str(i), "leaf": leaf.name},
+                )
                 for i, top in enumerate(tops)
             ]
             for leaf in layout.images
@@ -273,14 +287,22 @@ class RecordingWriter:
         self.next_episode -= 1
 
     def end_episode(
-        self, episode: StartedEpisode, end: int, length: int, total: Any, final_state: bytes | None, metadata: str
+        self,
+        episode: StartedEpisode,
+        end: int,
+        length: int,
+        total: Any,
+        final_state: bytes | None,
+        metadata: str,
     ) -> None:
         """Writes `/final_state` and `/episode_end`, and the episode's row of the index."""
         assert self.events is not None
         channels, sequences = self.channels, self.events.sequences
         total = total if type(total) is float else float(np.sum(total))
         number, env, first_row = episode.number, episode.env, episode.first_row
-        message = EpisodeEnd(number, env, first_row, length, total, end, final_state is not None, metadata).encode()
+        message = EpisodeEnd(
+            number, env, first_row, length, total, end, final_state is not None, metadata
+        ).encode()
         end_row, final_row = sequences[channels.end], -1
         now = time.time_ns()
         if final_state is None:
@@ -294,7 +316,10 @@ class RecordingWriter:
             number, env, end,
         )  # fmt: skip
         self.index.add(EpisodeRow._make(row), metadata)
-        if self.options.flush_seconds is not None and time.monotonic() - self._flushed_at > self.options.flush_seconds:
+        if (
+            self.options.flush_seconds is not None
+            and time.monotonic() - self._flushed_at > self.options.flush_seconds
+        ):
             self.flush()
 
     # ---- chunks
@@ -304,7 +329,9 @@ class RecordingWriter:
         if self.failed is not None:
             raise self.failed
         if rows.first + len(rows.offsets) > LAST_ROW:
-            raise RecordingError(f"{self.path}: a channel holds at most {LAST_ROW} messages; go on in a new recording")
+            raise RecordingError(
+                f"{self.path}: a channel holds at most {LAST_ROW} messages; go on in a new recording"
+            )
         try:
             self.container.add_chunk(rows)
         except RecordingError as err:

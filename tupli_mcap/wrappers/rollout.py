@@ -31,15 +31,12 @@ _REPORTS = 200  # progress is told about so often in a rollout
 
 
 class RolloutSummary(NamedTuple):
-    """What one call recorded; `return_mean` is over the episodes that ended, None if none did.
-
-    `episodes` counts interrupted ones too, `size` is the whole file's (bytes).
-    """
+    """What one call recorded; interrupted episodes count too. `size` is the whole file's (bytes)."""
 
     path: Path
     episodes: int
     steps: int
-    return_mean: float | None
+    return_mean: float
     seconds: float
     size: int
 
@@ -61,7 +58,8 @@ def record_rollouts(
 
     Args:
         env_id: as `gymnasium.make` takes it; "module:Name-v0" imports the module first.
-        steps: in total; with several sub-environments at least so many. The last episode may end "interrupted".
+        steps: in total; with several sub-environments at least so many. The last episode may end
+            "interrupted".
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
@@ -69,8 +67,8 @@ def record_rollouts(
         progress: called with the number of steps so far, a few hundred times.
 
     Raises:
-        RecordingError: the environment cannot be made, the policy or the environment failed (what was recorded
-            before is in the file), or the file cannot be written.
+        RecordingError: the environment cannot be made, the policy or the environment failed (what was
+            recorded before is in the file), or the file cannot be written.
         SpaceError: a space that cannot be recorded.
     """
     if steps < 1 or num_envs < 1:
@@ -82,17 +80,23 @@ def record_rollouts(
         if isinstance(made, gym.vector.VectorEnv):
             attachments = benchmark_attachments(made.envs[0]) if hasattr(made, "envs") else {}
             vector = RecordVectorEpisodes(
-                made, path, mode=mode, compression=compression, record_info=record_info, attachments=attachments
+                made,
+                path,
+                mode=mode,
+                compression=compression,
+                record_info=record_info,
+                attachments=attachments,
             )
             with vector:
                 done = _run_vector(vector, steps, seed, policy, report)
         else:
-            with RecordEpisodes(made, path, mode=mode, compression=compression, record_info=record_info) as single:
+            with RecordEpisodes(
+                made, path, mode=mode, compression=compression, record_info=record_info
+            ) as single:
                 done = _run(single, steps, seed, policy, report)
     with Recording(path) as recording:
         rows = recording.index[known:]
-        ended = rows["return"][rows["end"] != 2]
-        mean = float(ended.mean()) if len(ended) else None
+        mean = float(rows["return"].mean())
     return RolloutSummary(
         Path(path), len(rows), done, mean, time.perf_counter() - began, Path(path).stat().st_size
     )
@@ -173,7 +177,8 @@ def _run_vector(
 def _actions(env: RecordVectorEpisodes, policy: Policy, states: Any) -> Any:
     space = env.single_action_space
     chosen = [policy(state) for state in iterate(env.observation_space, states)]
-    return concatenate(space, chosen, create_empty_array(space, env.num_envs))
+    batch: Any = create_empty_array(space, env.num_envs)
+    return concatenate(space, chosen, batch)
 
 
 @contextlib.contextmanager
@@ -185,7 +190,8 @@ def _failures(done: int, path: Path) -> Iterator[None]:
         raise
     except Exception as err:
         raise RecordingError(
-            f"the policy or the environment failed at step {done}: {_reason(err)}; {path} holds the steps before it"
+            f"the policy or the environment failed at step {done}: {_reason(err)}; "
+            f"{path} holds the steps before it"
         ) from err
 
 

@@ -86,7 +86,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         options = WriterOptions(
             compression, mode, benchmark_id, attachments, journal_dir, chunk_size, flush_seconds
         )
-        spaces = StepLayout(env.observation_space, env.action_space, reward_space)  # refused before a file is made
+        spaces = StepLayout(
+            env.observation_space, env.action_space, reward_space
+        )  # refused before a file is made
         spaces.to_metadata()
         self._writer = RecordingWriter(path, options)
         try:
@@ -96,7 +98,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             raise
         self._recorder = SingleRecorder(self._writer, spaces, infos)
         self._watches = metadata_callback is not None or infos is not None
-        self._episode_metadata: list[str] = ["{}"]  # shared with the finalizer, which must not hold the wrapper
+        self._episode_metadata: list[str] = [
+            "{}"
+        ]  # shared with the finalizer, which must not hold the wrapper
         self._stepped = False
         self._state: Any = None
         self._finalizer = weakref.finalize(self, _close, self._recorder, self._episode_metadata)
@@ -147,7 +151,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             self._state = copy.deepcopy(state)
         return result
 
-    def _watch(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any, info: dict[str, Any]) -> None:
+    def _watch(
+        self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any, info: dict[str, Any]
+    ) -> None:
         before, entries = self._state, dict(info) if self._records_info else {}
         if self._step_callback is not None:
             extra = self._step_callback(Step(before, action, reward, terminal, timeout, info))

@@ -140,7 +140,12 @@ class RecordEpisodes(gym.vector.VectorWrapper):  # type: ignore[type-arg]
                 state, action, reward, terminal, timeout = values
                 metadata = self._callbacks[i](
                     RLTuple.model_construct(
-                        state=state, action=action, reward=float(reward), info=info, terminal=terminal, timeout=timeout
+                        state=state,
+                        action=action,
+                        reward=float(reward),
+                        info=info,
+                        terminal=terminal,
+                        timeout=timeout,
                     )
                 )
                 self._texts[i] = jsonvalue.dumps_plain(metadata) if metadata else "{}"

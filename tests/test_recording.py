@@ -1,0 +1,335 @@
+"""Reading: episodes, columns, slices, sources, appending, rewriting, and files that are no recordings."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import io
+import threading
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Sampler, roll, same
+from gymnasium import spaces
+from mcap.writer import Writer
+
+from tupli_mcap import (
+    EpisodeData,
+    FormatError,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    SpaceError,
+    StepError,
+    rewrite_recording,
+    write_recording,
+)
+
+DICT = spaces.Dict(
+    {"x": spaces.Box(-1, 1, (2, 2)), "t": spaces.Tuple((spaces.Discrete(3), spaces.MultiBinary(2)))}
+)
+TEXT = spaces.Dict({"note": spaces.Text(5), "x": spaces.Discrete(4)})
+IMAGE = spaces.Box(0, 255, (5, 4, 3), np.uint8)
+KINDS = {"box": spaces.Box(-1, 1, (3,), np.float64), "dict": DICT, "text": TEXT, "image": IMAGE}
+
+
+def record(path: Path, kind: str = "box", steps: int = 60, **kwargs: Any) -> list[tuple[Any, ...]]:
+    env = Sampler(KINDS[kind], spaces.Discrete(5, start=1))
+    with RecordEpisodes(env, path, chunk_size=1200, **kwargs) as recorded:
+        return roll(recorded, steps)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "r.mcap"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("threads", [1, 3])
+def test_columns_are_the_episodes_one_after_another(path: Path, kind: str, threads: int) -> None:
+    taken = record(path, kind)
+    recording = Recording(path)
+    fields = ["states", "actions", "rewards", "terminals", "timeouts", "next_states"]
+    columns = recording.read(fields=fields, threads=threads)
+    assert columns.rewards.tolist() == [step[2] for step in taken]
+    assert columns.episode_lengths.tolist() == [len(e) for e in recording.episodes]
+    chosen = recording.read([5, 2, 2], fields=fields, threads=threads)
+    expected = [*recording.episodes[5], *recording.episodes[2], *recording.episodes[2]]
+    assert chosen.rewards.tolist() == [step.reward for step in expected]
+    nested = chosen.next_states["x"] if kind in ("dict", "text") else chosen.next_states
+    singles = [recording.episodes[i].next_states for i in (5, 2, 2)]
+    parts = [single["x"] if kind in ("dict", "text") else single for single in singles]
+    assert np.array_equal(nested, np.concatenate(parts))
+
+
+def test_only_the_fields_asked_for(path: Path) -> None:
+    record(path)
+    columns = Recording(path).read(fields=["rewards"])
+    assert columns.states is None and columns.actions is None
+    assert len(columns.rewards) == len(columns) == 60
+    with pytest.raises(RecordingError, match="expected fields from states, actions, .*, found 'reward'"):
+        Recording(path).read(fields=["reward"])
+    with pytest.raises(RecordingError, match="expected episodes from 0 to 8, found"):
+        Recording(path).read([9])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_windows_of_an_episode(path: Path, kind: str) -> None:
+    record(path, kind)
+    episode = Recording(path).episodes[3]
+    steps = list(episode)
+    window = episode[2:5]
+    assert window.rewards.tolist() == [step.reward for step in steps[2:5]]
+    assert len(episode[5:2]) == 0
+    assert episode[-2:].actions.tolist() == [step.action for step in steps[-2:]]
+    with pytest.raises(RecordingError, match="expected consecutive steps, found a stride of 2"):
+        episode[::2]
+
+
+def test_episodes_are_a_sequence(path: Path) -> None:
+    record(path)
+    recording = Recording(path)
+    episodes = recording.episodes
+    assert [e.number for e in episodes[2:8:3]] == [2, 5]
+    assert episodes[-1].number == len(episodes) - 1
+    with pytest.raises(IndexError, match="expected an episode from 0 to 8, found 9"):
+        episodes[9]
+    assert repr(episodes[0]) == "<Episode 0: 7 steps, return 14, terminal>"
+    assert "9 episodes, 60 steps" in repr(recording)
+
+
+def test_opening_and_listing_touch_no_step_chunk(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tupli_mcap.recording import chunks
+
+    record(path)
+    monkeypatch.setattr(chunks.ChunkStore, "_read", lambda *_: pytest.fail("a chunk was read"))
+    recording = Recording(path)
+    assert len([(e.return_, e.end, len(e), e.metadata) for e in recording.episodes]) == 9
+
+
+def test_arrays_belong_to_the_caller(path: Path) -> None:
+    record(path)
+    recording = Recording(path)
+    recording.read([0]).states[:] = 99
+    assert (recording.read([0]).states != 99).all()
+
+
+# ---- sources
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[str]:
+    class Ranges(http.server.SimpleHTTPRequestHandler):
+        """The standard handler knows no ranges."""
+
+        def do_GET(self) -> None:
+            data = (tmp_path / self.path.lstrip("/")).read_bytes()
+            asked = self.headers.get("Range")
+            if asked is None:
+                start, end = 0, len(data) - 1
+                self.send_response(200)
+            else:
+                first, last = asked.removeprefix("bytes=").split("-")
+                start, end = int(first), min(int(last), len(data) - 1)
+                self.send_response(206)
+                self.send_header("Content-Range", f"bytes {start}-{end}/{len(data)}")
+            self.send_header("Accept-Ranges", "bytes")
+            self.send_header("Content-Length", str(end - start + 1))
+            self.end_headers()
+            if self.command == "GET":
+                self.wfile.write(data[start : end + 1])
+
+        do_HEAD = do_GET  # noqa: N815
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(Ranges, directory=str(tmp_path))
+    ) as httpd:
+        thread = threading.Thread(target=httpd.serve_forever, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{httpd.server_port}"
+        httpd.shutdown()
+        thread.join()
+
+
+def test_urls_and_open_files(path: Path, server: str) -> None:
+    record(path)
+    expected = Recording(path).read().states
+    with path.open("rb") as file:
+        assert np.array_equal(Recording(file).read(threads=3).states, expected)
+    assert np.array_equal(Recording(io.BytesIO(path.read_bytes())).read().states, expected)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # fsspec's own loop
+        assert np.array_equal(Recording(f"{server}/r.mcap").read().states, expected)
+        with pytest.raises(RecordingError, match=r"nothing\.mcap cannot be opened"):
+            Recording(f"{server}/nothing.mcap")
+    with pytest.raises(RecordingError, match="expected a path, a URL or a seekable binary file"):
+        Recording(7)  # type: ignore[arg-type]
+
+
+def test_a_closed_recording_says_so(path: Path) -> None:
+    record(path)
+    with Recording(path) as recording:
+        pass
+    with pytest.raises(RecordingError, match="is closed; open it again"):
+        recording.read()
+
+
+# ---- files that are no recordings
+
+
+def foreign(path: Path) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema("a/msg/B", "ros2msg", b"uint8 x")
+        channel = writer.register_channel("/b", "cdr", schema)
+        writer.add_message(channel, 1, b"\0\1\0\0\5", 1)
+        writer.finish()
+
+
+def test_other_files_get_one_clear_error(path: Path) -> None:
+    with pytest.raises(RecordingError, match="does not exist; give the path of a recording"):
+        Recording(path)
+    with pytest.raises(RecordingError, match="is a directory"):
+        Recording(path.parent)
+    path.write_bytes(b"")
+    with pytest.raises(FormatError, match="is empty; expected an MCAP recording"):
+        Recording(path)
+    path.write_bytes(b"PK\3\4" + bytes(100))
+    with pytest.raises(FormatError, match="expected an MCAP file, found b'PK"):
+        Recording(path)
+    foreign(path)
+    with pytest.raises(FormatError, match="is an MCAP file, but no tupli_mcap recording"):
+        Recording(path)
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(FormatError, match="no tupli_mcap recording|cut off or damaged"):
+        Recording(path)
+
+
+def test_a_flipped_bit_is_found(path: Path) -> None:
+    record(path)
+    data = path.read_bytes()
+    whole = Recording(path).read(fields=["states", "actions", "rewards", "next_states"])
+    rng = np.random.default_rng(0)
+    refused = 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        for _ in range(300):
+            changed = bytearray(data)
+            changed[rng.integers(len(data))] ^= 1 << rng.integers(8)
+            path.write_bytes(changed)
+            try:
+                found = Recording(path).read(fields=["states", "actions", "rewards", "next_states"])
+            except FormatError:
+                refused += 1
+                continue
+            n = 0 if found.states is None else len(found.states)
+            assert n == 0 or np.array_equal(found.states, whole.states[:n])
+            assert n == 0 or np.array_equal(found.actions, whole.actions[:n])
+    assert refused > 50
+
+
+# ---- appending
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_appending_rewrites_nothing(path: Path, kind: str) -> None:
+    first = record(path, kind)
+    with_index = path.read_bytes()
+    kept = Recording(path)._contents.data_end
+    second = record(path, kind, 40, mode="a")
+    assert path.read_bytes()[:kept] == with_index[:kept]
+    recording = Recording(path)
+    steps = [step for episode in recording.episodes for step in episode]
+    for step, (state, action, reward, *_) in zip(steps, first + second, strict=True):
+        assert same(step.state, state)
+        assert (step.action, step.reward) == (action, reward)
+    assert [e.number for e in recording.episodes] == list(range(len(recording.index)))
+
+
+def test_appending_to_something_else_is_refused(path: Path) -> None:
+    record(path, benchmark_id="a" * 64)
+    before = path.read_bytes()
+    with pytest.raises(SpaceError, match="expected the recorded observation_space .* record to another file"):
+        RecordEpisodes(Sampler(DICT, spaces.Discrete(5, start=1)), path, mode="a")
+    with pytest.raises(RecordingError, match="holds episodes of benchmark 'aaaa"):
+        RecordEpisodes(Sampler(KINDS["box"], spaces.Discrete(5, start=1)), path, mode="a", benchmark_id="b")
+    assert len(Recording(path).index) == 9
+    assert np.array_equal(Recording(path).read().states, Recording(io.BytesIO(before)).read().states)
+    foreign(path)
+    with pytest.raises(FormatError, match="no tupli_mcap recording"):
+        RecordEpisodes(gym.make("CartPole-v1"), path, mode="a")
+    with pytest.raises(RecordingError, match='use mode="x" to create it'):
+        RecordEpisodes(gym.make("CartPole-v1"), path.with_name("none.mcap"), mode="a")
+
+
+def test_appended_values_must_fit_the_recorded_dtypes(path: Path) -> None:
+    record(path)
+    with RecordEpisodes(Sampler(KINDS["box"], spaces.Discrete(5, start=1)), path, mode="a") as env:
+        env.reset()
+        with pytest.raises(
+            StepError, match="action: expected values that int64 holds exactly, found float64 1.5"
+        ):
+            env.step(1.5)
+
+
+# ---- rewriting
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rewriting_keeps_what_is_asked_for(path: Path, kind: str) -> None:
+    record(path, kind, record_info=True)
+    source = Recording(path)
+    target = path.with_name("t.mcap")
+    rewrite_recording(
+        source, target, episodes=[1, 4, 5], attachments={"artifacts/a": ("text/plain", b"hello")}
+    )
+    rewritten = Recording(target)
+    assert [e.number for e in rewritten.episodes] == [1, 4, 5]
+    for episode in rewritten.episodes:
+        old = source.episodes[episode.number]
+        assert all(same(a, b) for a, b in zip(episode, old, strict=True))
+        assert same(episode.final_state, old.final_state)
+        assert (episode.seed, episode.end, episode.start_time) == (old.seed, old.end, old.start_time)
+        assert episode.infos == old.infos
+    assert rewritten.uuid == source.uuid
+    assert rewritten.read_attachment("artifacts/a") == b"hello"
+    with pytest.raises(RecordingError, match="has no attachment 'x'; it has "):
+        rewritten.read_attachment("x")
+
+
+def test_recordings_from_values(path: Path) -> None:
+    states = [np.arange(2.0) + i for i in range(3)]
+    episodes = [
+        EpisodeData(
+            states, [0, 1, 0], [1, 2.5, -1], [False] * 3, [False, False, True], final_state=states[0]
+        ),
+        EpisodeData(
+            states[:2], [1, 1], [0, 0], [False, True], [False] * 2, metadata={"score": np.float64(3)}
+        ),
+    ]
+    write_recording(
+        path, episodes, observation_space=spaces.Box(0, 9, (2,), np.float64), action_space=spaces.Discrete(2)
+    )
+    first, second = Recording(path).episodes
+    assert (first.end, second.end) == ("timeout", "terminal")
+    assert same(first.final_state, states[0])
+    assert second.final_state is None
+    assert np.array_equal(second.next_states, [states[1], states[1]])  # not known: the last state again
+    assert second.metadata == {"score": 3.0}
+    with pytest.raises(StepError, match="expected as many states, actions"):
+        write_recording(
+            path,
+            [EpisodeData([], [], [], [], [])],
+            observation_space=KINDS["box"],
+            action_space=spaces.Discrete(2),
+            mode="w",
+        )
