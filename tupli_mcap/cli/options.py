@@ -21,7 +21,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON instead.")]
 Limit = Annotated[int | None, typer.Option(min=0, help="Print at most so many.")]
 FilterText = Annotated[
     str | None,
-    typer.Option("--filter", metavar="FILTER", help="Such as 'metadata.score > -200 and end = \"terminal\"'."),
+    typer.Option("--filter", metavar="FILTER", help="Such as 'metadata.score > -200 and env = 0'."),
 ]
 StoragePath = Annotated[
     Path, typer.Option("--storage", envvar="TUPLI_MCAP_STORAGE", help="The storage's directory.")
@@ -43,7 +43,8 @@ def open_storage(path: Path, *, create: bool = False) -> FileStorage:
 
     if not create and not path.is_dir():
         raise StorageError(
-            f"there is no storage at {str(path)!r}; give its directory with --storage, or in TUPLI_MCAP_STORAGE"
+            f"there is no storage at {str(path)!r}; give its directory with --storage or "
+            "in TUPLI_MCAP_STORAGE"
         )
     return FileStorage(path)
 

@@ -22,8 +22,10 @@ __all__ = [
     "print_table",
     "short_ids",
     "step_progress",
+    "terminal_width",
     "time_of",
     "warnings_in_one_line",
+    "when",
 ]
 
 _GAP = "  "
@@ -104,8 +106,8 @@ def step_progress(total: int) -> Iterator[Callable[[int], None] | None]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("recording"), BarColumn(), MofNCompleteColumn(), TextColumn("steps"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    shown = (BarColumn(), MofNCompleteColumn(), TextColumn("steps"), TimeRemainingColumn())
+    with Progress(TextColumn("recording"), *shown, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("steps", total=total)
         yield lambda done: progress.update(task, completed=min(done, total))
 
@@ -157,7 +159,8 @@ def numbers(values: Sequence[float | None], decimals: int = 2) -> list[str]:
         return [number(value) for value in values]
     texts = [number(value, decimals) for value in values]
     return [
-        f"{text}.{'0' * decimals}" if text.lstrip("-").replace(",", "").isdecimal() else text for text in texts
+        f"{text}.{'0' * decimals}" if text.lstrip("-").replace(",", "").isdecimal() else text
+        for text in texts
     ]
 
 
@@ -176,6 +179,14 @@ def time_of(time_ns: int) -> str:
     if not time_ns:
         return ""
     return datetime.fromtimestamp(time_ns // 10**9, UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
+
+
+def when(created_at: str) -> str:
+    """The same for an ISO 8601 time; one that is none is shown as it is."""
+    try:
+        return datetime.fromisoformat(created_at).astimezone().strftime("%Y-%m-%d %H:%M:%S")
+    except ValueError:
+        return created_at
 
 
 def _visible(text: str) -> str:
@@ -219,7 +230,7 @@ def _cut(text: str, width: int, end: Literal["start", "end"]) -> str:
     text = text[-4 * width :] if end == "start" else text[: 4 * width]
     while cell_len(text) > width - 1:
         text = text[1:] if end == "start" else text[:-1]
-    return "…" + text if end == "start" else text + "…"
+    return "…" + text.lstrip("…") if end == "start" else text + "…"
 
 
 def _print_lines(lines: Sequence[str]) -> None:

@@ -6,7 +6,7 @@ import itertools
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from pydantic import ValidationError
 
@@ -37,13 +37,25 @@ from tupli_mcap.storage.document import (
     unpack,
 )
 from tupli_mcap.storage.recordings import episode_id
+from tupli_mcap.storage.sidecar import Sidecar
 
 if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
 
-__all__ = ["export", "read", "write"]
+__all__ = ["ImportPreview", "export", "from_recording", "preview", "read", "write"]
 
 Attachments = dict[str, tuple[str, bytes]]
+
+
+class ImportPreview(NamedTuple):
+    """What a file holds, and how much of it a storage does not have yet."""
+
+    benchmark_id: str
+    name: str
+    episodes: int
+    new_episodes: int
+    artifacts: int
+    new_artifacts: int
 
 
 def write(storage: FileStorage, benchmark_id: str, target: Path, filter: BaseFilter | None = None) -> Path:
@@ -95,21 +107,81 @@ def read(storage: FileStorage, path: Path, *, trust: bool = False) -> str:
         StorageError: It carries no benchmark, or lacks an artifact.
     """
     with Recording(path) as recording:
-        record = _environment(recording, path)
-        header = _header(record, path)
-        query = BenchmarkQuery(
-            hash=header.hash,
-            serialized=pack(record, artifacts_of(record, str(path)), record.benchmark),
-            metadata=header.metadata,
-        )
-        if benchmark_hash(unpack(query.serialized), header.metadata) != header.id:
-            raise FormatError(f"{path}: expected the content of benchmark {header.id}, found something else")
-        _read_artifacts(storage, recording, record, path)
+        record, header, query = _incoming(recording, path)
+        artifacts = _read_artifacts(storage, recording, record, path)
+        for data, metadata in artifacts:
+            storage.store_artifact(data, metadata)
         if trust:
             _trust.trust(record.digest)
         storage.store_benchmark(query)
         _copy(storage, recording, path, header.id)
     return header.id
+
+
+def preview(storage: FileStorage | None, path: Path) -> ImportPreview:
+    """What `read` would do; checks the whole file but its steps, and writes nothing. Raises as `read` does.
+
+    storage: None stands for an empty one.
+    """
+    with Recording(path) as recording:
+        record, header, _ = _incoming(recording, path)
+        found = artifacts_of(record, str(path))
+        _read_artifacts(storage, recording, record, path)
+        known = set() if storage is None else {item.id for item in storage.list_artifacts()}
+        return ImportPreview(
+            benchmark_id=header.id,
+            name=header.metadata.name,
+            episodes=len(recording),
+            new_episodes=len(_missing(storage, recording)),
+            artifacts=len(found),
+            new_artifacts=len(set(found) - known),
+        )
+
+
+def from_recording(path: Path, target: Path, storage: FileStorage | None = None) -> Path:
+    """Write the episodes of one recording into a new file that carries its benchmark and all artifacts.
+
+    storage: has what the recording lacks; None if it lacks nothing, as a bundle or a recording of a plain
+    environment does.
+
+    Raises:
+        NotFoundError: The storage does not know the recording's benchmark.
+        StorageError: Something is missing and no storage given, or the file exists or cannot be written.
+    """
+    _refuse_existing(target)
+    with Recording(path) as recording:
+        attachments: Attachments = {}
+        if recording.benchmark_id:
+            record = recording.benchmark.record if DOCUMENT_NAME in recording.attachments else None
+            named = () if record is None else artifacts_of(record, str(path))
+            if record is None or any(ARTIFACT_PREFIX + uri not in recording.attachments for uri in named):
+                if storage is None:
+                    raise StorageError(
+                        f"{str(path)!r} lacks artifacts of its benchmark {recording.benchmark_id}; "
+                        "name the storage that has them"
+                    )
+                attachments = _attachments(storage, recording.benchmark_id)
+        else:
+            _environment(recording, path)  # refuses a recording that carries none
+        deleted = Sidecar.read(path).deleted
+        kept = [int(number) for number in recording.index["episode"] if int(number) not in deleted]
+        with os_errors("cannot write the bundle", target), fill(target) as temporary:
+            temporary.unlink()
+            rewrite_recording(recording, temporary, episodes=kept, attachments=attachments)
+    return target
+
+
+def _incoming(recording: Recording, path: Path) -> tuple[EnvironmentRecord, BenchmarkHeader, BenchmarkQuery]:
+    record = _environment(recording, path)
+    header = _header(record, path)
+    query = BenchmarkQuery(
+        hash=header.hash,
+        serialized=pack(record, artifacts_of(record, str(path)), record.benchmark),
+        metadata=header.metadata,
+    )
+    if benchmark_hash(unpack(query.serialized), header.metadata) != header.id:
+        raise FormatError(f"{path}: expected the content of benchmark {header.id}, found something else")
+    return record, header, query
 
 
 def _attachments(storage: FileStorage, benchmark_id: str) -> Attachments:
@@ -231,35 +303,44 @@ def _header(record: EnvironmentRecord, path: Path) -> BenchmarkHeader:
 
 
 def _read_artifacts(
-    storage: FileStorage, recording: Recording, record: EnvironmentRecord, path: Path
-) -> None:
+    storage: FileStorage | None, recording: Recording, record: EnvironmentRecord, path: Path
+) -> list[tuple[bytes, ArtifactMetadata]]:
+    """The artifacts a recording carries, checked; what it lacks, the storage must have."""
     said = (record.benchmark or {}).get("artifact_metadata")
     facts = said if isinstance(said, dict) else {}
+    found = []
     for uri in artifacts_of(record, str(path)):
         if ARTIFACT_PREFIX + uri not in recording.attachments:
-            if storage.list_artifacts(FilterEQ(key="id", value=uri)):
+            if storage is not None and storage.list_artifacts(FilterEQ(key="id", value=uri)):
                 continue
             raise StorageError(f"{str(path)!r} lacks the artifact {uri} of its benchmark; ask for a bundle")
         data = recording.read_attachment(ARTIFACT_PREFIX + uri)
         if sha256(data) != uri:
             raise FormatError(f"{path}: expected artifact {uri}, found bytes with SHA-256 {sha256(data)}")
         try:
-            metadata = ArtifactMetadata.model_validate(facts.get(uri, {"name": uri}))
+            found.append((data, ArtifactMetadata.model_validate(facts.get(uri, {"name": uri}))))
         except ValidationError as err:
             raise FormatError(f"{path}: artifact {uri}: {first_defect(err)}") from err
-        storage.store_artifact(data, metadata)
+    return found
+
+
+def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
+    """Numbers of the episodes that the storage does not hold yet."""
+    ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
+    if storage is None:
+        return list(ids.values())
+    present = {header.id for header in storage.list_episodes(FilterIN(key="id", value=list(ids)))}
+    return [number for uri, number in ids.items() if uri not in present]
 
 
 def _copy(storage: FileStorage, recording: Recording, path: Path, benchmark_id: str) -> None:
     """Copy the episodes that the storage does not hold yet."""
-    ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
-    present = {header.id for header in storage.list_episodes(FilterIN(key="id", value=list(ids)))}
-    missing = [number for uri, number in ids.items() if uri not in present]
+    missing = _missing(storage, recording)
     if not missing:
         return
     target = storage.new_recording_path(benchmark_id)
     with os_errors("cannot import", target), fill(target) as temporary:
-        if recording.complete and not present:
+        if recording.complete and len(missing) == len(recording):
             shutil.copyfile(path, temporary)
         else:
             temporary.unlink()

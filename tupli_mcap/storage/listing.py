@@ -1,4 +1,4 @@
-"""Recordings and episodes of files and directories, whether a storage or not; nothing is written."""
+"""The recordings of files and directories, whether a storage or not; nothing is written."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe import state_of
 from tupli_mcap.recording.lock import is_locked
-from tupli_mcap.schema import BaseFilter, EpisodeHeader
-from tupli_mcap.storage.catalog import Catalog
-from tupli_mcap.storage.entries import catalog_rows
-from tupli_mcap.storage.scan import scan, stamp_of
+from tupli_mcap.storage.scan import scan
 from tupli_mcap.storage.sidecar import Sidecar
 
-__all__ = ["ListedRecording", "file_episodes", "find_recordings", "is_storage", "list_recordings"]
+__all__ = ["Compactable", "ListedRecording", "compactable", "find_recordings", "list_recordings"]
 
 
 class ListedRecording(NamedTuple):
@@ -37,9 +34,12 @@ class ListedRecording(NamedTuple):
     error: str | None = None
 
 
-def is_storage(path: Path) -> bool:
-    """Whether a directory was made by a FileStorage."""
-    return any((path / name).exists() for name in ("catalog.sqlite", "benchmarks", "storage.json"))
+class Compactable(NamedTuple):
+    """A recording (its path below the storage) with how many deleted episodes, and its size (bytes)."""
+
+    recording: str
+    deleted: int
+    size: int
 
 
 def find_recordings(path: Path) -> list[Path]:
@@ -67,24 +67,19 @@ def list_recordings(paths: Iterable[Path]) -> Iterator[ListedRecording]:
             yield _listed(file)
 
 
-def file_episodes(
-    path: Path, filter: BaseFilter | None = None, *, limit: int | None = None
-) -> list[EpisodeHeader]:
-    """The episodes of one recording that a filter is true of, by number; the meaning is that of a storage.
+def compactable(root: Path) -> list[Compactable]:
+    """The recordings of a storage that `FileStorage.compact` would rewrite.
 
     Raises:
-        FormatError: it is no recording, or damaged.
-        FilterError: the filter names an unknown key.
+        FormatError: what is noted beside a recording is damaged.
     """
-    with Recording(path) as recording, Catalog(None) as catalog:
-        catalog.put_recording(
-            path.name,
-            stamp_of(path),
-            uuid=recording.uuid,
-            benchmark_id=recording.benchmark_id,
-            rows=catalog_rows(recording, Sidecar.read(path), live=is_locked(path)),
-        )
-        return catalog.episodes(filter, limit=limit)
+    found = []
+    for item in sorted(scan(root)):
+        path = root / item.relative
+        deleted = Sidecar.read(path).deleted
+        if deleted and not is_locked(path):
+            found.append(Compactable(item.relative, len(deleted), item.stamp.size))
+    return found
 
 
 def _listed(path: Path) -> ListedRecording:

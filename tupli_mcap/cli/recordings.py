@@ -1,0 +1,290 @@
+"""Commands on recordings: record, ls, info, episodes."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from tupli_mcap.cli.options import FilterText, Json, Limit, filter_of, open_storage
+from tupli_mcap.cli.output import (
+    Column,
+    bytes_of,
+    number,
+    numbers,
+    print_facts,
+    print_json,
+    print_table,
+    short_ids,
+    step_progress,
+    terminal_width,
+    time_of,
+    when,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tupli_mcap.recording.describe import RecordingDescription, Spread
+    from tupli_mcap.schema import EpisodeHeader
+
+__all__ = ["print_episodes", "register"]
+
+_ROOMY = 100  # columns of a terminal on which metadata and times fit side by side
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the application."""
+    app.command("record")(_record)
+    app.command("ls")(_ls)
+    app.command("info")(_info)
+    app.command("episodes")(_episodes)
+
+
+def _check_policy(value: str | None) -> str | None:
+    if value is not None and not all(value.partition(":")[::2]):
+        raise typer.BadParameter(f"expected module:function, found {value!r}")
+    return value
+
+
+def _record(
+    env_id: Annotated[str, typer.Argument(metavar="ENV_ID", help="As gymnasium.make takes it.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording (.mcap).")],
+    steps: Annotated[int, typer.Option(min=1, help="Steps to record, in total.")] = 1000,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the first reset and of random actions.")] = None,
+    num_envs: Annotated[int, typer.Option(min=1, help="Sub-environments side by side.")] = 1,
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODULE:FUNCTION",
+            callback=_check_policy,
+            help="Called with an observation, returns an action; random without it.",
+        ),
+    ] = None,
+    mode: Annotated[
+        Literal["x", "w", "a"], typer.Option(help="If the file exists: x refuses, w replaces, a appends.")
+    ] = "x",
+    compression: Annotated[Literal["zstd", "lz4", "none"], typer.Option(help="Of the chunks.")] = "zstd",
+    record_info: Annotated[
+        bool, typer.Option("--record-info", help="Record the infos of steps too.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Record rollouts of an environment.
+
+    Modules (of a policy, or an ENV_ID such as my_envs:Maze-v0) are looked for in the current directory too.
+    Ctrl-C ends the recording early; what was recorded stays.
+    """
+    from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
+
+    sys.path.insert(0, "")  # as `python -m` has it
+    function = None if policy is None else load_policy(policy)
+    with step_progress(steps) as progress:
+        summary = record_rollouts(
+            env_id,
+            output,
+            steps=steps,
+            seed=seed,
+            num_envs=num_envs,
+            policy=function,
+            mode=mode,
+            compression=compression,
+            record_info=record_info,
+            progress=progress,
+        )
+    if as_json:
+        print_json({**summary._asdict(), "path": str(summary.path)})
+        return
+    print(
+        f"{summary.path}: {number(summary.episodes)} episodes, {number(summary.steps)} steps, "
+        f"mean return {number(summary.return_mean)}, {bytes_of(summary.size)} in {summary.seconds:.1f} s"
+    )
+
+
+def _ls(
+    paths: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[PATH]...", help="Files, directories, storages; here by default."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """List recordings in files and directories.
+
+    RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; or recovered:
+    the writer was killed, and all steps it finished are there. Deleted episodes of a storage are not counted.
+    """
+    from tupli_mcap.storage.listing import list_recordings
+
+    found = list(list_recordings(paths or [Path()]))
+    good = [item for item in found if item.error is None]
+    if as_json:
+        print_json([item._asdict() for item in found])
+    else:
+        columns = (
+            Column("RECORDING", shrink="start"),
+            *(Column(title, "right") for title in ("EPISODES", "STEPS", "RETURN", "SIZE")),
+            Column("STATE"),
+        )
+        means = numbers([item.return_mean for item in good])
+        rows = [
+            (short_ids(r.path), number(r.episodes), number(r.steps), mean, bytes_of(r.size), r.state)
+            for r, mean in zip(good, means, strict=True)
+        ]
+        if good or not found:
+            print_table(columns, rows, empty="no recordings")
+    bad = [item for item in found if item.error is not None]
+    for item in bad:
+        print(f"error: {item.error}", file=sys.stderr)
+    if bad:
+        raise typer.Exit(1)
+
+
+def _info(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or an URL.")],
+    as_json: Json = False,
+) -> None:
+    """Show what is in a recording.
+
+    Spaces, benchmark, statistics, channels and attachments; no step is read.
+    """
+    from dataclasses import asdict
+
+    from tupli_mcap.recording import Recording
+    from tupli_mcap.recording.describe import describe
+
+    with Recording(file) as recording:
+        description = describe(recording)
+    if as_json:
+        channels = [channel._asdict() for channel in description.channels]
+        print_json({**asdict(description), "channels": channels, **_spreads(description)})
+        return
+    print_facts(_facts(description))
+    if description.channels:
+        print()
+        _print_channels(description)
+    if description.attachments:
+        print()
+        print_table(
+            (Column("ATTACHMENT", shrink="end"), Column("TYPE"), Column("SIZE", "right")),
+            [(short_ids(a["name"]), a["media_type"], bytes_of(a["size"])) for a in description.attachments],
+            empty="",
+        )
+
+
+def _episodes(
+    path: Annotated[
+        Path, typer.Argument(metavar="FILE|STORAGE", help="A recording, or a storage's directory.")
+    ],
+    filter_text: FilterText = None,
+    limit: Limit = None,
+    as_json: Json = False,
+) -> None:
+    """List episodes of a recording or a storage.
+
+    Filters compare keys of episodes (n_tuples, end, episode_return, seed, env, metadata.<name>, ...) with
+    = != > >= < <= in, and join with and, or, not.
+    """
+    wanted = filter_of(filter_text)
+    headers: Sequence[EpisodeHeader]
+    if path.is_dir():
+        with open_storage(path) as storage:
+            headers = storage.list_episodes(wanted, limit=limit)
+    else:
+        from tupli_mcap.dataset import TupliDataset
+
+        dataset = TupliDataset.from_files(path)
+        headers = (dataset if wanted is None else dataset.with_episode_filter(wanted)).preview()[:limit]
+    print_episodes(headers, as_json=as_json)
+
+
+def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
+    """Print episodes as a table or as JSON."""
+    if as_json:
+        print_json([header.model_dump() for header in headers])
+        return
+    several = len({header.recording for header in headers}) > 1
+    roomy = (terminal_width() or _ROOMY) >= _ROOMY
+    several_envs = any(header.env for header in headers)
+    returns = numbers([header.episode_return for header in headers])
+    columns = (
+        *([Column("ID")] if several else [Column("EPISODE", "right")]),
+        *([Column("ENV", "right")] if several_envs else []),
+        Column("STEPS", "right"),
+        Column("RETURN", "right"),
+        Column("END"),
+        Column("SEED", "right"),
+        *([Column("ENDED AT")] if roomy else []),
+        Column("METADATA", shrink="end"),
+    )
+    rows = []
+    for header, total in zip(headers, returns, strict=True):
+        rows.append(
+            (
+                short_ids(header.id) if several else str(header.episode),
+                *([str(header.env)] if several_envs else []),
+                number(header.n_tuples),
+                total,
+                header.end,
+                "" if header.seed is None else str(header.seed),
+                *([when(header.created_at)] if roomy else []),
+                ", ".join(f"{key}={_short(value)}" for key, value in header.metadata.items()),
+            )
+        )
+    print_table(columns, rows, empty="no episodes")
+
+
+def _short(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return value if isinstance(value, str) else repr(value)
+
+
+def _spreads(description: RecordingDescription) -> dict[str, dict[str, float] | None]:
+    named = {"lengths": description.lengths, "returns": description.returns}
+    return {name: None if spread is None else spread._asdict() for name, spread in named.items()}
+
+
+def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
+    states = {
+        "complete": "complete",
+        "recording": "a writer is at work on it",
+        "recovered": "recovered: its writer was killed, all finished steps are here",
+    }
+    environment = d.environment or "none attached"
+    ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)
+    return [
+        ("recording", d.name),
+        ("state", states[d.state]),
+        ("uuid", d.uuid),
+        ("made", f"{time_of(d.created_ns)} by {d.library}"),
+        *([("rollouts", f"{time_of(d.start_ns)} to {time_of(d.end_ns)}")] if d.episodes else []),
+        ("environment", f"{environment}, {d.num_envs} sub-environments" if d.num_envs > 1 else environment),
+        ("benchmark", d.benchmark_id or "none"),
+        ("observation", d.observation_space or "not known before the first step"),
+        ("action", d.action_space or "not known before the first step"),
+        ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),
+        ("steps", f"{d.steps:,}{_spread_text(d.lengths, ' an episode')}"),
+        *([("return", _spread_text(d.returns).removeprefix(", "))] if d.returns else []),
+        ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
+    ]
+
+
+def _spread_text(spread: Spread | None, of: str = "") -> str:
+    if spread is None:
+        return ""
+    return (
+        f", mean {number(spread.mean)}{of}, std {number(spread.std)}, "
+        f"from {number(spread.min)} to {number(spread.max)}"
+    )
+
+
+def _print_channels(d: RecordingDescription) -> None:
+    columns = (
+        Column("CHANNEL", shrink="end"),
+        Column("SCHEMA"),
+        *(Column(title, "right") for title in ("MESSAGES", "SIZE", "STORED")),
+    )
+    rows = [(c.topic, c.schema, number(c.messages), bytes_of(c.size), bytes_of(c.stored)) for c in d.channels]
+    print_table(columns, rows, empty="")

@@ -1,0 +1,164 @@
+"""Commands that hand recordings on and take them in: bundle, import, export, trust."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tupli_mcap.cli.options import (
+    DEFAULT_STORAGE,
+    FilterText,
+    Json,
+    StoragePath,
+    filter_of,
+    full_id,
+    open_storage,
+)
+from tupli_mcap.cli.output import bytes_of, number, print_facts, print_json
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording.carried import CarriedCode
+
+__all__ = ["register"]
+
+Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write (.mcap).")]
+Source = Annotated[Path, typer.Argument(metavar="FILE", help="A recording.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the application."""
+    app.command("bundle")(_bundle)
+    app.command("import")(_import)
+    app.command("export")(_export)
+    app.command("trust")(_trust)
+
+
+def _bundle(
+    source: Annotated[
+        str, typer.Argument(metavar="BENCHMARK_ID|FILE", help="A benchmark (4 digits may do) or a recording.")
+    ],
+    output: Output,
+    storage_path: StoragePath = DEFAULT_STORAGE,
+    filter_text: FilterText = None,
+    as_json: Json = False,
+) -> None:
+    """Write a benchmark with all it needs to a file.
+
+    The file carries the benchmark, its artifacts and its episodes: nothing else is needed to use it.
+    A benchmark id takes all its episodes (or those of the filter) from the storage. FILE takes the
+    episodes of that recording, and what it lacks from the storage.
+    """
+    path = Path(source)
+    if path.suffix == ".mcap" or path.is_file():
+        if filter_text is not None:
+            raise typer.BadParameter("a filter goes with a benchmark id, not with a file")
+        from tupli_mcap.storage import bundles
+
+        with open_storage(storage_path) if storage_path.is_dir() else nullcontext() as known:
+            bundles.from_recording(path, output, known)
+    else:
+        with open_storage(storage_path) as storage:
+            storage.bundle(full_id(storage, source), output, filter_of(filter_text))
+    _print_written(output, as_json)
+
+
+def _export(
+    output: Output,
+    storage_path: StoragePath = DEFAULT_STORAGE,
+    filter_text: FilterText = None,
+    as_json: Json = False,
+) -> None:
+    """Write episodes of a storage to one file.
+
+    They must be of one benchmark; its artifacts stay behind (use bundle to take them along).
+        With several benchmarks in the storage, choose one: --filter 'benchmark_id = "..."'.
+    """
+    with open_storage(storage_path) as storage:
+        storage.export(output, filter_of(filter_text))
+    _print_written(output, as_json)
+
+
+def _import(
+    file: Source,
+    storage_path: StoragePath = DEFAULT_STORAGE,
+    trust: Annotated[bool, typer.Option("--trust", help="Also trust its environment's code.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only check it and say what is new.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Take a bundle into a storage.
+
+    The storage is made if it is missing. Importing a file again changes nothing. Nothing in the file is
+    executed.
+    """
+    from tupli_mcap.storage import bundles
+
+    create = not dry_run
+    with (
+        open_storage(storage_path, create=create)
+        if create or storage_path.is_dir()
+        else nullcontext() as storage
+    ):
+        preview = bundles.preview(storage, file)
+        if storage is not None and not dry_run:
+            storage.import_bundle(file, trust=trust)
+    if as_json:
+        print_json({"dry_run": dry_run, **preview._asdict()})
+        return
+    verb = "would import" if dry_run else "imported"
+    print(
+        f"{verb} {number(preview.new_episodes)} of {number(preview.episodes)} episodes, "
+        f"{number(preview.new_artifacts)} of {number(preview.artifacts)} artifacts"
+    )
+    print_facts([("benchmark", preview.benchmark_id), ("name", preview.name)])
+
+
+def _trust(
+    file: Source,
+    show: Annotated[bool, typer.Option("--show", help="Only show what would run.")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Trust it no longer.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Let the environment in a file be rebuilt.
+
+    Rebuilding it may run code that came with the file, as this user, on this machine.
+        Reading its episodes needs no trust. Only this user's processes trust it from then on.
+    """
+    from tupli_mcap.recording.carried import carried_code, set_trust
+
+    if show and remove:
+        raise typer.BadParameter("--show and --remove exclude each other")
+    code = carried_code(file) if show else set_trust(file, trusted=not remove)
+    if as_json:
+        print_json(code._asdict())
+    else:
+        print_facts(_facts_of_code(code))
+
+
+def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
+    runs = {
+        "spec": "the registered environment, by its spec",
+        "pickle": f"{bytes_of(code.size)} of pickled Python code",
+    }
+    return [
+        ("environment", code.name),
+        ("runs", runs[code.kind]),
+        *([("spec", code.spec)] if code.spec else []),
+        *([("classes", ", ".join(code.classes))] if code.classes else []),
+        ("made with", ", ".join(f"{name} {version}" for name, version in code.versions.items())),
+        ("digest", code.digest),
+        *([("foreign", "; ".join(code.foreign))] if code.foreign else []),
+        ("trusted", "yes" if code.trusted else "no" if code.needs_trust else "not needed"),
+    ]
+
+
+def _print_written(path: Path, as_json: bool) -> None:
+    from tupli_mcap.storage.listing import list_recordings
+
+    (item,) = list_recordings([path])
+    if as_json:
+        print_json(item._asdict())
+    else:
+        print(f"{path}: {number(item.episodes)} episodes, {number(item.steps)} steps, {bytes_of(item.size)}")

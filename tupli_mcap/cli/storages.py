@@ -1,0 +1,143 @@
+"""Commands on storages: list-benchmarks, list-artifacts, list-episodes, compact, reindex."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from tupli_mcap.cli.options import (
+    DEFAULT_STORAGE,
+    FilterText,
+    Json,
+    Limit,
+    StoragePath,
+    filter_of,
+    open_storage,
+)
+from tupli_mcap.cli.output import Column, bytes_of, number, print_json, print_table, short_ids, when
+from tupli_mcap.cli.recordings import print_episodes
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the application."""
+    app.command("list-benchmarks")(_list_benchmarks)
+    app.command("list-artifacts")(_list_artifacts)
+    app.command("list-episodes")(_list_episodes)
+    app.command("compact")(_compact)
+    app.command("reindex")(_reindex)
+
+
+def _list_benchmarks(
+    storage_path: StoragePath = DEFAULT_STORAGE, filter_text: FilterText = None, as_json: Json = False
+) -> None:
+    """List the benchmarks of a storage.
+
+    Filters compare id, created_at, metadata.name, metadata.difficulty, metadata.extra.<name>, ...
+    """
+    with open_storage(storage_path) as storage:
+        headers = storage.list_benchmarks(filter_of(filter_text))
+    if as_json:
+        print_json([header.model_dump() for header in headers])
+        return
+    columns = (
+        Column("ID"),
+        Column("NAME", shrink="end"),
+        Column("VERSION"),
+        Column("CREATED"),
+        Column("DESCRIPTION", shrink="end"),
+    )
+    rows = [
+        (
+            short_ids(h.id),
+            h.metadata.name,
+            h.metadata.version or "",
+            when(h.created_at),
+            h.metadata.description,
+        )
+        for h in headers
+    ]
+    print_table(columns, rows, empty="no benchmarks")
+
+
+def _list_artifacts(
+    storage_path: StoragePath = DEFAULT_STORAGE, filter_text: FilterText = None, as_json: Json = False
+) -> None:
+    """List the artifacts of a storage.
+
+    Filters compare id, name, description, created_at, extra.<name>, ...
+    """
+    with open_storage(storage_path) as storage:
+        items = storage.list_artifacts(filter_of(filter_text))
+    if as_json:
+        print_json([item.model_dump() for item in items])
+        return
+    columns = (
+        Column("ID"),
+        Column("NAME", shrink="end"),
+        Column("CREATED"),
+        Column("DESCRIPTION", shrink="end"),
+    )
+    rows = [(short_ids(item.id), item.name, when(item.created_at), item.description) for item in items]
+    print_table(columns, rows, empty="no artifacts")
+
+
+def _list_episodes(
+    storage_path: StoragePath = DEFAULT_STORAGE,
+    filter_text: FilterText = None,
+    limit: Limit = None,
+    as_json: Json = False,
+) -> None:
+    """List the episodes of a storage.
+
+    Filters compare id, benchmark_id, recording, n_tuples, end, episode_return, seed, env, created_at,
+    metadata.<name>, ... with = != > >= < <= in, and join with and, or, not.
+    """
+    with open_storage(storage_path) as storage:
+        headers = storage.list_episodes(filter_of(filter_text), limit=limit)
+    print_episodes(headers, as_json=as_json)
+
+
+def _compact(
+    storage_path: StoragePath = DEFAULT_STORAGE,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be rewritten.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Free the space of deleted episodes.
+
+    Recordings that hold deleted episodes are rewritten without them.
+        Episodes that stay keep their ids. Recordings that are being written are left alone.
+    """
+    from tupli_mcap.storage.listing import compactable
+
+    with open_storage(storage_path) as storage:
+        found = compactable(storage_path)
+        freed = 0 if dry_run else storage.compact()
+    if as_json:
+        told = [item._asdict() for item in found]
+        print_json({"dry_run": dry_run, "recordings": told, "bytes_freed": freed})
+        return
+    if dry_run:
+        columns = (Column("RECORDING", shrink="start"), Column("DELETED", "right"), Column("SIZE", "right"))
+        rows = [(short_ids(i.recording), number(i.deleted), bytes_of(i.size)) for i in found]
+        print_table(columns, rows, empty="nothing to compact")
+        return
+    print(
+        f"rewrote {number(len(found))} recordings, freed {bytes_of(freed)}" if found else "nothing to compact"
+    )
+
+
+def _reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) -> None:
+    """Make the catalog of a storage anew.
+
+    The catalog is an index of the recordings, which are the only truth.
+    """
+    with open_storage(storage_path) as storage:
+        storage.reindex()
+        episodes = storage.count_episodes()
+    if as_json:
+        print_json({"storage": str(storage_path), "episodes": episodes})
+    else:
+        print(f"{storage_path}: {number(episodes)} episodes")
