@@ -296,8 +296,13 @@ def every_info(path: Path) -> list[Log]:
     return expected(env, infos=lambda log: log["infos"])
 
 
-def vector(path: Path, mode: gym.vector.AutoresetMode) -> list[Log]:
-    envs = [Played(POLE, pole, [(2 + i, "terminal"), (3, "timeout")]) for i in range(3)]
+def vector(
+    path: Path,
+    mode: gym.vector.AutoresetMode,
+    space: gym.Space[Any] = POLE,
+    observe: Observe = pole,
+) -> list[Log]:
+    envs = [Played(space, observe, [(2 + i, "terminal"), (3, "timeout")]) for i in range(3)]
     inner = gym.vector.SyncVectorEnv([lambda env=env: env for env in envs], autoreset_mode=mode)  # type: ignore[misc]
     with recorded_vector.RecordEpisodes(inner, path, compression="none", attachments={}) as recorder:
         recorder.reset(seed=11)
