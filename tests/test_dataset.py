@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from tupli_mcap.dataset import (
     TupliDataset,
     loading,
     progress,
+    sources,
 )
 from tupli_mcap.errors import (
     FilterError,
@@ -398,6 +400,25 @@ def test_only_the_asked_episodes_are_read(
     assert len(read) == 1
 
 
+def test_memory_is_bounded_by_what_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    space = gym.spaces.Box(-np.inf, np.inf, (20_000,), np.float64)
+    env = Scripted(lambda step: np.full(20_000, float(step)), space, length=10)
+    record(tmp_path / "a.mcap", env, 200)  # 32 MB
+    monkeypatch.setattr(loading, "_BLOCK_BYTES", 1 << 20)
+    monkeypatch.setattr(sources, "_CACHE_BYTES", 1 << 20)
+    dataset = TupliDataset.from_files(tmp_path / "a.mcap")
+    tracemalloc.start()
+    try:
+        assert dataset.rewards.sum() == 200
+        assert len(dataset.with_tuple_filter(F("state.7") == 4).rewards) == 20
+        _, peak = tracemalloc.get_traced_memory()
+        assert peak < 8 << 20
+        dataset.load()
+        assert tracemalloc.get_traced_memory()[1] > 32 << 20, "or this measures nothing"
+    finally:
+        tracemalloc.stop()
+
+
 def test_converted_arrays_are_the_callers_own(cart: tuple[TupliDataset, Taken]) -> None:
     dataset, _ = cart
     dataset.load()
@@ -664,6 +685,13 @@ def test_a_copied_recording_counts_once(tmp_path: Path) -> None:
     dataset = TupliDataset.from_files(str(tmp_path / "*.mcap"))
     with pytest.warns(UserWarning, match=r"copy\.mcap holds \d+ episodes of .*a\.mcap again"):
         assert len(dataset) == 50
+
+
+def test_urls(tmp_path: Path) -> None:
+    pytest.importorskip("fsspec")
+    taken = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 50)
+    dataset = TupliDataset.from_files((tmp_path / "a.mcap").as_uri())
+    np.testing.assert_array_equal(dataset.observations, column(taken, 0))
 
 
 def test_benchmarks_of_files(tmp_path: Path) -> None:

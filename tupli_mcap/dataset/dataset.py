@@ -67,7 +67,8 @@ class TupliDataset:
     ) -> Self:
         """A dataset of recordings in no storage: a path, a pattern ("runs/*.mcap"), a URL, or a list.
 
-        An episode that is in two of the files counts once, with a warning.
+        An episode that is in two of the files counts once, with a warning; one that is still being recorded
+        is listed as interrupted.
 
         Raises:
             RecordingError: there is no such file.

@@ -52,7 +52,9 @@ def read_columns(
     """Columns of the wanted steps, by field; which steps those are; and the layout they share.
 
     Fields are those of `Recording.read`, "infos" (a list of dicts) and "steps" (int64, from 0 in each
-    episode). At any time no more is held than the result and one block of episodes (64 MiB, or one episode).
+    episode).
+    No more is held at any time than the result, one block of episodes (64 MiB, or one episode) and the cache
+    of one recording.
 
     Args:
         selector: the tuple filter; `known` is its result if it has been evaluated before.

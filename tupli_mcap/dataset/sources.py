@@ -13,7 +13,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from pydantic import ValidationError
 
-from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.errors import FormatError, RecordingError, TupliError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import (
@@ -184,7 +184,7 @@ def _episode_headers(recording: Recording, name: str) -> Iterator[EpisodeHeader]
             published_in=[],
             created_at=f"{time}+00:00",
             benchmark_id=recording.benchmark_id,
-            metadata={} if metadata == "{}" else jsonvalue.loads(metadata),
+            metadata={} if metadata == "{}" else _metadata(metadata, name, number),
             n_tuples=length,
             terminated=_ENDS[end] == "terminal",
             timeout=_ENDS[end] == "timeout",
@@ -195,6 +195,13 @@ def _episode_headers(recording: Recording, name: str) -> Iterator[EpisodeHeader]
             episode=number,
             recording=name,
         )
+
+
+def _metadata(text: str, name: str, number: int) -> dict[str, Any]:
+    value = jsonvalue.loads(text)
+    if not isinstance(value, dict):
+        raise FormatError(f"{name}: episode {number} expected metadata as a JSON object, found {value!r:.80}")
+    return value
 
 
 def _benchmark_header(recording: Recording) -> BenchmarkHeader:
