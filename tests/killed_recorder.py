@@ -1,4 +1,4 @@
-"""A recording child that reports every finished step, to be killed at any moment: `python killed_recorder.py KIND PATH`."""
+"""A recording child that reports every finished step, to be killed at any moment."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ KINDS: dict[str, Any] = {
     "box": spaces.Box(-1, 1, (4,), np.float32),
     "text": spaces.Dict({"note": spaces.Text(30), "x": spaces.Discrete(5)}),
     "image": spaces.Dict({"camera": spaces.Box(0, 255, (8, 8, 3), np.uint8), "x": spaces.Box(-1, 1, (1,))}),
+    "large": spaces.Dict({"x": spaces.Discrete(5), "y": spaces.Box(-1, 1, (600,))}),
     "vector": spaces.Box(-1, 1, (4,), np.float32),
     "info": spaces.Box(-1, 1, (4,), np.float32),
 }

@@ -109,6 +109,24 @@ def test_under_and_over_other_wrappers(tmp_path: Path) -> None:
     check_against(tmp_path / "r.mcap", taken)
 
 
+@pytest.mark.parametrize("chunk_size", [1000, 200_000])
+def test_large_arrays(tmp_path: Path, chunk_size: int) -> None:
+    space = spaces.Dict(
+        {
+            "a": spaces.Box(-1, 1, (3,), np.float32),
+            "large": spaces.Box(-1, 1, (700,), np.float64),
+            "larger": spaces.Box(0, 255, (80, 70), np.uint8),
+        }
+    )
+    with RecordEpisodes(Sampler(space, space), tmp_path / "r.mcap", chunk_size=chunk_size) as env:
+        taken = roll(env, 40)
+    check_against(tmp_path / "r.mcap", taken)
+    last = spaces.Tuple((spaces.Discrete(3), spaces.Box(-1, 1, (1000,), np.float32)))
+    with RecordEpisodes(Sampler(last, last), tmp_path / "s.mcap", chunk_size=chunk_size) as env:
+        taken = roll(env, 40)
+    check_against(tmp_path / "s.mcap", taken)
+
+
 def test_environments_may_reuse_their_arrays(tmp_path: Path) -> None:
     buffer = np.zeros(2, np.float32)
 

@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.table import Table
 
 from tupli_mcap import F, FileStorage, TupliDataset, TupliEnvWrapper
-from tupli_mcap.vector import RecordEpisodes
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+from tupli_mcap.vector import RecordEpisodes
 
 ROOT = Path(__file__).resolve().parent.parent / "demo"
 console = Console()
@@ -37,7 +37,7 @@ class WindyMountainCar(MountainCarEnv):
         return super().reset(seed=seed, options=options)
 
     def step(self, action):
-        state, reward, terminated, truncated, info = super().step(action)
+        _, reward, terminated, truncated, _ = super().step(action)
         wind = self.strength * (1 + np.sin(self.time / 50))
         self.time += 1
         self.state = (self.state[0], float(np.clip(self.state[1] - wind, -self.max_speed, self.max_speed)))
@@ -95,7 +95,9 @@ def show(title: str, dataset: TupliDataset) -> None:
     headers = dataset.preview()
     for header in headers[:8]:
         facts = ", ".join(f"{key} {value:.3g}" for key, value in header.metadata.items())
-        table.add_row(str(header.episode), str(header.n_tuples), f"{header.episode_return:g}", header.end, facts)
+        table.add_row(
+            str(header.episode), str(header.n_tuples), f"{header.episode_return:g}", header.end, facts
+        )
     if len(headers) > 8:
         table.add_row("…", "", "", "", f"{len(headers) - 8} more")
     console.print(table)

@@ -170,7 +170,7 @@ def make_row_encoder(
         view=np.frombuffer(buffer, np.uint8),
     )
     exec(compile(text, "<tupli_mcap row encoder>", "exec"), namespace)
-    return RowEncoder(namespace["put"], namespace["put_state"], head.offset, text)
+    return RowEncoder(namespace["put"], namespace["put_state"], layout.state_end, text)
 
 
 def _shift(head: _Packed, size: int, tail: _Packed) -> _Packed:

@@ -118,7 +118,7 @@ def _equal(array: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bool:
 
 
 def check_structure(space: gym.Space[Any], value: Any, path: str) -> None:
-    """Raises StepError unless the Dicts and Tuples of `space` are dicts of its keys and tuples of its length in `value`."""
+    """Raises StepError unless `value` has dicts of the same keys and tuples of the same length as `space`."""
     if type(space) is spaces.Dict:
         keys = list(space.spaces)
         if not isinstance(value, Mapping) or set(value) != set(keys):

@@ -46,7 +46,8 @@ HEADER_FIELDS: list[tuple[str, str, int]] = [
 _TIME_MSG = "int32 sec\nuint32 nanosec\n"
 _SEPARATOR = "=" * 80 + "\n"
 IMAGE_SCHEMA = (
-    "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"
+    "std_msgs/Header header\nuint32 height\nuint32 width\n"
+    "string encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"
     f"{_SEPARATOR}MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
     f"{_SEPARATOR}MSG: builtin_interfaces/Time\n{_TIME_MSG}"
 )
@@ -108,7 +109,8 @@ def record_dtype(fields: Sequence[Field], body_size: int) -> DType:
     formats += [(f.dtype.newbyteorder("<"), f.shape) for f in fields]
     offsets = [offset for _, _, offset in HEADER_FIELDS] + [BODY + f.offset for f in fields]
     spec: Any = {"names": names, "formats": formats, "offsets": offsets, "itemsize": BODY + body_size}
-    return np.dtype(spec)
+    dtype: DType = np.dtype(spec)
+    return dtype
 
 
 def field_line(leaf: Leaf, dtype: DType) -> str:

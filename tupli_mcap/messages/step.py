@@ -16,6 +16,7 @@ import numpy as np
 from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.layout import (
+    BODY,
     ImageLayout,
     MessageLayout,
     field_line,
@@ -121,6 +122,13 @@ class StepLayout:
             + [(leaf.name, self.dtypes[leaf.name], leaf.shape) for leaf in self.step_leaves]
             + [("terminal", _BOOL, ()), ("timeout", _BOOL, ())]
         )
+
+    @cached_property
+    def state_end(self) -> int:
+        """Bytes of a `/step` record up to the end of its state; only for constant layouts."""
+        names = {leaf.name for leaf in self.state}
+        ends = [field.offset + field.nbytes for field in self.step_message.fields if field.name in names]
+        return BODY + max(ends, default=8)
 
     @cached_property
     def final_message(self) -> MessageLayout:

@@ -48,7 +48,7 @@ class Run(NamedTuple):
 
     channel: int
     first: int
-    count: int
+    steps: int
     out: int
 
 
@@ -144,7 +144,7 @@ class ColumnReader:
         pieces: dict[int, list[Piece]] = {}
         for run in runs:
             place = run.out
-            for span in self._store.spans(run.channel, run.first, run.count):
+            for span in self._store.spans(run.channel, run.first, run.steps):
                 pieces.setdefault(span.chunk, []).append(Piece(span.begin, span.end, place))
                 place += span.end - span.begin
         return [self._task(chunk, parts, names, out, dtype, keep) for chunk, parts in pieces.items()]
@@ -173,7 +173,7 @@ class ColumnReader:
         if self._decoder is None:
             raise RecordingError("a constant layout is not decoded message by message")
         for run in runs:
-            for i, body in enumerate(self._store.bodies(run.channel, run.first, run.count)):
+            for i, body in enumerate(self._store.bodies(run.channel, run.first, run.steps)):
                 values = self._decoder.step(body)
                 for name in names:
                     out[name][run.out + i] = values[name]

@@ -49,6 +49,11 @@ CHUNK_ROWS = np.dtype(
 COMPRESSIONS = ["none", "zstd", "lz4"]
 
 
+def _built(builder: RecordBuilder) -> bytes:
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
+
+
 class Rows(NamedTuple):
     """Message records of one channel, ready to be a chunk: `offsets` of each from the first, `times` their log_time."""
 
@@ -101,19 +106,19 @@ class Container:
         """Magic and header."""
         builder = RecordBuilder()
         Header(PROFILE, library).write(builder)
-        self.write(MAGIC + builder.end())
+        self.write(MAGIC + _built(builder))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         builder = RecordBuilder()
         Metadata(name, dict(values)).write(builder)
-        data = builder.end()
+        data = _built(builder)
         self.metadata_indexes.append(MetadataIndex(self.position, len(data), name))
         self.write(data)
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         builder = RecordBuilder()
         Attachment(time_ns, time_ns, name, media_type, data).write(builder)
-        record = builder.end()
+        record = _built(builder)
         offset = self.position
         self.write(record)
         self.attachment_indexes.append(
@@ -145,7 +150,7 @@ class Container:
         builder = RecordBuilder()
         self.schemas[self.channels[channel].schema_id].write(builder)
         self.channels[channel].write(builder)
-        return builder.end()
+        return _built(builder)
 
     def add_chunk(self, rows: Rows) -> None:
         """Writes a chunk of one channel's records and its message index.
@@ -162,7 +167,7 @@ class Container:
         name = "" if self._compression == "none" else self._compression
         builder = RecordBuilder()
         Chunk(name, packed, end, start, crc, size).write(builder)
-        chunk = builder.end()
+        chunk = _built(builder)
         index = _message_index(rows, len(head))
         entry = ChunkIndex(
             chunk_length=len(chunk),
@@ -183,7 +188,7 @@ class Container:
         """Remembers a chunk that is in the file, for the summary and the episode index."""
         builder = RecordBuilder()
         index.write(builder)
-        self.chunk_indexes.append(builder.end())
+        self.chunk_indexes.append(_built(builder))
         self.chunk_rows += np.array(row, CHUNK_ROWS).tobytes()
         channel, rows = row[7], row[4]
         self._announced.add(channel)
@@ -204,7 +209,7 @@ class Container:
         """DataEnd, summary, footer, magic, in one write."""
         builder = RecordBuilder()
         DataEnd(0).write(builder)
-        data_end = builder.end()
+        data_end = _built(builder)
         summary_start = self.position + len(data_end)
         groups: list[tuple[Opcode, list[Any]]] = [
             (Opcode.SCHEMA, list(self.schemas.values())),
@@ -224,11 +229,11 @@ class Container:
         offset_start = summary_start + builder.count
         for offset in offsets:
             offset.write(builder)
-        summary = builder.end()
+        summary = _built(builder)
         Footer(summary_start, offset_start, 0).write(builder)
-        crc = zlib.crc32(builder.end()[:-4], zlib.crc32(summary))
+        crc = zlib.crc32(_built(builder)[:-4], zlib.crc32(summary))
         Footer(summary_start, offset_start, crc).write(builder)
-        self.write(data_end + summary + builder.end() + MAGIC)
+        self.write(data_end + summary + _built(builder) + MAGIC)
 
     def _statistics(self) -> Statistics:
         return Statistics(

@@ -36,7 +36,7 @@ class Contents:
     channels: dict[int, Channel] = field(default_factory=dict)
     attachments: dict[str, AttachmentIndex] = field(default_factory=dict)
     metadata_indexes: list[MetadataIndex] = field(default_factory=list)
-    table: np.ndarray = field(default_factory=lambda: np.empty(0, CHUNK_ROWS))  # type: ignore[type-arg]
+    table: np.ndarray = field(default_factory=lambda: np.empty(0, CHUNK_ROWS))
     memory: list[bytes] = field(default_factory=list)
     tail: list[Rows] = field(default_factory=list)
     index: EpisodeIndex = field(

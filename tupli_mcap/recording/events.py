@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import struct
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
 
 __all__ = [
+    "END_NAME",
     "END_NAMES",
+    "END_SCHEMA",
+    "INTERRUPTED",
+    "START_NAME",
+    "START_SCHEMA",
+    "TERMINAL",
+    "TIMEOUT",
     "EpisodeEnd",
     "EpisodeStart",
     "read_strings",
@@ -18,6 +25,17 @@ __all__ = [
 
 END_NAMES = ("terminal", "timeout", "interrupted")
 TERMINAL, TIMEOUT, INTERRUPTED = range(3)
+
+START_NAME = "tupli_mcap/msg/EpisodeStart"
+START_SCHEMA = (
+    "uint32 episode\nuint32 env\nuint64 first_row\nbool seed_given\nbool continued\n"
+    "string seed\nstring options\nstring reset_info\n"
+)
+END_NAME = "tupli_mcap/msg/EpisodeEnd"
+END_SCHEMA = (
+    "uint32 episode\nuint32 env\nuint64 first_row\nuint64 length\nfloat64 episode_return\nuint8 end\n"
+    "bool has_final_state\nstring metadata\n"
+)
 
 _START = struct.Struct("<IIQ??2x")
 _END = struct.Struct("<IIQQdB?2x")
@@ -70,12 +88,6 @@ class EpisodeStart(NamedTuple):
     environment drew. `continued`: stepped on after an end, without a reset.
     """
 
-    SCHEMA_NAME = "tupli_mcap/msg/EpisodeStart"
-    SCHEMA = (
-        "uint32 episode\nuint32 env\nuint64 first_row\nbool seed_given\nbool continued\n"
-        "string seed\nstring options\nstring reset_info\n"
-    )
-
     episode: int
     env: int
     first_row: int
@@ -87,17 +99,17 @@ class EpisodeStart(NamedTuple):
 
     def encode(self) -> bytes:
         fixed = _START.pack(*self[:5])
-        if self[5:] == ("", "", "{}"):
+        texts = (self.seed, self.options, self.reset_info)
+        if texts == ("", "", "{}"):
             return fixed + _PLAIN_START
-        return fixed + _strings(_START.size, *(text.encode() for text in self[5:]))
+        return fixed + _strings(_START.size, *(text.encode() for text in texts))
 
     @classmethod
     def decode(cls, body: memoryview) -> EpisodeStart:
         if len(body) < _START.size:
             raise FormatError(f"/episode_start: expected at least {_START.size} bytes, found {len(body)}")
-        fixed: Any = _START.unpack_from(body, 0)
-        seed, options, info = read_strings(body, _START.size, 3)
-        return cls(*fixed, seed, options, info)
+        texts = read_strings(body, _START.size, 3)
+        return cls._make([*_START.unpack_from(body, 0), *texts])
 
 
 _PLAIN_START = _strings(_START.size, b"", b"", b"{}")
@@ -105,12 +117,6 @@ _PLAIN_START = _strings(_START.size, b"", b"", b"{}")
 
 class EpisodeEnd(NamedTuple):
     """`end` indexes END_NAMES; `episode_return` is the sum of the rewards; `metadata` is JSON."""
-
-    SCHEMA_NAME = "tupli_mcap/msg/EpisodeEnd"
-    SCHEMA = (
-        "uint32 episode\nuint32 env\nuint64 first_row\nuint64 length\nfloat64 episode_return\nuint8 end\n"
-        "bool has_final_state\nstring metadata\n"
-    )
 
     episode: int
     env: int
@@ -129,11 +135,10 @@ class EpisodeEnd(NamedTuple):
     def decode(cls, body: memoryview) -> EpisodeEnd:
         if len(body) < _END.size:
             raise FormatError(f"/episode_end: expected at least {_END.size} bytes, found {len(body)}")
-        fixed: Any = _END.unpack_from(body, 0)
-        (metadata,) = read_strings(body, _END.size, 1)
-        if fixed[5] >= len(END_NAMES):
-            raise FormatError(f"/episode_end: expected an end of 0, 1 or 2, found {fixed[5]}")
-        return cls(*fixed, metadata)
+        message = cls._make([*_END.unpack_from(body, 0), *read_strings(body, _END.size, 1)])
+        if message.end >= len(END_NAMES):
+            raise FormatError(f"/episode_end: expected an end of 0, 1 or 2, found {message.end}")
+        return message
 
 
 _PLAIN_END = _strings(_END.size, b"{}")

@@ -28,8 +28,9 @@ _MAX_RATIO = 1 << 16  # zstd cannot compress further than about 1 : 32,000
 EPISODE_ROWS = np.dtype(
     [
         ("first_row", "<u8"), ("length", "<u8"), ("return", "<f8"), ("start_time", "<i8"), ("end_time", "<i8"),
-        ("seed", "<i8"), ("start_row", "<u8"), ("end_row", "<u8"), ("final_row", "<i8"), ("metadata_offset", "<u8"), ("metadata_length", "<u4"),
-        ("episode", "<u4"), ("env", "<u4"), ("end", "u1"), ("has_seed", "u1"), ("pad", "u1", (2,)),
+        ("seed", "<i8"), ("start_row", "<u8"), ("end_row", "<u8"), ("final_row", "<i8"),
+        ("metadata_offset", "<u8"), ("metadata_length", "<u4"), ("episode", "<u4"), ("env", "<u4"),
+        ("end", "u1"), ("has_seed", "u1"), ("pad", "u1", (2,)),
     ]
 )  # fmt: skip
 

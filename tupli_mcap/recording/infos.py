@@ -39,8 +39,7 @@ class InfoRecorder:
     def schema(self) -> tuple[str, dict[str, str]]:
         """The ros2msg text of `/info` and its channel's metadata."""
         lines = ["uint32 episode\nuint32 step\n"]
-        for field in self._fields:
-            lines.append(f"float64 {field}\nbool has_{field}\nuint8[7] pad_{field}\n")
+        lines += [f"float64 {field}\nbool has_{field}\nuint8[7] pad_{field}\n" for field in self._fields]
         return "".join([*lines, "string json\n"]), {"fields": jsonvalue.dumps(self._names)}
 
     def put(self, writer: RecordingWriter, episode: int, step: int, info: Mapping[str, Any]) -> None:

@@ -120,6 +120,20 @@ class Journal:
         start = self.offsets[name]
         return memoryview(self._map)[start : start + self.areas[name].size]
 
+    def row_area(self, name: str) -> RowArea:
+        """The area `name`, which holds rows."""
+        area = self.areas[name]
+        if not isinstance(area, RowArea):
+            raise TypeError(f"the area {name!r} holds records, not rows")
+        return area
+
+    def log_area(self, name: str) -> LogArea:
+        """The area `name`, which holds records of variable size."""
+        area = self.areas[name]
+        if not isinstance(area, LogArea):
+            raise TypeError(f"the area {name!r} holds rows, not records")
+        return area
+
     def sync(self) -> None:
         """Writes the mapped pages to the disk."""
         self._map.flush()

@@ -120,8 +120,8 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
 def _missing(source: Source, err: Exception) -> str:
     if isinstance(err, FileNotFoundError):
         return (
-            f"{source.name} was not finished and has no journal {Path(str(err.filename)).name} beside it: steps not yet "
-            "in a chunk cannot be recovered; keep the two files together"
+            f"{source.name} was not finished and has no journal {Path(str(err.filename)).name} beside it: steps not "
+            "yet in a chunk cannot be recovered; keep the two files together"
         )
     return f"{source.name}: its journal cannot be read ({err})"
 
@@ -165,7 +165,7 @@ def _salvage(
             total = first + (0 if rows is None else len(rows.offsets))
             following = salvage.following(total - 1)
             if following is not None:
-                tail.pending[env] = following.tobytes()[BODY + 8 : BODY + _state_end(layout)]
+                tail.pending[env] = following.tobytes()[BODY + 8 : layout.state_end]
         else:
             log = _log_area(journal, f"steps/{env}")
             entries = [e for e in log_records(journal, log, {channel: first}) if e[0] == channel]
@@ -180,11 +180,6 @@ def _salvage(
     for name in ("events", "info"):
         if name in journal.areas:
             tail.rows += to_rows(log_records(journal, _log_area(journal, name), counts))
-
-
-def _state_end(layout: StepLayout) -> int:
-    names = {leaf.name for leaf in layout.state}
-    return max((f.offset + f.nbytes for f in layout.step_message.fields if f.name in names), default=8)
 
 
 def _rows_area(journal: JournalContents, name: str) -> RowArea:
@@ -273,11 +268,11 @@ def _complete(
         episodes.starts[start.episode] = (counts[channel], time, start)
         counts[channel] += 1
     for number in sorted(set(episodes.starts) - set(episodes.ends)):
-        row, time, start = episodes.starts[number]
+        _, _, start = episodes.starts[number]
         facts = _rows_of(store, layout, steps, start, number)
         if facts is None:
             continue  # a reset without a step is no episode
-        length, total, end, end_time = facts
+        length, total, how, end_time = facts
         if (
             number not in episodes.finals
             and start.env in tail.pending
@@ -292,7 +287,7 @@ def _complete(
             counts[channel] += 1
         channel = topics["/episode_end"]
         message = EpisodeEnd(
-            number, start.env, start.first_row, length, total, end, number in episodes.finals, "{}"
+            number, start.env, start.first_row, length, total, how, number in episodes.finals, "{}"
         )
         made.append(
             (channel, counts[channel], end_time, record(channel, counts[channel], end_time, message.encode()))

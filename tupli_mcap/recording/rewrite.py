@@ -175,7 +175,9 @@ class _Rewriter:
             self._container.add_chunk(rows)
 
     def _events(self, rows: Any, firsts: Any) -> None:
-        starts, ends, finals = [], [], []
+        starts: list[tuple[int, bytes]] = []
+        ends: list[tuple[int, bytes]] = []
+        finals: list[tuple[int, bytes]] = []
         for row, first in zip(rows, firsts, strict=True):
             ((start_time, body),) = self._messages(self._topics["/episode_start"], int(row["start_row"]), 1)
             starts.append(
@@ -202,7 +204,7 @@ class _Rewriter:
                     end.episode,
                     end.env,
                     end.end,
-                ),  # fmt: skip
+                ),
                 end.metadata,
             )
             ends.append((end_time, end.encode()))

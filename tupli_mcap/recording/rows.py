@@ -13,7 +13,7 @@ import numpy as np
 
 from tupli_mcap.messages.encoder import Cursor, ImageSink, make_row_encoder
 from tupli_mcap.messages.exact import exact_array
-from tupli_mcap.messages.layout import BODY, ImageLayout, RECORD_HEADER, CDR_HEADER
+from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
@@ -170,6 +170,7 @@ class ImageRows:
         self._sink = sink
         self._sequence = first
         self._time = 0
+        self._half = self._row = 0
         self._uint8 = np.dtype(np.uint8)
         self.move(area, buffer)
 
@@ -212,7 +213,8 @@ class ImageRows:
 
     def pending(self) -> bytes:
         """The running row's image."""
-        return self._data[self._half, self._row].tobytes()
+        data: bytes = self._data[self._half, self._row].tobytes()
+        return data
 
     def _advance(self) -> None:
         self._row += 1

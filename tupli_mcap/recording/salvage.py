@@ -108,7 +108,7 @@ def _half(contents: JournalContents, area: LogArea, half: int) -> memoryview:
     end = int(raw[start : start + 8].view("<u8")[0])
     if end > area.capacity:
         raise FormatError(f"the journal's area {area.name!r} claims {end} bytes of {area.capacity}")
-    return memoryview(raw)[start + 64 : start + 64 + end]
+    return memoryview(raw.data)[start + 64 : start + 64 + end]
 
 
 def to_rows(entries: Sequence[tuple[int, int, int, bytes]]) -> list[Rows]:
@@ -132,7 +132,7 @@ def running_record(
     not here."""
     for half in range(area.halves):
         start = half * area.half + 64 + len(_half(contents, area, half))
-        raw = memoryview(contents.data[area.name])[start : (half + 1) * area.half]
+        raw = memoryview(contents.data[area.name].data)[start : (half + 1) * area.half]
         if len(raw) < BODY:
             continue
         opcode, _, _, found, _, _ = RECORD_HEADER.unpack_from(raw)

@@ -45,7 +45,7 @@ def decide_layout(
 
 
 class SingleRecorder:
-    """Records one environment's episodes. `put` is the function to call with each step; it changes as episodes go by."""
+    """Records one environment's episodes. `put` takes each step; what it is changes as episodes go by."""
 
     def __init__(
         self,

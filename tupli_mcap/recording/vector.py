@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
@@ -187,7 +186,7 @@ class VectorRecorder:
         """Records infos of the batch just put."""
         if self._infos is None:
             return
-        for i in np.flatnonzero(stepped):
+        for i in np.flatnonzero(stepped).tolist():
             episode = self._episodes[i]
             if episode is not None:
                 self._infos.put(self._writer, episode.number, int(self._lengths[i]) - 1, entries[i])

@@ -63,12 +63,7 @@ class VectorRows:
         self._time = self._rows["#log_time"]
         self._sequence = self._rows["#sequence"]
         self._state_bytes: Array = np.frombuffer(buffer, np.uint8).reshape(2, n, area.rows + 1, area.row_size)
-        ends = [
-            message.offset(f.name) + f.nbytes
-            for f in message.fields
-            if f.name in {leaf.name for leaf in layout.state}
-        ]
-        self._state_end = BODY + max(ends, default=8)
+        self._state_end = layout.state_end
 
     def _writer(self, leaf: Leaf) -> tuple[Leaf, Array | None, np.dtype[Any], tuple[int, ...]]:
         view = None if leaf.size == 0 else self._rows[leaf.name]

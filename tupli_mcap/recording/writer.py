@@ -20,10 +20,17 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import RecordingError, SpaceError
-from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.layout import IMAGE_SCHEMA
+from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.container import Container, Rows
-from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
+from tupli_mcap.recording.events import (
+    END_NAME,
+    END_SCHEMA,
+    START_NAME,
+    START_SCHEMA,
+    EpisodeEnd,
+    EpisodeStart,
+)
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.journal import Area, Journal, LogArea, RowArea, journal_path
 from tupli_mcap.recording.lock import FileLock
@@ -156,7 +163,7 @@ class RecordingWriter:
                 old = self.container.schemas[self.container.channels[known[topic]].schema_id]
                 if old.data != text.encode():
                     raise RecordingError(
-                        f"{self.path} records {topic} with other fields; choose the same ones, or record to another file"
+                        f"{self.path} records {topic} with other fields; choose the same, or another file"
                     )
                 return known[topic]
             if schema_name not in schemas:
@@ -185,8 +192,8 @@ class RecordingWriter:
             steps,
             images,
             channel("/final_state", FINAL_STATE_SCHEMA, layout.final_schema, description),
-            channel("/episode_start", EpisodeStart.SCHEMA_NAME, EpisodeStart.SCHEMA, {}),
-            channel("/episode_end", EpisodeEnd.SCHEMA_NAME, EpisodeEnd.SCHEMA, {}),
+            channel("/episode_start", START_NAME, START_SCHEMA, {}),
+            channel("/episode_end", END_NAME, END_SCHEMA, {}),
             None if info is None else channel("/info", "tupli_mcap/msg/Info", info[0], info[1]),
         )
 
@@ -215,25 +222,25 @@ class RecordingWriter:
         counts, before_ns = self.container.counts, self.container.end_time
         self.journal = self._new_journal(areas)
         self.journal.publish()
-        by_name = self.journal.areas
+        rows_area, log_area = self.journal.row_area, self.journal.log_area
         buffer = self.journal.buffer
         self.images = []
         for leaf, ids in zip(layout.images, channels.images, strict=True):
             self.images.append(
                 [
                     ImageRows(
-                        leaf, layout.image_messages[leaf.name], by_name[f"{leaf.name}/{i}"], buffer(f"{leaf.name}/{i}"),
-                        channel, self.add_chunk, counts[channel],
-                    )  # type: ignore[arg-type]
+                        leaf, layout.image_messages[leaf.name], rows_area(f"{leaf.name}/{i}"),
+                        buffer(f"{leaf.name}/{i}"), channel, self.add_chunk, counts[channel],
+                    )
                     for i, channel in enumerate(ids)
                 ]
             )  # fmt: skip
         if not layout.constant:
             logs = [
                 StepLog(
-                    layout, by_name[f"steps/{i}"], buffer(f"steps/{i}"), channel, self.add_chunk,
+                    layout, log_area(f"steps/{i}"), buffer(f"steps/{i}"), channel, self.add_chunk,
                     [sinks[i] for sinks in self.images], counts[channel],
-                )  # type: ignore[arg-type]
+                )
                 for i, channel in enumerate(channels.steps)
             ]  # fmt: skip
             for log in logs:
@@ -246,18 +253,18 @@ class RecordingWriter:
             before = np.array([counts[c] for c in channels.steps], dtype=np.int64)
             derivers = [RowDeriver(time_ns=before_ns) for _ in channels.steps]
             self.vector = VectorRows(
-                layout, by_name["steps"], buffer("steps"), channels.steps, self.add_chunk, before, derivers
-            )  # type: ignore[arg-type]
+                layout, rows_area("steps"), buffer("steps"), channels.steps, self.add_chunk, before, derivers
+            )
         else:
             self.rows = SingleRows(
-                layout, by_name["steps"], buffer("steps"), channels.steps[0], self.add_chunk,
+                layout, rows_area("steps"), buffer("steps"), channels.steps[0], self.add_chunk,
                 [sinks[0] for sinks in self.images], counts[channels.steps[0]], RowDeriver(time_ns=before_ns),
-            )  # type: ignore[arg-type]  # fmt: skip
+            )  # fmt: skip
         events = {c: counts[c] for c in (channels.final_state, channels.start, channels.end)}
-        self.events = EventLog(by_name["events"], buffer("events"), self.add_chunk, events, before_ns)  # type: ignore[arg-type]
+        self.events = EventLog(log_area("events"), buffer("events"), self.add_chunk, events, before_ns)
         if channels.info is not None:
             info = {channels.info: counts[channels.info]}
-            self.infos = EventLog(by_name["info"], buffer("info"), self.add_chunk, info, before_ns)  # type: ignore[arg-type]
+            self.infos = EventLog(log_area("info"), buffer("info"), self.add_chunk, info, before_ns)
 
     # ---- episodes
 
@@ -381,14 +388,15 @@ class RecordingWriter:
         journal = self._new_journal(areas)
         logs = self.vector if isinstance(self.vector, list) else [self.rows]
         for i, log in enumerate(logs):
-            log.move(journal.areas[f"steps/{i}"], journal.buffer(f"steps/{i}"))  # type: ignore[union-attr, arg-type]
-        for leaf, sinks in zip(self.layout.images, self.images, strict=True):  # type: ignore[union-attr]
+            if isinstance(log, StepLog):
+                log.move(journal.log_area(f"steps/{i}"), journal.buffer(f"steps/{i}"))
+        for leaf, sinks in zip(self.layout.images if self.layout else [], self.images, strict=True):
             for i, sink in enumerate(sinks):
                 name = f"{leaf.name}/{i}"
-                sink.move(journal.areas[name], journal.buffer(name))  # type: ignore[arg-type]
-        for name, log in (("events", self.events), ("info", self.infos)):
-            if log is not None:
-                log.move(journal.areas[name], journal.buffer(name))  # type: ignore[arg-type]
+                sink.move(journal.row_area(name), journal.buffer(name))
+        for name, events in (("events", self.events), ("info", self.infos)):
+            if events is not None:
+                events.move(journal.log_area(name), journal.buffer(name))
         journal.publish()
         self.journal = journal
 
@@ -427,7 +435,7 @@ class RecordingWriter:
         """In a forked child: lets go of the file and its lock without writing; the parent goes on."""
         self.closed = True
         self.failed = RecordingError(
-            f"{self.path} is recorded by the process that opened it, not by its forked child; wrap the environment there"
+            f"{self.path} is recorded by the process that opened it, not by a forked child; wrap the environment here"
         )
         self.lock.abandon()
         if self.on_abandon is not None:

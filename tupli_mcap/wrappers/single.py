@@ -8,7 +8,7 @@ import time
 import weakref
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, SupportsFloat
+from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
@@ -106,7 +106,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         self._finalizer = weakref.finalize(self, _close, self._recorder, self._episode_metadata)
 
     @property
-    def spec(self) -> EnvSpec | None:
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
         """The inner environment's: a recorder is no part of what an environment is."""
         return self.env.spec
 
@@ -189,12 +189,13 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
     def __enter__(self) -> RecordEpisodes:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_: object) -> Literal[False]:
         self.close()
+        return False
 
     def __getstate__(self) -> dict[str, Any]:
         raise RecordingError(
-            f"a wrapper that records to {self.path} cannot be pickled or copied; wrap the environment in the other process"
+            f"a wrapper that records to {self.path} cannot be pickled or copied; wrap the environment there"
         )
 
 

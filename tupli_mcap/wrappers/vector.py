@@ -28,7 +28,7 @@ __all__ = ["RecordEpisodes"]
 StepCallback = Callable[[Step], Mapping[str, Any] | None]
 
 
-class RecordEpisodes(gym.vector.VectorWrapper):  # type: ignore[type-arg]
+class RecordEpisodes(gym.vector.VectorWrapper):
     """Records every sub-environment of a vector environment (Sync, Async, custom) into the MCAP file `path`.
 
     Arguments are those of `tupli_mcap.RecordEpisodes`. A metadata callback is copied for each sub-environment.
@@ -80,11 +80,6 @@ class RecordEpisodes(gym.vector.VectorWrapper):  # type: ignore[type-arg]
         self._states: list[Any] = []
         self._watches = wanted or metadata_callback is not None
         self._finalizer = weakref.finalize(self, self._recorder.close)
-
-    @property
-    def closed(self) -> bool:
-        """True once the recording is finished."""
-        return self._writer.closed
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         result = self.env.step(actions)
