@@ -294,7 +294,8 @@ def _environment(recording: Recording, path: Path) -> EnvironmentRecord:
 def _header(record: EnvironmentRecord, path: Path) -> BenchmarkHeader:
     if not (record.benchmark or {}).get("id"):
         raise StorageError(
-            f"{str(path)!r} carries an environment, but no benchmark; it was recorded outside a storage"
+            f"{str(path)!r} carries an environment, but no benchmark: it was recorded outside a storage; "
+            "copy the file into the storage's directory, where its episodes are found"
         )
     try:
         return BenchmarkHeader.model_validate(record.benchmark)

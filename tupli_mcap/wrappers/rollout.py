@@ -87,12 +87,11 @@ def record_rollouts(
                 record_info=record_info,
                 attachments=attachments,
             )
-            with vector:
+            with _closing(vector, mode):
                 done = _run_vector(vector, steps, seed, policy, report)
         else:
-            with RecordEpisodes(
-                made, path, mode=mode, compression=compression, record_info=record_info
-            ) as single:
+            single = RecordEpisodes(made, path, mode=mode, compression=compression, record_info=record_info)
+            with _closing(single, mode):
                 done = _run(single, steps, seed, policy, report)
     with Recording(path) as recording:
         rows = recording.index[known:]
@@ -130,6 +129,19 @@ def _make(env_id: str, num_envs: int) -> gym.Env[Any, Any] | gym.vector.SyncVect
         return gym.vector.SyncVectorEnv([lambda: gym.make(env_id)] * num_envs)
     except Exception as err:  # an environment's constructor may raise anything
         raise RecordingError(f"the environment {env_id!r} cannot be made: {_reason(err)}") from err
+
+
+@contextlib.contextmanager
+def _closing(env: RecordEpisodes | RecordVectorEpisodes, mode: Mode) -> Iterator[None]:
+    """Closes a wrapper. A new file that no step came into is removed: it would be in the way of the next try."""
+    try:
+        with contextlib.closing(env):
+            yield
+    except BaseException:
+        with contextlib.suppress(TupliError, OSError):
+            if mode == "x" and _episodes_in(env.path) == 0:
+                env.path.unlink()
+        raise
 
 
 def _run(
@@ -190,8 +202,8 @@ def _failures(done: int, path: Path) -> Iterator[None]:
         raise
     except Exception as err:
         raise RecordingError(
-            f"the policy or the environment failed at step {done}: {_reason(err)}; "
-            f"{path} holds the steps before it"
+            f"the policy or the environment failed at step {done}: {_reason(err)}"
+            + (f"; {path} holds the steps before it" if done else "")
         ) from err
 
 

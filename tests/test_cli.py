@@ -1,0 +1,887 @@
+"""The command line: what each command prints, and the one line and exit code of each failure."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from typer.testing import CliRunner
+
+from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper, trust
+from tupli_mcap.cli import app
+from tupli_mcap.cli.output import bytes_of, number, numbers
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, RLTuple
+from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
+
+TOOL = Path(sys.executable).with_name("tupli-mcap")
+
+
+class Result:
+    """What a command printed, and its exit code."""
+
+    def __init__(self, code: int, out: str, err: str) -> None:
+        self.code, self.out, self.err = code, out, err
+
+    @property
+    def json(self) -> Any:
+        assert (self.code, self.err) == (0, "")
+        return json.loads(self.out)
+
+
+def run(*args: object) -> Result:
+    result = CliRunner().invoke(app, [str(arg) for arg in args])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return Result(result.exit_code, result.stdout, result.stderr)
+
+
+def ok(*args: object) -> str:
+    result = run(*args)
+    assert (result.code, result.err) == (0, "")
+    return result.out
+
+
+def fails(*args: object, code: int = 1) -> str:
+    """The one line of a failure, without `error: `; nothing else is printed."""
+    result = run(*args)
+    assert result.code == code
+    assert result.out == ""
+    assert result.err.count("\n") == 1
+    assert result.err.startswith("error: ")
+    return result.err.removeprefix("error: ").rstrip("\n")
+
+
+def tool(*args: object, cwd: Path, **environment: str) -> Result:
+    """The installed command in a process of its own."""
+    done = subprocess.run(
+        [TOOL, *map(str, args)],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    return Result(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("TUPLI_MCAP_STORAGE", raising=False)
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def cartpole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recordings") / "cartpole.mcap"
+    record_rollouts("CartPole-v1", path, steps=200, seed=1)
+    return path
+
+
+class Return(EpisodeMetadataCallback):
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self.total = 0.0
+
+    def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+        self.total += float(tuple.reward)
+        return {"cum_eps_reward": self.total, "is_expert": self.total > 20}
+
+
+class Wind(gym.Wrapper[Any, Any, Any, Any]):
+    """In no registry: such an environment is pickled."""
+
+
+def fill(root: Path) -> tuple[str, str]:
+    """A storage of two benchmarks (a registered environment and a pickled one), an artifact and 3 + 2 episodes."""
+    ids = []
+    storage = FileStorage(root)
+    for env, name, episodes in (
+        (gym.make("CartPole-v1"), "pole", 3),
+        (Wind(gym.make("CartPole-v1")), "wind", 2),
+    ):
+        with TupliEnvWrapper(env, storage=storage, metadata_callback=Return()) as wrapped:
+            ids.append(wrapped.store(name=name, description=f"about {name}"))
+            wrapped.action_space.seed(1)
+            for seed in range(episodes):
+                wrapped.reset(seed=seed)
+                while not any(wrapped.step(wrapped.action_space.sample())[2:4]):
+                    pass
+    storage.store_artifact(b"a,b\n", ArtifactMetadata(name="wind.csv", description="the wind"))
+    storage.close()
+    return ids[0], ids[1]
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
+    root = tmp_path_factory.mktemp("storages") / "lab"
+    return root, *fill(root)
+
+
+@pytest.fixture
+def lab(filled: tuple[Path, str, str], here: Path) -> tuple[Path, str, str]:
+    """A copy of the storage, to change."""
+    shutil.copytree(filled[0], here / "lab", copy_function=shutil.copy2)
+    return here / "lab", filled[1], filled[2]
+
+
+# --- record ---
+
+
+class TestRecord:
+    def test_records_real_rollouts(self, here: Path) -> None:
+        out = ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 300, "--seed", 7)
+        assert re.fullmatch(
+            r"a\.mcap: \d+ episodes, 300 steps, mean return [\d.]+, [\d.]+ kB in [\d.]+ s\n", out
+        )
+        with Recording("a.mcap") as recording:
+            assert recording.num_steps == 300
+            assert recording.episodes[0].seed == 7
+            assert recording.benchmark.record.name == "CartPole-v1"
+        ok("record", "CartPole-v1", "-o", "b.mcap", "--steps", 300, "--seed", 7)
+        with Recording("a.mcap") as first, Recording("b.mcap") as second:
+            np.testing.assert_array_equal(first.read().states, second.read().states)
+
+    def test_summary_as_json(self, here: Path) -> None:
+        told = run("record", "CartPole-v1", "-o", "a.mcap", "--steps", 50, "--json").json
+        assert (told["path"], told["steps"]) == ("a.mcap", 50)
+        assert told["size"] == Path("a.mcap").stat().st_size
+
+    def test_vector_environments(self, here: Path) -> None:
+        told = run("record", "CartPole-v1", "-o", "v.mcap", "--steps", 301, "--num-envs", 3, "--json").json
+        with Recording("v.mcap") as recording:
+            assert recording.num_envs == 3
+            assert recording.num_steps == told["steps"]
+            assert 301 <= told["steps"] < 304
+            assert len(recording) == told["episodes"]
+            assert recording.benchmark.record.name == "CartPole-v1"
+
+    def test_modes(self, here: Path) -> None:
+        ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 40)
+        before = Path("a.mcap").read_bytes()
+        assert fails("record", "CartPole-v1", "-o", "a.mcap").startswith(
+            "a.mcap exists and is not overwritten"
+        )
+        assert Path("a.mcap").read_bytes() == before
+        told = run("record", "CartPole-v1", "-o", "a.mcap", "--steps", 30, "--mode", "a", "--json").json
+        assert told["steps"] == 30
+        with Recording("a.mcap") as recording:
+            assert recording.num_steps == 70
+        ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 30, "--mode", "w")
+        with Recording("a.mcap") as recording:
+            assert recording.num_steps == 30
+
+    def test_compression_and_infos(self, here: Path) -> None:
+        ok("record", "FrozenLake-v1", "-o", "a.mcap", "--steps", 30, "--compression", "none", "--record-info")
+        with Recording("a.mcap") as recording:
+            info = recording.episodes[0].infos[0]
+            assert set(info) == {"prob"}
+        assert run("info", "a.mcap", "--json").json["compression"] == pytest.approx(1, abs=0.2)
+
+    @pytest.mark.parametrize("envs", [1, 3])
+    def test_policies(self, here: Path, envs: int) -> None:
+        Path(f"policy_of_{envs}.py").write_text(
+            "def push(state):\n    assert state.shape == (4,)\n    return int(state[2] > 0)\n"
+        )
+        args = ("-o", "a.mcap", "--steps", 300, "--num-envs", envs, "--policy", f"policy_of_{envs}:push")
+        told = run("record", "CartPole-v1", *args, "--json").json
+        assert told["return_mean"] > 28  # random actions reach 22
+        with Recording("a.mcap") as recording:
+            columns = recording.read()
+            np.testing.assert_array_equal(columns.actions, columns.states[:, 2] > 0)
+
+    def test_policies_that_do_not_import(self, here: Path) -> None:
+        line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "no_such_module:act")
+        assert line == (
+            "the policy 'no_such_module:act' cannot be imported: "
+            "ModuleNotFoundError: No module named 'no_such_module'"
+        )
+        line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "math:no_such_function")
+        assert line.startswith("the policy 'math:no_such_function' cannot be imported: AttributeError: ")
+        line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "math:pi")
+        assert line == "the policy 'math:pi' must be a function, found float"
+        line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "math", code=2)
+        assert line.startswith("Invalid value for '--policy': expected module:function, found 'math'; see ")
+        assert not Path("a.mcap").exists()
+
+    def test_policies_that_fail(self, here: Path) -> None:
+        line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "math:factorial")
+        assert line.startswith("the policy or the environment failed at step 0: TypeError: ")
+        assert not Path("a.mcap").exists()
+        Path("tiring.py").write_text("left = [0] * 9\ndef act(state):\n    return left.pop()\n")
+        line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "tiring:act")
+        assert line == (
+            "the policy or the environment failed at step 9: IndexError: pop from empty list; "
+            "a.mcap holds the steps before it"
+        )
+        with Recording("a.mcap") as recording:
+            assert recording.num_steps == 9
+
+    def test_environments_that_cannot_be_made(self, here: Path) -> None:
+        line = fails("record", "NoSuchEnvironment-v0", "-o", "a.mcap")
+        assert line.startswith("the environment 'NoSuchEnvironment-v0' cannot be made: NameNotFound: ")
+        line = fails("record", "no_such_module:Env-v0", "-o", "a.mcap", "--num-envs", 2)
+        assert line.startswith(
+            "the environment 'no_such_module:Env-v0' cannot be made: ModuleNotFoundError: "
+        )
+        assert not Path("a.mcap").exists()
+
+    def test_places_that_cannot_be_written(self, here: Path) -> None:
+        Path("file").touch()
+        line = fails("record", "CartPole-v1", "-o", "file/a.mcap")
+        assert line == "file/a.mcap cannot be recorded to: Not a directory; choose a writable place"
+        line = fails("record", "CartPole-v1", "-o", "none/a.mcap")
+        assert line == "none/a.mcap cannot be recorded to: its directory does not exist"
+        line = fails("record", "CartPole-v1", "-o", "/proc/a.mcap")
+        assert line.startswith("/proc/a.mcap cannot be recorded to: ")
+
+    @pytest.mark.parametrize(
+        ("args", "line"),
+        [
+            ((), "Missing option '--output' / '-o'"),
+            (("-o", "a.mcap", "--steps", "0"), "Invalid value for '--steps'"),
+            (("-o", "a.mcap", "--steps", "many"), "Invalid value for '--steps'"),
+            (("-o", "a.mcap", "--num-envs", "0"), "Invalid value for '--num-envs'"),
+            (("-o", "a.mcap", "--mode", "r"), "Invalid value for '--mode'"),
+            (("-o", "a.mcap", "--compression", "gzip"), "Invalid value for '--compression'"),
+        ],
+    )
+    def test_usage(self, here: Path, args: Sequence[str], line: str) -> None:
+        found = fails("record", "CartPole-v1", *args, code=2)
+        assert found.startswith(line)
+        assert found.endswith("see tupli-mcap record --help")
+
+    def test_the_library_refuses_no_steps(self, here: Path) -> None:
+        with pytest.raises(RecordingError, match="expected at least 1 step and 1 environment, found 0 and 1"):
+            record_rollouts("CartPole-v1", "a.mcap", steps=0)
+        with pytest.raises(RecordingError, match="must have the form module:function"):
+            load_policy(":act")
+
+    def test_progress_grows_to_the_end(self, here: Path) -> None:
+        told: list[int] = []
+        record_rollouts("CartPole-v1", "a.mcap", steps=1000, progress=told.append)
+        assert told == sorted(told)
+        assert told[-1] == 1000
+        assert 100 <= len(told) <= 400
+
+    def test_ctrl_c_keeps_what_was_recorded(self, here: Path) -> None:
+        args = [TOOL, "record", "CartPole-v1", "-o", "a.mcap", "--steps", "100000000"]
+        with subprocess.Popen(args, stderr=subprocess.PIPE, text=True, cwd=here) as process:
+            deadline = time.monotonic() + 30
+            while not (here / "a.mcap").exists() or (here / "a.mcap").stat().st_size < 100_000:
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=30)
+        assert (process.returncode, err) == (1, "error: interrupted\n")
+        with Recording("a.mcap") as recording:
+            assert recording.complete
+            assert recording.num_steps > 0
+
+
+# --- ls, info, episodes ---
+
+
+class TestLook:
+    def test_ls_lists_files_and_directories(self, here: Path, cartpole: Path) -> None:
+        (here / "deep").mkdir()
+        shutil.copy(cartpole, here / "deep" / "b.mcap")
+        shutil.copy(cartpole, here / "a.mcap")
+        header, *rows = ok("ls").splitlines()
+        assert header.split() == ["RECORDING", "EPISODES", "STEPS", "RETURN", "SIZE", "STATE"]
+        assert [row.split()[0] for row in rows] == ["a.mcap", "deep/b.mcap"]
+        with Recording(cartpole) as recording:
+            mean = f"{recording.index['return'].mean():.2f}".removesuffix(".00")
+            expected = [str(len(recording)), "200", mean]
+        assert rows[0].split()[1:4] == expected
+        assert rows[0].split()[-1] == "complete"
+        (told,) = run("ls", "deep", "--json").json
+        assert told["path"] == "deep/b.mcap"
+        assert (told["steps"], told["state"], told["error"]) == (200, "complete", None)
+
+    def test_ls_of_nothing(self, here: Path) -> None:
+        assert ok("ls") == "no recordings\n"
+        assert run("ls", "--json").json == []
+
+    def test_ls_says_what_it_could_not_read_and_goes_on(self, here: Path, cartpole: Path) -> None:
+        shutil.copy(cartpole, "good.mcap")
+        Path("bad.mcap").write_bytes(b"nonsense")
+        result = run("ls", ".", "gone.mcap")
+        assert result.code == 1
+        assert [line.split()[0] for line in result.out.splitlines()] == ["RECORDING", "good.mcap"]
+        first, second = result.err.splitlines()
+        assert first.startswith("error: bad.mcap: expected an MCAP file, found b'nonsense'")
+        assert second == "error: gone.mcap does not exist; give a recording (.mcap) or a directory of them"
+        as_json = run("ls", "bad.mcap", "--json")
+        assert as_json.code == 1
+        assert json.loads(as_json.out)[0]["error"].startswith("bad.mcap: expected an MCAP file")
+
+    def test_ls_leaves_out_deleted_episodes(self, lab: tuple[Path, str, str]) -> None:
+        with FileStorage(lab[0]) as storage:
+            storage.delete_episode(storage.list_episodes()[0].id)
+        assert sum(item["episodes"] for item in run("ls", "lab", "--json").json) == 4
+
+    def test_ls_tells_a_live_recording_from_a_killed_one(self, here: Path) -> None:
+        env = RecordEpisodes(gym.make("CartPole-v1"), "a.mcap")
+        env.reset(seed=1)
+        env.step(0)
+        assert run("ls", "a.mcap", "--json").json[0]["state"] == "recording"
+        for name in ("a.mcap", "a.mcap.journal"):
+            shutil.copy(name, f"b{name[1:]}")
+        (told,) = run("ls", "b.mcap", "--json").json
+        assert (told["state"], told["episodes"], told["steps"]) == ("recovered", 1, 1)
+        assert "its writer was killed" in ok("info", "b.mcap")
+        env.close()
+
+    def test_info(self, cartpole: Path, here: Path) -> None:
+        out = ok("info", cartpole)
+        facts = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in out.split("\n\n")[0].splitlines())
+        assert facts["recording"] == str(cartpole)
+        assert facts["state"] == "complete"
+        assert facts["environment"] == "CartPole-v1"
+        assert facts["benchmark"] == "none"
+        assert facts["action"] == "Discrete(2)"
+        assert facts["observation"].endswith("(4,), float32)")
+        assert re.search(r"compressed \d+\.\d : 1", facts["size"])
+        assert "/step           tupli_mcap/msg/Step" in out
+        assert "benchmark.json" in out
+
+    def test_info_as_json(self, cartpole: Path, here: Path) -> None:
+        told = run("info", cartpole, "--json").json
+        with Recording(cartpole) as recording:
+            assert told["uuid"] == recording.uuid
+            assert told["episodes"] == len(recording) == sum(told["ends"].values())
+            assert told["returns"]["mean"] == pytest.approx(recording.index["return"].mean())
+            assert told["lengths"]["max"] == recording.index["length"].max()
+        (steps,) = [channel for channel in told["channels"] if channel["topic"] == "/step"]
+        assert steps["messages"] == 200
+
+    def test_info_of_an_empty_recording(self, here: Path) -> None:
+        RecordEpisodes(gym.make("CartPole-v1"), "empty.mcap").close()
+        assert "not known before the first step" in ok("info", "empty.mcap")
+        assert run("info", "empty.mcap", "--json").json["returns"] is None
+        assert ok("episodes", "empty.mcap") == "no episodes\n"
+
+    def test_info_of_nested_spaces_fits_one_line_each(self, here: Path) -> None:
+        ok("record", "Blackjack-v1", "-o", "a.mcap", "--steps", 20)
+        assert "observation  Tuple(Discrete(32), Discrete(11), Discrete(2))\n" in ok("info", "a.mcap")
+
+    def test_episodes_of_a_file(self, cartpole: Path, here: Path) -> None:
+        header, *rows = ok("episodes", cartpole).splitlines()
+        assert header.split() == ["EPISODE", "STEPS", "RETURN", "END", "SEED", "ENDED", "AT"]
+        with Recording(cartpole) as recording:
+            assert [int(row.split()[1]) for row in rows] == recording.index["length"].tolist()
+            long = int((recording.index["length"] > 20).sum())
+        assert len(run("episodes", cartpole, "--filter", "n_tuples > 20", "--json").json) == long
+        assert len(run("episodes", cartpole, "--limit", 2, "--json").json) == 2
+        assert ok("episodes", cartpole, "--filter", "n_tuples > 1000") == "no episodes\n"
+
+    def test_episodes_of_a_storage(self, filled: tuple[Path, str, str], here: Path) -> None:
+        told = run("episodes", filled[0], "--json").json
+        assert len(told) == 5
+        assert {item["benchmark_id"] for item in told} == set(filled[1:])
+        assert len(ok("episodes", filled[0], "--limit", 3).splitlines()) == 4
+
+    def test_values_json_has_no_word_for(self, here: Path) -> None:
+        class Odd(Return):
+            def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+                return {"score": float("nan"), "at": np.float32(0.5), "name": "a\nb\x1b[31m"}
+
+        with RecordEpisodes(gym.make("CartPole-v1"), "a.mcap", metadata_callback=Odd()) as env:
+            env.reset()
+            env.step(0)
+        (told,) = run("episodes", "a.mcap", "--json").json
+        assert told["metadata"] == {"score": {"$float": "nan"}, "at": 0.5, "name": "a\nb\x1b[31m"}
+        out = ok("episodes", "a.mcap")
+        assert "score=nan, at=0.5, name=a�b�[31m" in out  # nothing in a file moves the cursor
+
+
+# --- what is no recording ---
+
+
+def foreign(path: Path) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="other")
+        schema = writer.register_schema("thing", "jsonschema", b"{}")
+        channel = writer.register_channel("/thing", "json", schema)
+        writer.add_message(channel, log_time=1, publish_time=1, data=b"{}")
+        writer.finish()
+
+
+def truncated(path: Path) -> None:
+    record_rollouts("CartPole-v1", path, steps=50)
+    path.write_bytes(path.read_bytes()[:40])
+
+
+BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (lambda path: None, r"bad\.mcap does not exist; give the path of a recording \(\.mcap\)"),
+    "empty": (Path.touch, r"bad\.mcap is empty; expected an MCAP recording"),
+    "text": (
+        lambda path: path.write_text("hello, world"),
+        r"bad\.mcap: expected an MCAP file, found b'hello, w.*",
+    ),
+    "truncated": (truncated, r"bad\.mcap: the file is cut off or damaged before its first step.*"),
+    "foreign": (foreign, r"bad\.mcap is an MCAP file, but no tupli_mcap recording .*"),
+    "directory": (Path.mkdir, r"bad\.mcap is a directory; .*"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*has no journal")
+@pytest.mark.parametrize("kind", BAD_FILES)
+@pytest.mark.parametrize(
+    "command",
+    [("info",), ("trust",), ("import", "--storage", "lab"), ("bundle", "-o", "out.mcap")],
+    ids=lambda c: c[0],
+)
+def test_files_that_are_no_recording(here: Path, kind: str, command: tuple[str, ...]) -> None:
+    make, line = BAD_FILES[kind]
+    make(Path("bad.mcap"))
+    assert re.search(line, fails(command[0], "bad.mcap", *command[1:]))
+    assert not Path("out.mcap").exists()
+
+
+@pytest.mark.filterwarnings("ignore:.*has no journal")
+@pytest.mark.parametrize("kind", ["empty", "text", "truncated", "foreign"])
+def test_episodes_of_files_that_are_no_recording(here: Path, kind: str) -> None:
+    make, line = BAD_FILES[kind]
+    make(Path("bad.mcap"))
+    assert re.search(line, fails("episodes", "bad.mcap"))
+
+
+def test_a_file_cut_off_later_is_read_up_to_there(here: Path, cartpole: Path) -> None:
+    Path("cut.mcap").write_bytes(cartpole.read_bytes()[:-2000])
+    result = run("ls", "cut.mcap", "--json")
+    assert result.code == 0
+    assert result.err.startswith(
+        "warning: cut.mcap was not finished and has no journal cut.mcap.journal beside it"
+    )
+    assert result.err.count("\n") == 1
+    (told,) = json.loads(result.out)
+    assert (told["state"], told["error"]) == ("recovered", None)
+
+
+def test_episodes_of_what_is_missing(here: Path) -> None:
+    assert (
+        fails("episodes", "bad.mcap") == "there is no file 'bad.mcap'; give the path of a recording (.mcap)"
+    )
+
+
+# --- storages ---
+
+
+class TestStorages:
+    def test_list_benchmarks(self, filled: tuple[Path, str, str], here: Path) -> None:
+        root, pole, wind = filled
+        header, *rows = ok("list-benchmarks", "--storage", root).splitlines()
+        assert header.split() == ["ID", "NAME", "CREATED", "DESCRIPTION"]
+        assert [row.split()[:2] for row in rows] == [[pole, "pole"], [wind, "wind"]]
+        (told,) = run(
+            "list-benchmarks", "--storage", root, "--filter", 'metadata.name = "wind"', "--json"
+        ).json
+        assert told["id"] == wind
+
+    def test_list_artifacts(self, filled: tuple[Path, str, str], here: Path) -> None:
+        out = ok("list-artifacts", "--storage", filled[0])
+        assert "wind.csv" in out
+        (told,) = run("list-artifacts", "--storage", filled[0], "--json").json
+        assert told["name"] == "wind.csv"
+        assert ok("list-artifacts", "--storage", filled[0], "--filter", "name = 'x'") == "no artifacts\n"
+
+    def test_list_episodes(self, filled: tuple[Path, str, str], here: Path) -> None:
+        everything = run("list-episodes", "--storage", filled[0], "--json").json
+        wanted = [item for item in everything if item["metadata"]["cum_eps_reward"] > 20]
+        assert 0 < len(wanted) < len(everything)
+        args = ("--filter", "metadata.cum_eps_reward > 20")
+        assert run("list-episodes", "--storage", filled[0], *args, "--json").json == wanted
+        out = ok("list-episodes", "--storage", filled[0], *args)
+        assert [line.split()[0] for line in out.splitlines()[1:]] == [item["id"] for item in wanted]
+
+    def test_the_storage_of_the_environment(
+        self, filled: tuple[Path, str, str], here: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("TUPLI_MCAP_STORAGE", str(filled[0]))
+        assert len(run("list-benchmarks", "--json").json) == 2
+        shutil.copytree(filled[0], here / "_local_storage")
+        monkeypatch.delenv("TUPLI_MCAP_STORAGE")
+        assert len(run("list-benchmarks", "--json").json) == 2
+
+    @pytest.mark.parametrize(
+        "command", ["list-benchmarks", "list-artifacts", "list-episodes", "compact", "reindex"]
+    )
+    def test_no_storage_there(self, here: Path, command: str) -> None:
+        line = "there is no storage at {!r}; give its directory with --storage or in TUPLI_MCAP_STORAGE"
+        assert fails(command) == line.format("_local_storage")
+        assert fails(command, "--storage", "none") == line.format("none")
+        assert list(here.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        ("text", "line"),
+        [
+            ("metadata.score >", "filter 'metadata.score >' needs a value .* at character 16, found the end"),
+            ("and", "filter 'and' needs .* at character 0.*"),
+            ("score > 1", "unknown filter key 'score'; the keys are benchmark_id, .*"),
+            ("env > [1]", "filter 'env > \\[1\\]' needs a value .*"),
+            ("env > true", ".*true.*"),
+        ],
+    )
+    def test_filters_without_meaning(
+        self, filled: tuple[Path, str, str], cartpole: Path, here: Path, text: str, line: str
+    ) -> None:
+        for command in (
+            ("list-episodes", "--storage", filled[0]),
+            ("episodes", filled[0]),
+            ("episodes", cartpole),
+            ("export", "--storage", filled[0], "-o", "out.mcap"),
+        ):
+            assert re.fullmatch(line, fails(*command, "--filter", text, code=2), re.IGNORECASE)
+        assert not Path("out.mcap").exists()
+
+    def test_compact(self, lab: tuple[Path, str, str]) -> None:
+        assert ok("compact", "--storage", "lab") == "nothing to compact\n"
+        with FileStorage("lab") as storage:
+            storage.delete_episode(storage.list_episodes()[0].id)
+        sizes = {path: path.stat().st_size for path in Path("lab").rglob("*.mcap")}
+        header, row = ok("compact", "--storage", "lab", "--dry-run").splitlines()
+        assert header.split() == ["RECORDING", "DELETED", "SIZE"]
+        assert row.split()[1] == "1"
+        assert {path: path.stat().st_size for path in Path("lab").rglob("*.mcap")} == sizes
+        told = run("compact", "--storage", "lab", "--json").json
+        assert told["bytes_freed"] == sum(sizes.values()) - sum(
+            path.stat().st_size for path in Path("lab").rglob("*.mcap")
+        )
+        assert [item["deleted"] for item in told["recordings"]] == [1]
+        assert run("compact", "--storage", "lab", "--dry-run", "--json").json["recordings"] == []
+        assert len(run("list-episodes", "--storage", "lab", "--json").json) == 4
+
+    def test_reindex(self, lab: tuple[Path, str, str]) -> None:
+        Path("lab/catalog.sqlite").write_bytes(b"broken")
+        assert ok("reindex", "--storage", "lab") == "lab: 5 episodes\n"
+        assert run("reindex", "--storage", "lab", "--json").json == {"storage": "lab", "episodes": 5}
+
+    def test_a_damaged_recording_is_a_warning(self, lab: tuple[Path, str, str]) -> None:
+        Path("lab/bad.mcap").write_bytes(b"nonsense")
+        result = run("list-episodes", "--storage", "lab", "--json")
+        assert result.code == 0
+        assert len(json.loads(result.out)) == 5
+        assert result.err.count("\n") == 1
+        assert result.err.startswith("warning: skipped a recording: lab/bad.mcap: expected an MCAP file")
+
+
+# --- sharing ---
+
+
+class TestSharing:
+    def test_a_bundle_goes_round(self, lab: tuple[Path, str, str]) -> None:
+        pole = lab[1]
+        assert re.fullmatch(
+            r"b\.mcap: 3 episodes, \d+ steps, [\d.]+ kB\n",
+            ok("bundle", pole, "-o", "b.mcap", "--storage", "lab"),
+        )
+        dry = ok("import", "b.mcap", "--storage", "other", "--dry-run")
+        assert dry.splitlines()[0] == "would import 3 of 3 episodes, 0 of 0 artifacts"
+        assert not Path("other").exists()
+        told = run("import", "b.mcap", "--storage", "other", "--json").json
+        assert (told["benchmark_id"], told["name"], told["new_episodes"]) == (pole, "pole", 3)
+        assert run("import", "b.mcap", "--storage", "other", "--json").json["new_episodes"] == 0
+        dry_json = run("import", "b.mcap", "--storage", "other", "--dry-run", "--json").json
+        assert (dry_json["dry_run"], dry_json["new_episodes"], dry_json["episodes"]) == (True, 0, 3)
+        here = run("list-episodes", "--storage", "lab", "--filter", f'benchmark_id = "{pole}"', "--json").json
+        there = run("list-episodes", "--storage", "other", "--json").json
+        assert [item["id"] for item in there] == [item["id"] for item in here]
+
+    def test_ids_may_be_short(self, lab: tuple[Path, str, str]) -> None:
+        wind = lab[2]
+        told = run("bundle", wind[:12], "-o", "b.mcap", "--storage", "lab", "--json").json
+        assert (told["benchmark_id"], told["episodes"]) == (wind, 2)
+
+    def test_a_bundle_of_a_filter(self, lab: tuple[Path, str, str]) -> None:
+        told = run(
+            "bundle", lab[1], "-o", "b.mcap", "--storage", "lab", "--filter", "seed = 1", "--json"
+        ).json
+        assert told["episodes"] == 1
+
+    def test_a_bundle_of_a_recording(self, lab: tuple[Path, str, str]) -> None:
+        (path,) = Path("lab/recordings", lab[2]).glob("*.mcap")
+        with FileStorage("lab") as storage:
+            storage.delete_episode(next(h.id for h in storage.list_episodes() if h.benchmark_id == lab[2]))
+        ok("bundle", path, "-o", "b.mcap", "--storage", "lab")
+        assert run("import", "b.mcap", "--storage", "other", "--json").json["episodes"] == 1
+        assert fails("bundle", path, "-o", "c.mcap", "--filter", "env = 0", code=2).startswith(
+            "Invalid value: a filter goes with a benchmark id, not with a file"
+        )
+
+    def test_a_bundle_of_a_plain_recording(self, here: Path, cartpole: Path) -> None:
+        ok("bundle", cartpole, "-o", "b.mcap")
+        with Recording("b.mcap") as copy, Recording(cartpole) as original:
+            np.testing.assert_array_equal(copy.read().states, original.read().states)
+            assert copy.benchmark.record == original.benchmark.record
+        with RecordEpisodes(gym.make("CartPole-v1"), "bare.mcap", attachments={}) as env:
+            env.reset()
+            env.step(0)
+        assert fails("bundle", "bare.mcap", "-o", "c.mcap").startswith("'bare.mcap' carries no benchmark")
+        assert not Path("c.mcap").exists()
+
+    def test_artifacts_come_along(self, here: Path) -> None:
+        from tupli_mcap.environment import capture
+        from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery
+        from tupli_mcap.storage.document import BenchmarkContent, benchmark_hash, facts_about, pack
+
+        env = gym.make("CartPole-v1")
+        metadata = BenchmarkMetadata(name="with wind")
+        with FileStorage("lab") as storage:
+            artifact = storage.store_artifact(b"1,2\n", ArtifactMetadata(name="wind.csv")).id
+            record = capture(env)
+            storage.store_benchmark(
+                BenchmarkQuery(
+                    hash=benchmark_hash(BenchmarkContent(record, (artifact,)), metadata),
+                    serialized=pack(record, [artifact], facts_about(env)),
+                    metadata=metadata,
+                )
+            )
+            benchmark = storage.list_benchmarks()[0].id
+        env.close()
+        ok("bundle", benchmark, "-o", "b.mcap", "--storage", "lab")
+        out = ok("import", "b.mcap", "--storage", "other")
+        assert out.splitlines()[0] == "imported 0 of 0 episodes, 1 of 1 artifacts"
+        assert [item["id"] for item in run("list-artifacts", "--storage", "other", "--json").json] == [
+            artifact
+        ]
+
+    def test_export(self, lab: tuple[Path, str, str]) -> None:
+        line = fails("export", "-o", "e.mcap", "--storage", "lab")
+        assert line.startswith("expected episodes of one benchmark to export, found 5 episodes of 2: ")
+        out = ok("export", "-o", "e.mcap", "--storage", "lab", "--filter", f'benchmark_id = "{lab[1]}"')
+        assert out.startswith("e.mcap: 3 episodes, ")
+
+    def test_existing_files_stay(self, lab: tuple[Path, str, str]) -> None:
+        Path("b.mcap").write_text("mine")
+        line = "'b.mcap' exists and is not overwritten; choose another path or delete it"
+        assert fails("bundle", lab[1], "-o", "b.mcap", "--storage", "lab") == line
+        assert fails("export", "-o", "b.mcap", "--storage", "lab", "--filter", "seed = 1") == line
+        (path,) = Path("lab/recordings", lab[1]).glob("*.mcap")
+        assert fails("bundle", path, "-o", "b.mcap") == line
+        assert Path("b.mcap").read_text() == "mine"
+
+    @pytest.mark.parametrize("benchmark", ["0" * 64, "abcd", "../../etc", "/etc", "", "a\nb", "é"])
+    def test_unknown_ids(self, lab: tuple[Path, str, str], benchmark: str) -> None:
+        line = fails("bundle", benchmark, "-o", "b.mcap", "--storage", "lab")
+        assert line.startswith("there is no benchmark with id ")
+        assert not Path("b.mcap").exists()
+
+    def test_places_that_cannot_be_written(self, lab: tuple[Path, str, str]) -> None:
+        Path("file").touch()
+        line = fails("bundle", lab[1], "-o", "file/b.mcap", "--storage", "lab")
+        assert line.startswith("cannot write the bundle 'file/b.mcap': ")
+        ok("bundle", lab[1], "-o", "b.mcap", "--storage", "lab")
+        line = fails("import", "b.mcap", "--storage", "file/storage")
+        assert line.startswith("cannot make the storage 'file/storage': ")
+
+    def test_a_plain_recording_is_no_bundle(self, here: Path, cartpole: Path) -> None:
+        line = fails("import", cartpole, "--storage", "lab")
+        assert re.search("recorded outside a storage; copy the file into the storage's directory", line)
+
+    def test_trust(self, lab: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+        (path,) = Path("lab/recordings", lab[2]).glob("*.mcap")
+        monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(Path("config").resolve()))
+        shown = run("trust", path, "--show", "--json").json
+        assert (shown["kind"], shown["needs_trust"], shown["trusted"]) == ("pickle", True, False)
+        assert not trust.is_trusted(shown["digest"])
+        facts = dict(line.split("  ", 1) for line in ok("trust", path).splitlines() if line[0] != " ")
+        assert facts["trusted"].strip() == "yes"
+        assert facts["digest"].strip() == shown["digest"]
+        assert trust.is_trusted(shown["digest"])
+        assert run("trust", path, "--remove", "--json").json["trusted"] is False
+        assert not trust.is_trusted(shown["digest"])
+        assert fails("trust", path, "--show", "--remove", code=2).startswith(
+            "Invalid value: --show and --remove exclude each other"
+        )
+
+    def test_trust_is_not_needed_for_a_registered_environment(self, here: Path, cartpole: Path) -> None:
+        out = ok("trust", cartpole, "--show")
+        assert "the registered environment, by its spec" in out
+        assert out.splitlines()[-1] == "trusted      not needed"
+
+    def test_import_may_trust(self, lab: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+        ok("bundle", lab[2], "-o", "b.mcap", "--storage", "lab")
+        monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(Path("config").resolve()))
+        digest = run("trust", "b.mcap", "--show", "--json").json["digest"]
+        ok("import", "b.mcap", "--storage", "other")
+        assert not trust.is_trusted(digest)
+        ok("import", "b.mcap", "--storage", "other", "--trust")
+        assert trust.is_trusted(digest)
+
+
+# --- the program as a whole ---
+
+
+COMMANDS = [
+    *("record", "ls", "info", "episodes", "list-benchmarks", "list-artifacts", "list-episodes"),
+    *("compact", "reindex", "bundle", "import", "export", "trust"),
+]
+
+
+class TestProgram:
+    def test_help(self, here: Path) -> None:
+        listed = ok("--help")
+        assert ok() == listed
+        for command in COMMANDS:
+            assert re.search(rf"^  {command} +\S.*[^.]\.$", listed, re.MULTILINE)  # not cut to "..."
+            out = ok(command, "--help")
+            assert out == ok(command, "-h")
+            assert max(map(len, out.splitlines())) <= 80
+
+    def test_everything_that_prints_has_json(self) -> None:
+        for command in COMMANDS:
+            assert "--json" in ok(command, "--help")
+
+    def test_usage_errors(self, here: Path) -> None:
+        assert fails("lss", code=2).startswith("No such command 'lss'")
+        assert fails("ls", "--no-such-option", code=2).startswith("No such option")
+        assert fails("info", code=2) == "Missing argument 'FILE'; see tupli-mcap info --help"
+
+    def test_debug_shows_the_traceback(self, here: Path) -> None:
+        for args in (("--debug", "info", "none.mcap"), ("info", "none.mcap", "--debug")):
+            result = run(*args)
+            assert result.code == 1
+            assert "Traceback" in result.err
+            assert result.err.splitlines()[-1].startswith("error: none.mcap does not exist")
+
+    def test_bugs_are_not_disguised(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def broken(*_: object) -> None:
+            raise ZeroDivisionError("a bug")
+
+        monkeypatch.setattr("tupli_mcap.storage.listing.list_recordings", broken)
+        with pytest.raises(ZeroDivisionError, match="a bug"):
+            run("ls")
+
+    def test_the_installed_command(self, here: Path, cartpole: Path) -> None:
+        assert re.fullmatch(r"tupli-mcap \d+\.\d+\.\d+\S*\n", tool("--version", cwd=here).out)
+        assert tool("info", cartpole, "--json", cwd=here).json["steps"] == 200
+        failed = tool("info", "none.mcap", cwd=here)
+        assert (failed.code, failed.out) == (1, "")
+        assert failed.err == "error: none.mcap does not exist; give the path of a recording (.mcap)\n"
+        assert tool("info", cwd=here).code == 2
+
+    def test_completion(self, here: Path) -> None:
+        script = tool(
+            "--show-completion", cwd=here, SHELL="/bin/bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1"
+        )
+        assert script.code in (0, 2)  # without detection, the option wants the shell's name
+        found = tool(
+            cwd=here, _TUPLI_MCAP_COMPLETE="complete_bash", COMP_WORDS="tupli-mcap list-", COMP_CWORD="1"
+        )
+        assert found.out.split() == ["list-benchmarks", "list-artifacts", "list-episodes"]
+
+    def test_help_imports_nothing_heavy(self, here: Path) -> None:
+        code = (
+            "import sys\nfrom tupli_mcap.cli import app\n"
+            "try: app(['--help'])\nexcept SystemExit: pass\n"
+            "print([m for m in ('gymnasium', 'numpy', 'sqlalchemy', 'pydantic', 'mcap') if m in sys.modules])"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout.splitlines()[-1] == "[]"
+
+    def test_a_reader_that_stops_reading(self, here: Path, cartpole: Path) -> None:
+        with subprocess.Popen(
+            [TOOL, "episodes", cartpole], stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=here
+        ) as process:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            process.stdout.close()
+            assert process.stderr.read() == b""
+
+    @pytest.mark.parametrize("width", [60, 80, 120])
+    def test_tables_fit_the_terminal(
+        self, filled: tuple[Path, str, str], here: Path, monkeypatch: pytest.MonkeyPatch, width: int
+    ) -> None:
+        monkeypatch.setenv("COLUMNS", str(width))
+        root = filled[0]
+        (path,) = (root / "recordings" / filled[1]).glob("*.mcap")
+        for args in (
+            ("ls", root),
+            ("info", path),
+            ("episodes", root),
+            ("episodes", path),
+            ("list-benchmarks", "--storage", root),
+            ("list-artifacts", "--storage", root),
+            ("trust", path),
+        ):
+            lines = ok(*args).splitlines()
+            assert max(map(len, lines)) <= width or args[0] == "info"
+            assert len({len(line) for line in lines}) > 1
+
+    def test_a_terminal_gets_a_progress_bar(self, here: Path) -> None:
+        pid, fd = pty.fork()
+        if pid == 0:
+            os.execv(TOOL, [str(TOOL), "record", "CartPole-v1", "-o", "a.mcap", "--steps", "30000"])
+        seen = b""
+        while select.select([fd], [], [], 30)[0]:
+            try:
+                part = os.read(fd, 65536)
+            except OSError:  # the other end has closed
+                break
+            if not part:
+                break
+            seen += part
+        os.close(fd)
+        assert os.waitpid(pid, 0)[1] == 0
+        assert b"steps" in seen
+        assert b"/30000" in seen
+        assert b"a.mcap: " in seen
+
+
+class TestWords:
+    @pytest.mark.parametrize(
+        ("size", "text"),
+        [
+            (0, "0 B"),
+            (999, "999 B"),
+            (1000, "1.0 kB"),
+            (18_349, "18.3 kB"),
+            (999_960, "1.0 MB"),
+            (2e15, "2000.0 TB"),
+        ],
+    )
+    def test_sizes(self, size: float, text: str) -> None:
+        assert bytes_of(int(size)) == text
+
+    @pytest.mark.parametrize(
+        ("value", "text"),
+        [
+            (None, ""),
+            (0, "0"),
+            (1234, "1,234"),
+            (-1.5, "-1.50"),
+            (1e-5, "1e-05"),
+            (float("nan"), "nan"),
+            (1e20, "1e+20"),
+        ],
+    )
+    def test_numbers(self, value: float | None, text: str) -> None:
+        assert number(value) == text
+
+    def test_a_column_of_numbers_has_equal_decimals(self) -> None:
+        assert numbers([1.0, 2.5, None, float("inf")]) == ["1.00", "2.50", "", "inf"]
+        assert numbers([1.0, -2000.0]) == ["1", "-2,000"]
