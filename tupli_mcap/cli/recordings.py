@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -33,6 +34,18 @@ if TYPE_CHECKING:
 __all__ = ["print_episodes", "register"]
 
 _ROOMY = 100  # columns of a terminal on which metadata and times fit side by side
+
+
+class _Mode(StrEnum):
+    x = "x"
+    w = "w"
+    a = "a"
+
+
+class _Compression(StrEnum):
+    zstd = "zstd"
+    lz4 = "lz4"
+    none = "none"
 
 
 def register(app: typer.Typer) -> None:
@@ -64,9 +77,9 @@ def _record(
         ),
     ] = None,
     mode: Annotated[
-        Literal["x", "w", "a"], typer.Option(help="If the file exists: x refuses, w replaces, a appends.")
-    ] = "x",
-    compression: Annotated[Literal["zstd", "lz4", "none"], typer.Option(help="Of the chunks.")] = "zstd",
+        _Mode, typer.Option(help="If the file exists: x refuses, w replaces, a appends.")
+    ] = _Mode.x,
+    compression: Annotated[_Compression, typer.Option(help="Of the chunks.")] = _Compression.zstd,
     record_info: Annotated[
         bool, typer.Option("--record-info", help="Record the infos of steps too.")
     ] = False,
@@ -89,8 +102,8 @@ def _record(
             seed=seed,
             num_envs=num_envs,
             policy=function,
-            mode=mode,
-            compression=compression,
+            mode=mode.value,
+            compression=compression.value,
             record_info=record_info,
             progress=progress,
         )

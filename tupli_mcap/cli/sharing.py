@@ -74,7 +74,7 @@ def _export(
     """Write episodes of a storage to one file.
 
     They must be of one benchmark; its artifacts stay behind (use bundle to take them along).
-        With several benchmarks in the storage, choose one: --filter 'benchmark_id = "..."'.
+    With several benchmarks in the storage, choose one: --filter 'benchmark_id = "..."'.
     """
     with open_storage(storage_path) as storage:
         storage.export(output, filter_of(filter_text))
@@ -124,7 +124,7 @@ def _trust(
     """Let the environment in a file be rebuilt.
 
     Rebuilding it may run code that came with the file, as this user, on this machine.
-        Reading its episodes needs no trust. Only this user's processes trust it from then on.
+    Reading its episodes needs no trust. Only this user's processes trust it from then on.
     """
     from tupli_mcap.recording.carried import carried_code, set_trust
 

@@ -108,7 +108,7 @@ def _compact(
     """Free the space of deleted episodes.
 
     Recordings that hold deleted episodes are rewritten without them.
-        Episodes that stay keep their ids. Recordings that are being written are left alone.
+    Episodes that stay keep their ids. Recordings that are being written are left alone.
     """
     from tupli_mcap.storage.listing import compactable
 

@@ -89,14 +89,15 @@ class NameRegistry:
     def __init__(self, reserved: Sequence[str] = ()) -> None:
         self._taken = set(reserved)
 
-    def take(self, text: str) -> str:
+    def take(self, text: str, prefixes: Sequence[str] = ("",)) -> str:
+        """A name like `text` that is free, with each of `prefixes` before it."""
         base = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_") or "field"
         if not base[0].isalpha():
             base = f"f_{base}"
         name, n = base, 2
-        while name in self._taken:
+        while any(prefix + name in self._taken for prefix in prefixes):
             name, n = f"{base}_{n}", n + 1
-        self._taken.add(name)
+        self._taken.update(prefix + name for prefix in prefixes)
         return name
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import struct
+import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mcap.records import ChunkIndex
@@ -47,11 +49,29 @@ def resume(writer: RecordingWriter) -> None:
     writer.container.position = contents.data_end
     for rows in contents.tail:
         writer.container.add_chunk(rows)
+    known = set(contents.attachments)
+    for name, (media_type, data) in (writer.options.attachments or {}).items():
+        if name not in known:
+            writer.container.add_attachment(name, media_type, data, time.time_ns())
+
+
+def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:
+    """The file says where its journal is; a reader would look for it there."""
+    recorded = contents.metadata.get("journal")
+    given = writer.options.journal_dir
+    if given is not None and (recorded is None or Path(given).resolve() != Path(recorded).parent):
+        raise RecordingError(
+            f"{writer.path}: its journal belongs {'beside it' if recorded is None else f'at {recorded}'}, not into "
+            f"{given}; leave journal_dir out when appending"
+        )
+    if recorded is not None:
+        writer.options = writer.options._replace(journal_dir=Path(recorded).parent)
 
 
 def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> None:
     container = writer.container
     writer.uuid = contents.metadata["uuid"]
+    _keep_journal_place(writer, contents)
     container.schemas = dict(sorted(contents.schemas.items()))
     container.channels = dict(sorted(contents.channels.items()))
     if list(container.channels) != list(range(1, len(container.channels) + 1)):

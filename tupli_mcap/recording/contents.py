@@ -86,6 +86,22 @@ def read_contents(source: Source) -> Contents:
     )
 
 
+def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
+    """The step channels in the order of their sub-environments.
+
+    Raises:
+        FormatError: they are not numbered from 0.
+    """
+    found = [channel for channel in channels.values() if channel.topic.endswith("/step")]
+    by_env = {channel.metadata.get("env", ""): channel for channel in found}
+    numbers = [str(i) for i in range(len(found))]
+    if sorted(by_env) != sorted(numbers):
+        raise FormatError(
+            f"{name}: expected step channels of sub-environments 0 to {len(found) - 1}, found {list(by_env)}"
+        )
+    return [by_env[number] for number in numbers]
+
+
 def check_version(source: Source, metadata: dict[str, str]) -> dict[str, str]:
     """Raises FormatError unless the metadata is that of a format this version reads."""
     version = metadata.get("format_version")

@@ -96,7 +96,7 @@ class Episode:
     @property
     def seed(self) -> int | None:
         """The seed passed to `reset`, else the one the environment drew in an unseeded first reset, else None."""
-        return int(self.start.seed) if self.start.seed else None
+        return self.start.seed_number
 
     @property
     def options(self) -> Any:

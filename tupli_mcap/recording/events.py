@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import NamedTuple
 
@@ -37,6 +38,7 @@ END_SCHEMA = (
     "bool has_final_state\nstring metadata\n"
 )
 
+_SEED = re.compile(r"-?[0-9]{1,80}", re.ASCII)
 _START = struct.Struct("<IIQ??2x")
 _END = struct.Struct("<IIQQdB?2x")
 _LENGTH = struct.Struct("<I")
@@ -96,6 +98,11 @@ class EpisodeStart(NamedTuple):
     seed: str
     options: str
     reset_info: str
+
+    @property
+    def seed_number(self) -> int | None:
+        """The seed as a number; None if there is none."""
+        return int(self.seed) if _SEED.fullmatch(self.seed) else None
 
     def encode(self) -> bytes:
         fixed = _START.pack(*self[:5])

@@ -70,10 +70,13 @@ class IndexBuilder:
             has_seed, seed = False, 0
         else:
             has_seed = True
-        self.rows += _ROW.pack(
-            first, length, total, start, end, seed, start_row, end_row, final_row, len(self.metadata), len(text),
-            number, env, how, has_seed,
-        )  # fmt: skip
+        try:
+            self.rows += _ROW.pack(
+                first, length, total, start, end, seed, start_row, end_row, final_row, len(self.metadata), len(text),
+                number, env, how, has_seed,
+            )  # fmt: skip
+        except struct.error as err:  # only what was read from a damaged journal
+            raise FormatError(f"episode {number}: its facts do not fit the index: {err}") from err
         self.metadata += text
         self.count += 1
 
@@ -127,6 +130,8 @@ class EpisodeIndex(NamedTuple):
         rows, at = _decompress(data, _HEAD.size, episodes * EPISODE_ROWS.itemsize, where)
         table, at = _decompress(data, at, chunks * CHUNK_ROWS.itemsize, where)
         texts, at = _decompress(data, at, metadata, where)
+        if rows and (np.frombuffer(rows, EPISODE_ROWS)["end"] > 2).any():
+            raise FormatError(f"{where}: the episode index names ends that do not exist")
         if at != len(data):
             raise FormatError(f"{where}: expected an episode index of {at} bytes, found {len(data)}")
         return cls(np.frombuffer(rows, EPISODE_ROWS), np.frombuffer(table, CHUNK_ROWS), texts)

@@ -34,7 +34,7 @@ class InfoRecorder:
         self._names = [] if isinstance(select, bool) or callable(select) else list(select)
         self._select = select
         registry = NameRegistry(("episode", "step", "json"))
-        self._fields = [registry.take(name) for name in self._names]
+        self._fields = [registry.take(name, ("", "has_", "pad_")) for name in self._names]
 
     def schema(self) -> tuple[str, dict[str, str]]:
         """The ros2msg text of `/info` and its channel's metadata."""

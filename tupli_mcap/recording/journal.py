@@ -149,12 +149,16 @@ def _plan(areas: list[Area], info: Mapping[str, Any]) -> tuple[bytes, dict[str, 
     body = {"info": dict(info), "areas": [area.to_json() for area in areas]}
     text = json.dumps(body).encode()
     header = _HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text
-    offset = _aligned(len(header))
-    offsets = {}
+    return header, *_place(areas, len(header))
+
+
+def _place(areas: list[Area], header: int) -> tuple[dict[str, int], int]:
+    """Where each area starts after a header of that many bytes, and where the last one ends."""
+    offset, offsets = _aligned(header), {}
     for area in areas:
         offsets[area.name] = offset
         offset = _aligned(offset + area.size)
-    return header, offsets, offset
+    return offsets, offset
 
 
 def _create(path: Path, size: int) -> mmap.mmap:
@@ -204,7 +208,7 @@ def read_journal(path: Path) -> JournalContents:
         info = dict(body["info"])
     except (ValueError, KeyError, TypeError) as err:
         raise FormatError(f"{path}: expected areas in the journal's header, found {text[:80]!r}") from err
-    _, offsets, _ = _plan(areas, info)
+    offsets, _ = _place(areas, _HEAD.size + length)
     data = {}
     for area in areas:
         start = offsets[area.name]

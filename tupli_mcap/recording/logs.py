@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -80,6 +80,7 @@ class EventLog:
         self._sink = sink
         self._time = time_ns
         self._last = 0  # where the last message began
+        self._can_drop = False
         self.move(area, buffer)
 
     def move(self, area: LogArea, buffer: memoryview) -> None:
@@ -109,28 +110,32 @@ class EventLog:
             if end > self._capacity:
                 for rows in group_records(memoryview(data)):
                     self._sink(rows)
+                self._can_drop = False
                 return time_ns
-        self._last = self._position
+        self._last, self._can_drop = self._position, True
         self._records[self._last : end] = data
         self._position = end
         self._commit[0] = end
         return time_ns
 
     def drop_last(self, channel: int) -> None:
-        """Takes back the message of the last `append`, which was one of `channel`."""
+        """Takes back the message of the last `append`, which was one of `channel`, unless it is in the file already."""
+        if not self._can_drop:
+            return
         self._position = self._last
         self._commit[0] = self._last
         self.sequences[channel] -= 1
 
     def flush(self, *, keep_last: bool = False) -> None:
         """Writes the records to the file; with `keep_last` the last one stays, so that it can still be dropped."""
+        keep_last = keep_last and self._can_drop
         end = self._last if keep_last else self._position
         last = bytes(self._records[end : self._position])
         for rows in group_records(self._records[:end]):
             self._sink(rows)
         self._commit[0] = 0
         self._records[: len(last)] = last
-        self._last, self._position = 0, len(last)
+        self._last, self._position, self._can_drop = 0, len(last), keep_last
         self._commit[0] = len(last)
 
 
@@ -153,6 +158,21 @@ def _encoder(layout: StepLayout, leaf: Leaf) -> Encoder:
     return encode
 
 
+class PreparedState(NamedTuple):
+    """A state encoded: its record as far as it goes, and its images."""
+
+    record: bytearray
+    images: list[Any]
+
+
+class PreparedStep(NamedTuple):
+    """A step encoded: its whole record but the header, its reward, and the state after it."""
+
+    record: bytearray
+    reward: Any
+    after: PreparedState
+
+
 class StepLog:
     """The steps of one environment whose messages vary in size.
 
@@ -168,6 +188,7 @@ class StepLog:
         sink: Sink,
         images: Sequence[Any],
         first: int = 0,
+        time_ns: int = 0,
     ) -> None:
         self._layout = layout
         self._channel = channel
@@ -175,7 +196,7 @@ class StepLog:
         self._images = images
         self._episode = 0
         self._step = 0
-        self._time = 0
+        self._time = time_ns
         self._pending = bytearray()
         self._state = leaf_encoders(layout, [leaf for leaf in layout.state if leaf.kind != "image"])
         self._action = leaf_encoders(layout, layout.action)
@@ -194,41 +215,75 @@ class StepLog:
         self._write_pending(0)
 
     def begin_episode(self, episode: int) -> None:
-        """The records that follow belong to `episode`."""
+        """The records from the running one on belong to `episode`."""
         self._episode, self._step, self.total = episode, 0, 0.0
+        if self._pending:
+            self._number(self._pending)
+            self._write_pending(self._position)
 
-    def put_state(self, state: Any) -> None:
+    def prepare_state(self, state: Any) -> PreparedState:
+        """A state as `commit_state` takes it; StepError if it cannot be stored exactly."""
+        check_structure(self._layout.observation_space, state, "state")
+        out = bytearray(BODY + 8)
+        self._encode(out, self._state, state)
+        images = [
+            sink.check(leaf_value(state, leaf))
+            for sink, leaf in zip(self._images, self._layout.images, strict=True)
+        ]
+        return PreparedState(out, images)
+
+    def commit_state(self, prepared: PreparedState) -> None:
         """Starts the running record over: the state of a reset."""
-        pending, images = self._encode_state(state, 0, self.count)
-        self._reserve(len(pending))
-        self._pending = pending
+        self._reserve(len(prepared.record))
+        self._pending = prepared.record
+        self._number(self._pending)
         self._write_pending(self._position)
-        for sink, image in zip(self._images, images, strict=True):
+        for sink, image in zip(self._images, prepared.images, strict=True):
             sink.put_first(image)
 
-    def put(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
-        """Completes and commits the running record; `state` starts the next one."""
+    def prepare(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> PreparedStep:
+        """A step as `commit` takes it; StepError if it cannot be stored exactly."""
         check_structure(self._layout.action_space, action, "action")
         out = bytearray(self._pending)
         self._encode(out, self._action, action)
         self._encode(out, self._reward, reward)
         out += bytes((bool(terminal), bool(timeout)))
-        pending, images = self._encode_state(state, self._step + 1, self.count + 1)
+        return PreparedStep(out, reward, self.prepare_state(state))
+
+    def commit(self, prepared: PreparedStep) -> None:
+        """Completes and commits the running record; the prepared state starts the next one."""
+        out, pending = prepared.record, prepared.after.record
         self._reserve(len(out) + len(pending))
         self._time = max(time.time_ns(), self._time)
+        out[BODY : BODY + 8] = self._pending[BODY : BODY + 8]  # a new episode may have begun in between
         RECORD_HEADER.pack_into(out, 0, 5, len(out) - 9, self._channel, self.count, self._time, self._time)
         records, start = self._records[self._half], self._position
         end = start + len(out)
         records[start:end] = out
+        self.count += 1
+        self._step += 1
         self._pending = pending
+        self._number(pending)
         self._write_pending(end)
-        for sink, image in zip(self._images, images, strict=True):
+        for sink, image in zip(self._images, prepared.after.images, strict=True):
             sink.put(image)
         self._ends[self._half][0] = end
         self._position = end
-        self.count += 1
-        self._step += 1
-        self.total += reward
+        self.total += prepared.reward
+
+    def put_state(self, state: Any) -> None:
+        """`commit_state` of `prepare_state`."""
+        self.commit_state(self.prepare_state(state))
+
+    def put(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
+        """`commit` of `prepare`."""
+        self.commit(self.prepare(action, state, reward, terminal, timeout))
+
+    def _number(self, pending: bytearray) -> None:
+        """Says in a record that is not complete which one it will be; a length of 0 marks it as such."""
+        RECORD_HEADER.pack_into(pending, 0, 5, 0, self._channel, self.count, 0, 0)
+        pending[RECORD_HEADER.size : BODY] = CDR_HEADER
+        pending[BODY : BODY + 8] = self._episode.to_bytes(4, "little") + self._step.to_bytes(4, "little")
 
     def pending_state(self) -> bytes:
         """The CDR bytes of the running record's state, as they follow `episode` and `env` in `/final_state`."""
@@ -238,18 +293,6 @@ class StepLog:
     def _encode(out: bytearray, encoders: Sequence[tuple[Leaf, Encoder]], root: Any) -> None:
         for leaf, encode in encoders:
             encode(leaf_value(root, leaf), out, BODY)
-
-    def _encode_state(self, state: Any, step: int, sequence: int) -> tuple[bytearray, list[Any]]:
-        check_structure(self._layout.observation_space, state, "state")
-        # a length of 0 says that the record is not complete, its sequence which one it will be
-        out = bytearray(RECORD_HEADER.pack(5, 0, self._channel, sequence, 0, 0)) + CDR_HEADER
-        out += self._episode.to_bytes(4, "little") + step.to_bytes(4, "little")
-        self._encode(out, self._state, state)
-        images = [
-            sink.check(leaf_value(state, leaf))
-            for sink, leaf in zip(self._images, self._layout.images, strict=True)
-        ]
-        return out, images
 
     def _write_pending(self, position: int) -> None:
         self._records[self._half][position : position + len(self._pending)] = self._pending

@@ -10,14 +10,15 @@ from typing import Any, BinaryIO, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from mcap.records import Channel
 
 from tupli_mcap.environment import EnvironmentRecord, build
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages import jsonvalue
-from tupli_mcap.messages.step import STEP_SCHEMA, StepLayout
+from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns, Run, runs_of
-from tupli_mcap.recording.contents import Contents, read_contents
+from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.infos import InfoDecoder
@@ -87,10 +88,7 @@ class Recording:
         self.metadata: Mapping[str, str] = MappingProxyType(contents.metadata)
         self.index = contents.index.episodes
         topics = {channel.topic: channel for channel in contents.channels.values()}
-        steps = sorted(
-            (channel for channel in contents.channels.values() if channel.topic.endswith("/step")),
-            key=lambda channel: int(channel.metadata.get("env", "0")),
-        )
+        steps = step_channels(contents.channels, self.name)
         self._step_channels = [channel.id for channel in steps]
         self._layout: StepLayout | None = None
         self._columns: ColumnReader | None = None
@@ -98,13 +96,15 @@ class Recording:
         self._infos: dict[int, dict[int, dict[str, Any]]] | None = None
         if steps:
             self._layout = StepLayout.from_metadata(steps[0].metadata)
+            description = {key: value for key, value in steps[0].metadata.items() if key != "env"}
             for channel in steps:
-                schema = contents.schemas.get(channel.schema_id)
-                text = self._layout.step_schema.encode()
-                if schema is None or schema.name != STEP_SCHEMA or schema.data != text:
+                self._check_schema(channel, STEP_SCHEMA, self._layout.step_schema)
+                if {key: value for key, value in channel.metadata.items() if key != "env"} != description:
                     raise FormatError(
-                        f"{self.name}: the schema of {channel.topic} is not the one its spaces have"
+                        f"{self.name}: {channel.topic} describes other spaces than {steps[0].topic}"
                     )
+            if "/final_state" in topics:
+                self._check_schema(topics["/final_state"], FINAL_STATE_SCHEMA, self._layout.final_schema)
             images = {
                 leaf.name: {
                     channel.id: self._topics.get(
@@ -115,6 +115,11 @@ class Recording:
                 for leaf in self._layout.images
             }
             self._columns = ColumnReader(self._layout, self._store, images)
+
+    def _check_schema(self, channel: Channel, name: str, text: str) -> None:
+        schema = self._contents.schemas.get(channel.schema_id)
+        if schema is None or schema.name != name or schema.data != text.encode():
+            raise FormatError(f"{self.name}: the schema of {channel.topic} is not the one its spaces have")
 
     # ---- facts
 
@@ -213,7 +218,7 @@ class Recording:
     def episode_start(self, i: int) -> EpisodeStart:
         """The `/episode_start` message of episode `i`."""
         row = self.index[i]
-        (body,) = self._store.bodies(self._topics["/episode_start"], int(row["start_row"]), 1)
+        (body,) = self._store.bodies(self._channel("/episode_start"), int(row["start_row"]), 1)
         start = EpisodeStart.decode(body)
         if start.episode != row["episode"]:
             raise FormatError(
@@ -228,8 +233,15 @@ class Recording:
             return None
         return self.layout.nest_state([values[leaf.name] for leaf in self.layout.state])
 
+    def _channel(self, topic: str) -> int:
+        if topic not in self._topics:
+            raise FormatError(
+                f"{self.name}: expected a channel {topic}, found {', '.join(self._topics) or 'none'}"
+            )
+        return self._topics[topic]
+
     def _finals(self, rows: Any) -> list[dict[str, Any] | None]:
-        return self._reader.final_states(self._topics["/final_state"], rows)
+        return self._reader.final_states(self._channel("/final_state"), rows)
 
     @property
     def _reader(self) -> ColumnReader:
@@ -317,7 +329,7 @@ class Recording:
         return columns
 
     def _next_states(self, states: Any, rows: Any, lengths: Any) -> Any:
-        finals = self._finals(rows)
+        finals = self._finals(rows) if len(rows) else []
         layout = self.layout
         ends = np.cumsum(lengths) - 1
         known = [(int(end), values) for end, values in zip(ends, finals, strict=True) if values is not None]

@@ -21,7 +21,7 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.container import CHUNK_ROWS, Rows
-from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_version
+from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_version, step_channels
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, journal_path, read_journal
@@ -93,10 +93,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         complete=False,
         data_end=end,
     )
-    steps = sorted(
-        (c for c in found.channels.values() if c.topic.endswith("/step")),
-        key=lambda c: int(c.metadata.get("env", "0")),
-    )
+    steps = step_channels(found.channels, source.name)
     if steps:
         layout = StepLayout.from_metadata(steps[0].metadata)
         if journal is not None:
@@ -308,7 +305,7 @@ def _index(episodes: _Episodes, table: np.ndarray[Any, Any]) -> EpisodeIndex:
             continue
         start_row, start_time, start = episodes.starts[number]
         end_row, end_time, end = episodes.ends[number]
-        seed = int(start.seed) if start.seed.lstrip("-").isdecimal() else None
+        seed = start.seed_number
         final = episodes.finals.get(number, -1) if end.has_final_state else -1
         row = EpisodeRow(
             end.first_row, end.length, end.episode_return, start_time, end_time, seed, start_row, end_row, final,

@@ -101,6 +101,7 @@ class _Rewriter:
         rows = source.index
         if numbers is not None:
             rows = rows[np.isin(rows["episode"], np.asarray(list(numbers), dtype=np.int64))]
+        container.define_channels()
         if source.num_envs:
             self._steps(rows)
         container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, self._index.encode(container.chunk_rows), now)

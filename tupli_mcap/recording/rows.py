@@ -163,13 +163,14 @@ class ImageRows:
         channel: int,
         sink: Sink,
         first: int = 0,
+        time_ns: int = 0,
     ) -> None:
         self._leaf = leaf
         self._layout = layout
         self._channel = channel
         self._sink = sink
         self._sequence = first
-        self._time = 0
+        self._time = time_ns
         self._half = self._row = 0
         self._uint8 = np.dtype(np.uint8)
         self.move(area, buffer)

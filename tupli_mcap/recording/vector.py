@@ -21,7 +21,7 @@ from tupli_mcap.messages.exact import decide_dtype, leaf_value
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder
-from tupli_mcap.recording.logs import leaf_encoders
+from tupli_mcap.recording.logs import StepLog, leaf_encoders
 from tupli_mcap.recording.single import decide_layout
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
@@ -150,8 +150,6 @@ class VectorRecorder:
         active = None if holes is None else ~holes
         try:
             finals = self._finals(done, infos) if any_done and self._autoreset == "SameStep" else {}
-            if self._fresh:
-                self._start(active)
             self._store(actions, states, rewards, terminals, timeouts, active, finals)
         except StepError:
             self.refuse()
@@ -173,14 +171,15 @@ class VectorRecorder:
         """The metadata (JSON texts) of the running episodes, by sub-environment."""
         self._texts = list(texts)
 
-    def finish(self, terminals: Any) -> None:
-        """Ends the episodes that ended in the batch just put."""
+    def finish(self, terminals: Any, infos: Mapping[str, Any]) -> None:
+        """Ends the episodes that ended in the batch just put; `infos` are that batch's."""
         if not self._any_ended:
             return
         for i in np.flatnonzero(self._ended).tolist():
             self._end(i, TERMINAL if terminals[i] else TIMEOUT)
         if self._autoreset == "SameStep":
-            self._after_same_step()
+            self._note_resets(self._ended, infos)
+            self._any_ended = False
 
     def put_infos(self, stepped: Array, entries: Sequence[Mapping[str, Any]]) -> None:
         """Records infos of the batch just put."""
@@ -269,11 +268,14 @@ class VectorRecorder:
         active: Array | None,
         finals: dict[int, Any],
     ) -> None:
+        """Checks the whole batch, then starts episodes, then writes: a batch is recorded or refused as one."""
         store = self._writer.vector
         self._final_bytes = {i: self._encode_final(state) for i, state in finals.items()}
         if isinstance(store, VectorRows):
             images = self._check_images(states)
             batch = store.check(actions, states, rewards)
+            if self._fresh:
+                self._start(active)
             for sinks, column in images:
                 for i in range(self._n):
                     if active is None or active[i]:
@@ -282,12 +284,20 @@ class VectorRecorder:
                         sinks[i].put_first(column[i])
             store.put(batch, terminals, timeouts, self._numbers, active)
             return
+        logs: list[StepLog] = store  # type: ignore[assignment]
+        resets, steps = {}, {}
         each = zip(self._each(self._actions, actions), self._each(self._observations, states), strict=True)
         for i, (action, state) in enumerate(each):
             if active is not None and not active[i]:
-                store[i].put_state(state)  # type: ignore[index]
+                resets[i] = logs[i].prepare_state(state)
             else:
-                store[i].put(action, state, rewards[i], terminals[i], timeouts[i])  # type: ignore[index]
+                steps[i] = logs[i].prepare(action, state, rewards[i], terminals[i], timeouts[i])
+        if self._fresh:
+            self._start(active)
+        for i, reset in resets.items():
+            logs[i].commit_state(reset)
+        for i, step in steps.items():
+            logs[i].commit(step)
 
     def _check_images(self, states: Any) -> list[tuple[Any, Any]]:
         found = []
@@ -311,13 +321,6 @@ class VectorRecorder:
             text = jsonvalue.dumps(info, fallback=repr) if info else "{}"
             self._facts[i] = ResetFacts(None, None, "", text, now)
         self._fresh = True
-
-    def _after_same_step(self) -> None:
-        now = time.time_ns()
-        for i in np.flatnonzero(self._ended):
-            self._facts[i] = ResetFacts(None, None, "", "{}", now)
-        self._fresh = True
-        self._any_ended = False
 
     # ---- ends
 

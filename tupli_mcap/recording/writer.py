@@ -230,7 +230,7 @@ class RecordingWriter:
                 [
                     ImageRows(
                         leaf, layout.image_messages[leaf.name], rows_area(f"{leaf.name}/{i}"),
-                        buffer(f"{leaf.name}/{i}"), channel, self.add_chunk, counts[channel],
+                        buffer(f"{leaf.name}/{i}"), channel, self.add_chunk, counts[channel], before_ns,
                     )
                     for i, channel in enumerate(ids)
                 ]
@@ -239,7 +239,7 @@ class RecordingWriter:
             logs = [
                 StepLog(
                     layout, log_area(f"steps/{i}"), buffer(f"steps/{i}"), channel, self.add_chunk,
-                    [sinks[i] for sinks in self.images], counts[channel],
+                    [sinks[i] for sinks in self.images], counts[channel], before_ns,
                 )
                 for i, channel in enumerate(channels.steps)
             ]  # fmt: skip

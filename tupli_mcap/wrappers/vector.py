@@ -89,7 +89,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         stepped = self._recorder.put(actions, states, rewards, terminals, timeouts, infos)
         if self._watches:
             self._watch(stepped, actions, result)
-        self._recorder.finish(terminals)
+        self._recorder.finish(terminals, infos)
         return result
 
     def reset(
