@@ -308,10 +308,7 @@ def vector(
         recorder.reset(seed=11)
         for t in range(9):
             recorder.step(np.array([-1, 0, 1]) if t % 2 else np.array([1, 1, 1]))
-    episodes = [episode for i, env in enumerate(envs) for episode in expected(env, i)]
-    if mode is gym.vector.AutoresetMode.SAME_STEP:  # the info of a reset inside a step is not recorded
-        episodes = [{**episode, "reset_info": {}} for episode in episodes]
-    return episodes
+    return [episode for i, env in enumerate(envs) for episode in expected(env, i)]
 
 
 def appended(path: Path) -> list[Log]:
@@ -384,6 +381,7 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "every_info": every_info,
     "vector_next_step": lambda path: vector(path, gym.vector.AutoresetMode.NEXT_STEP),
     "vector_same_step": lambda path: vector(path, gym.vector.AutoresetMode.SAME_STEP),
+    "vector_variable": lambda path: vector(path, gym.vector.AutoresetMode.NEXT_STEP, spaces.Text(20), words),
     "appended": appended,
     "continued": continued,
     "rewritten": rewritten,
