@@ -126,7 +126,8 @@ def _ls(
     """List recordings in files and directories.
 
     RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; or recovered:
-    the writer was killed, and all steps it finished are there. Deleted episodes of a storage are not counted.
+    its writer was killed or failed, and all steps that were finished are there. Deleted episodes
+    of a storage are not counted.
     """
     from tupli_mcap.storage.listing import list_recordings
 
@@ -263,7 +264,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
     states = {
         "complete": "complete",
         "recording": "a writer is at work on it",
-        "recovered": "recovered: its writer was killed, all finished steps are here",
+        "recovered": "recovered: its writer did not finish it, all finished steps are here",
     }
     environment = d.environment or "none attached"
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)

@@ -39,7 +39,7 @@ class ChannelFacts(NamedTuple):
 class RecordingDescription:
     """Facts about a recording; spaces and spreads are None where there is no step or no episode.
 
-    state: "complete", "recording" (a writer is at work) or "recovered" (a writer was killed).
+    state: "complete", "recording" (a writer is at work) or "recovered" (a writer did not finish).
     size: bytes of the file. created_ns, start_ns, end_ns: wall clock; the latter two are 0 without
         an episode.
     compression: bytes of messages for one byte of chunks in the file; None without a chunk.
@@ -107,7 +107,7 @@ def describe(recording: Recording) -> RecordingDescription:
 
 
 def state_of(recording: Recording) -> str:
-    """ "complete", "recording" (a writer is at work) or "recovered" (a writer was killed)."""
+    """ "complete", "recording" (a writer is at work) or "recovered" (a writer did not finish)."""
     if recording.complete:
         return "complete"
     return "recording" if recording.path is not None and is_locked(recording.path) else "recovered"

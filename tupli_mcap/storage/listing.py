@@ -20,7 +20,7 @@ class ListedRecording(NamedTuple):
     """A recording without its deleted episodes; `error` says why there is nothing else.
 
     return_mean: over all episodes that are left, None if there are none. size: bytes of the file.
-    state: "complete", "recording" (a writer is at work) or "recovered" (a writer was killed).
+    state: "complete", "recording" (a writer is at work) or "recovered" (a writer did not finish).
     """
 
     path: str
