@@ -20,22 +20,18 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import RecordingError, SpaceError
-from tupli_mcap.messages.layout import IMAGE_SCHEMA
-from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.events import (
-    END_NAME,
-    END_SCHEMA,
-    START_NAME,
-    START_SCHEMA,
     EpisodeEnd,
     EpisodeStart,
 )
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.journal import Area, Journal, LogArea, RowArea, journal_path
+from tupli_mcap.recording.journal import Area, Journal, journal_path
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog, StepLog
-from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows, rows_per_half
+from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
 from tupli_mcap.recording.vector_rows import VectorRows
 
 __all__ = ["FORMAT_VERSION", "RECORDING_METADATA", "Mode", "RecordingWriter", "WriterOptions"]
@@ -59,17 +55,6 @@ class WriterOptions(NamedTuple):
     flush_seconds: float | None = None
 
 
-class Channels(NamedTuple):
-    """MCAP channel ids."""
-
-    steps: list[int]
-    images: list[list[int]]  # by image leaf, then by sub-environment
-    final_state: int
-    start: int
-    end: int
-    info: int | None
-
-
 _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
 
 
@@ -90,12 +75,10 @@ class RecordingWriter:
         self.images: list[list[ImageRows]] = []
         self.events: EventLog | None = None
         self.infos: EventLog | None = None
-        self.on_abandon: Callable[[], None] | None = (
-            None  # tells the recorder, whose encoder knows only its buffer
-        )
-        self.start_is_droppable: Callable[[], bool] = lambda: (
-            False
-        )  # the last event is a start without a step
+        # set by the recorder: told of a fork (its encoder knows only its buffer), and asked whether the last event
+        # is the start of an episode without a step
+        self.on_abandon: Callable[[], None] = lambda: None
+        self.start_is_droppable: Callable[[], bool] = lambda: False
         self.num_envs = 1
         self.is_vector = False
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
@@ -150,75 +133,30 @@ class RecordingWriter:
         self.layout = layout
         self.num_envs = num_envs
         self.is_vector = vector
-        self.channels = self._register(layout, info_schema)
+        self.channels = register_channels(
+            self.container, str(self.path), layout, num_envs if vector else None, info_schema
+        )
         self.container.define_channels()
         self._make_stores(self._areas())
 
-    def _register(self, layout: StepLayout, info: tuple[str, Mapping[str, str]] | None) -> Channels:
-        known = {channel.topic: channel.id for channel in self.container.channels.values()}
-        schemas = {schema.name: schema.id for schema in self.container.schemas.values()}
-
-        def channel(topic: str, schema_name: str, text: str, metadata: Mapping[str, str]) -> int:
-            if topic in known:
-                old = self.container.schemas[self.container.channels[known[topic]].schema_id]
-                if old.data != text.encode():
-                    raise RecordingError(
-                        f"{self.path} records {topic} with other fields; choose the same, or another file"
-                    )
-                return known[topic]
-            if schema_name not in schemas:
-                schemas[schema_name] = self.container.add_schema(schema_name, text)
-            return self.container.add_channel(topic, schemas[schema_name], metadata)
-
-        description = layout.to_metadata()
-        tops = [f"/env_{i}" for i in range(self.num_envs)] if self.is_vector else [""]
-        steps = [
-            channel(f"{top}/step", STEP_SCHEMA, layout.step_schema, {**description, "env": str(i)})
-            for i, top in enumerate(tops)
-        ]
-        images = [
-            [
-                channel(
-                    f"{top}/image/{leaf.name}",
-                    "sensor_msgs/msg/Image",
-                    IMAGE_SCHEMA,
-                    {"env": str(i), "leaf": leaf.name},
-                )
-                for i, top in enumerate(tops)
-            ]
-            for leaf in layout.images
-        ]
-        return Channels(
-            steps,
-            images,
-            channel("/final_state", FINAL_STATE_SCHEMA, layout.final_schema, description),
-            channel("/episode_start", START_NAME, START_SCHEMA, {}),
-            channel("/episode_end", END_NAME, END_SCHEMA, {}),
-            None if info is None else channel("/info", "tupli_mcap/msg/Info", info[0], info[1]),
+    def _areas(self, step_capacity: int = 0) -> list[Area]:
+        has_infos = self.channels.info is not None
+        return plan_areas(
+            self._laid(), self.num_envs, self.options.chunk_size, step_capacity, infos=has_infos
         )
 
-    def _areas(self, step_capacity: int = 0) -> list[Area]:
-        assert self.layout is not None
-        n, size = self.num_envs, self.options.chunk_size
-        if n > 1:  # one chunk a sub-environment: smaller ones, but never below 64 KiB
-            size = max(64 * 1024, size // n)
-        areas: list[Area] = []
-        if not self.layout.constant:
-            areas += [LogArea(f"steps/{i}", max(size, step_capacity), 2) for i in range(n)]
-        else:
-            row = self.layout.step_message.record_size
-            areas.append(RowArea("steps", row, rows_per_half(row, size), n))
-        for leaf in self.layout.images:
-            row = self.layout.image_messages[leaf.name].dtype.itemsize
-            areas += [RowArea(f"{leaf.name}/{i}", row, rows_per_half(row, size)) for i in range(n)]
-        areas.append(LogArea("events", 512 * 1024))
-        if self.channels.info is not None:
-            areas.append(LogArea("info", size))
-        return areas
+    def _laid(self) -> StepLayout:
+        if self.layout is None:
+            raise RecordingError(f"{self.path} has no step yet, so its layout is not known")
+        return self.layout
+
+    def _events(self) -> EventLog:
+        if self.events is None:
+            raise RecordingError(f"{self.path} has no step yet, so it has no episodes")
+        return self.events
 
     def _make_stores(self, areas: Sequence[Area]) -> None:
-        assert self.layout is not None
-        layout, channels = self.layout, self.channels
+        layout, channels = self._laid(), self.channels
         counts, before_ns = self.container.counts, self.container.end_time
         self.journal = self._new_journal(areas)
         self.journal.publish()
@@ -270,7 +208,6 @@ class RecordingWriter:
 
     def start_episode(self, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
         """Writes `/episode_start`; it is taken back by `drop_start` if no step follows."""
-        assert self.events is not None
         seed = reset.seed if reset.seed is not None else reset.drawn_seed
         message = EpisodeStart(
             self.next_episode,
@@ -282,15 +219,14 @@ class RecordingWriter:
             reset.options,
             reset.info,
         )
-        row = self.events.sequences[self.channels.start]
-        start_time = self.events.append(reset.time_ns, (self.channels.start, message.encode()))
+        row = self._events().sequences[self.channels.start]
+        start_time = self._events().append(reset.time_ns, (self.channels.start, message.encode()))
         self.next_episode += 1
         return StartedEpisode(message.episode, env, first_row, start_time, seed, row)
 
     def drop_start(self) -> None:
         """Takes back the last `/episode_start`, the last event: a reset without a step is no episode."""
-        assert self.events is not None
-        self.events.drop_last(self.channels.start)
+        self._events().drop_last(self.channels.start)
         self.next_episode -= 1
 
     def end_episode(
@@ -303,8 +239,8 @@ class RecordingWriter:
         metadata: str,
     ) -> None:
         """Writes `/final_state` and `/episode_end`, and the episode's row of the index."""
-        assert self.events is not None
-        channels, sequences = self.channels, self.events.sequences
+        channels, events = self.channels, self._events()
+        sequences = events.sequences
         total = total if type(total) is float else float(np.sum(total))
         number, env, first_row = episode.number, episode.env, episode.first_row
         message = EpisodeEnd(
@@ -313,11 +249,11 @@ class RecordingWriter:
         end_row, final_row = sequences[channels.end], -1
         now = time.time_ns()
         if final_state is None:
-            now = self.events.append(now, (channels.end, message))
+            now = events.append(now, (channels.end, message))
         else:
             final_row = sequences[channels.final_state]
             body = _NUMBERS.pack(number, env) + final_state
-            now = self.events.append(now, (channels.final_state, body), (channels.end, message))
+            now = events.append(now, (channels.final_state, body), (channels.end, message))
         row = (
             first_row, length, total, episode.start_time, now, episode.seed, episode.start_row, end_row, final_row,
             number, env, end,
@@ -438,8 +374,7 @@ class RecordingWriter:
             f"{self.path} is recorded by the process that opened it, not by a forked child; wrap the environment here"
         )
         self.lock.abandon()
-        if self.on_abandon is not None:
-            self.on_abandon()
+        self.on_abandon()
 
 
 class ResetFacts(NamedTuple):

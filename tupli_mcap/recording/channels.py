@@ -1,0 +1,106 @@
+"""Which channels and which journal areas a layout needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.messages.layout import IMAGE_SCHEMA
+from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
+from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.events import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
+from tupli_mcap.recording.journal import Area, LogArea, RowArea
+from tupli_mcap.recording.rows import rows_per_half
+
+__all__ = ["Channels", "plan_areas", "register_channels"]
+
+
+class Channels(NamedTuple):
+    """MCAP channel ids."""
+
+    steps: list[int]
+    images: list[list[int]]  # by image leaf, then by sub-environment
+    final_state: int
+    start: int
+    end: int
+    info: int | None
+
+
+def register_channels(
+    container: Container,
+    name: str,
+    layout: StepLayout,
+    sub_environments: int | None,
+    info: tuple[str, Mapping[str, str]] | None,
+) -> Channels:
+    """Adds the channels a layout needs, or finds them in a recording that is appended to.
+
+    `sub_environments` is None for a single environment; `info` is the schema and the metadata of `/info`.
+
+    Raises:
+        RecordingError: a channel of that topic has another schema.
+    """
+    known = {channel.topic: channel.id for channel in container.channels.values()}
+    schemas = {schema.name: schema.id for schema in container.schemas.values()}
+
+    def channel(topic: str, schema: str, text: str, metadata: Mapping[str, str]) -> int:
+        if topic in known:
+            old = container.schemas[container.channels[known[topic]].schema_id]
+            if old.data != text.encode():
+                raise RecordingError(
+                    f"{name} records {topic} with other fields; choose the same, or another file"
+                )
+            return known[topic]
+        if schema not in schemas:
+            schemas[schema] = container.add_schema(schema, text)
+        return container.add_channel(topic, schemas[schema], metadata)
+
+    description = layout.to_metadata()
+    tops = [""] if sub_environments is None else [f"/env_{i}" for i in range(sub_environments)]
+    steps = [
+        channel(f"{top}/step", STEP_SCHEMA, layout.step_schema, {**description, "env": str(i)})
+        for i, top in enumerate(tops)
+    ]
+    images = [
+        [
+            channel(
+                f"{top}/image/{leaf.name}",
+                "sensor_msgs/msg/Image",
+                IMAGE_SCHEMA,
+                {"env": str(i), "leaf": leaf.name},
+            )
+            for i, top in enumerate(tops)
+        ]
+        for leaf in layout.images
+    ]
+    return Channels(
+        steps,
+        images,
+        channel("/final_state", FINAL_STATE_SCHEMA, layout.final_schema, description),
+        channel("/episode_start", START_NAME, START_SCHEMA, {}),
+        channel("/episode_end", END_NAME, END_SCHEMA, {}),
+        None if info is None else channel("/info", "tupli_mcap/msg/Info", info[0], info[1]),
+    )
+
+
+def plan_areas(layout: StepLayout, n: int, size: int, step_capacity: int, *, infos: bool) -> list[Area]:
+    """The areas of a journal for `n` sub-environments and chunks of `size` bytes.
+
+    `step_capacity` is the least room (bytes) for steps of variable size.
+    """
+    if n > 1:  # one chunk a sub-environment: smaller ones, but never below 64 KiB
+        size = max(64 * 1024, size // n)
+    areas: list[Area] = []
+    if not layout.constant:
+        areas += [LogArea(f"steps/{i}", max(size, step_capacity), 2) for i in range(n)]
+    else:
+        row = layout.step_message.record_size
+        areas.append(RowArea("steps", row, rows_per_half(row, size), n))
+    for leaf in layout.images:
+        row = layout.image_messages[leaf.name].dtype.itemsize
+        areas += [RowArea(f"{leaf.name}/{i}", row, rows_per_half(row, size)) for i in range(n)]
+    areas.append(LogArea("events", 512 * 1024))
+    if infos:
+        areas.append(LogArea("info", size))
+    return areas
