@@ -38,6 +38,8 @@ def _nested_graphs() -> list[AnySpace]:
         return []
 
 
+NESTED_GRAPHS = _nested_graphs()
+
 BOXES: list[AnySpace] = [
     *(Box(0, 100, (3,), dtype) for dtype in (*_INTEGERS, *_FLOATS)),
     *(Box(-5, 5, (), dtype) for dtype in (np.int8, np.int64, *_FLOATS)),
@@ -112,7 +114,7 @@ COMPOSITE_SPACES: list[AnySpace] = [
     Graph(Discrete(5), Box(-1, 1, (1,), np.float64)),
     Graph(Box(-1, 1, (2, 2), np.float16), None),
     Graph(Discrete(3), Discrete(4, start=-2)),
-    *_nested_graphs(),
+    *NESTED_GRAPHS,
     OneOf([Discrete(3), Box(0, 1, (2,))]),
     OneOf([MultiBinary(3), Text(3), Discrete(2), Box(0, 1, (2, 0)), Box(0, 1, ())]),
     OneOf(

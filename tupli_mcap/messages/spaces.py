@@ -195,12 +195,20 @@ def _read_multi_binary(fields: Fields, _: ReadSub) -> gym.Space[Any]:
 
 def _write_text(space: Any, _path: str, _: WriteSub) -> Json:
     # As code points where there are surrogates: two in a row become one other character in JSON.
-    characters = "".join(space.character_list)
+    characters = "".join(_characters(space))
     try:
         characters.encode()
     except UnicodeEncodeError:
         return {**_text_lengths(space), "characters": [ord(character) for character in characters]}
     return {**_text_lengths(space), "characters": characters}
+
+
+def _characters(space: Any) -> list[str]:
+    """Those of a Text, in their order; sorted where that is a set's, as Gymnasium 1.0 leaves it (the default's
+    too): it differs from process to process, and one space would be described in many ways."""
+    listed = list(dict.fromkeys(space.character_list))
+    of_a_set = len(listed) > 8 and listed == list(space.character_set)  # no coincidence
+    return sorted(listed) if of_a_set else listed
 
 
 def _text_lengths(space: Any) -> Json:
