@@ -24,7 +24,7 @@ from tupli_mcap.recording.rows import even_rows
 
 __all__ = ["rewrite_recording"]
 
-_CHUNK = 512 * 1024
+_CHUNK = 256 * 1024
 
 
 def rewrite_recording(

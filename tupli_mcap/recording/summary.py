@@ -57,7 +57,7 @@ class Summary(NamedTuple):
 def check_magic(source: Source) -> None:
     """Raises FormatError unless the file starts as an MCAP file."""
     if source.size == 0:
-        raise FormatError(f"{source.name} is empty; expected an MCAP recording")
+        raise FormatError(f"{source.name} is empty; expected an MCAP recording, so delete it or record again")
     head = source.read(0, min(len(MAGIC), source.size))
     if head != MAGIC:
         raise FormatError(f"{source.name}: expected an MCAP file, found {head!r} at its start")

@@ -51,7 +51,7 @@ class WriterOptions(NamedTuple):
     benchmark_id: str = ""
     attachments: Mapping[str, tuple[str, bytes]] | None = None
     journal_dir: str | os.PathLike[str] | None = None
-    chunk_size: int = 512 * 1024
+    chunk_size: int = 256 * 1024
     flush_seconds: float | None = None
 
 
@@ -103,7 +103,12 @@ class RecordingWriter:
 
             resume(self)
             return
-        os.ftruncate(self.lock.fd, 0)
+        try:
+            os.ftruncate(self.lock.fd, 0)
+        except OSError as err:
+            raise RecordingError(
+                f"{self.path} cannot be recorded to: {err.strerror}; choose a regular file"
+            ) from err
         now = time.time_ns()
         values = {
             "uuid": self.uuid,

@@ -72,7 +72,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         attachments: Mapping[str, tuple[str, bytes]] | None = None,
         flush_seconds: float | None = None,
         journal_dir: str | os.PathLike[str] | None = None,
-        chunk_size: int = 512 * 1024,
+        chunk_size: int = 256 * 1024,
     ) -> None:
         super().__init__(env)
         self.path = Path(path)

@@ -50,7 +50,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         attachments: Mapping[str, tuple[str, bytes]] | None = None,
         flush_seconds: float | None = None,
         journal_dir: str | os.PathLike[str] | None = None,
-        chunk_size: int = 512 * 1024,
+        chunk_size: int = 256 * 1024,
         autoreset_mode: str | None = None,
     ) -> None:
         super().__init__(env)
