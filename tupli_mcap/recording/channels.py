@@ -99,7 +99,8 @@ def plan_areas(layout: StepLayout, n: int, size: int, step_capacity: int, *, inf
         areas.append(RowArea("steps", row, rows_per_half(row, size), n))
     for leaf in layout.images:
         row = layout.image_messages[leaf.name].dtype.itemsize
-        areas += [RowArea(f"{leaf.name}/{i}", row, rows_per_half(row, size)) for i in range(n)]
+        rows = rows_per_half(row, max(size, min(8 * row, 1 << 20)))  # a few images a chunk, within 1 MiB
+        areas += [RowArea(f"{leaf.name}/{i}", row, rows) for i in range(n)]
     areas.append(LogArea("events", 512 * 1024))
     if infos:
         areas.append(LogArea("info", size))
