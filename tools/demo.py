@@ -121,11 +121,12 @@ def main() -> None:
     console.print(f"{len(climbed.preview())} of {len(lab.preview())} episodes got above 0 in position.\n")
     show("CartPole, 8 environments in one file", TupliDataset.from_files(cart_poles))
 
-    console.print("\nTo look at them:")
+    print("\nTo look at them:")
     recording = next(iter(sorted((ROOT / "lab").rglob("*.mcap"))))
     for path in (recording, cart_poles):
-        console.print(f"  .venv/bin/tupli-mcap info {path.relative_to(ROOT.parent)}", highlight=False)
-    console.print("They are ordinary MCAP files: Rerun, Foxglove and ROS tools open them too.")
+        print(f"  .venv/bin/tupli-mcap info {path.relative_to(ROOT.parent)}")
+    print("  .venv/bin/tupli-mcap episodes demo/lab --filter 'metadata.highest > 0'")
+    print("They are ordinary MCAP files: Rerun, Foxglove and ROS tools open them too.")
 
 
 if __name__ == "__main__":
