@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -214,8 +215,11 @@ def test_appending_goes_on_with_every_stream(tmp_path: Path) -> None:
     with RecordEpisodes(make(SPACES["box"], None), path, mode="a") as env:
         more = run(env, None, 20)
     check(path, [a + b for a, b in zip(taken, more, strict=True)])
+    other = SyncVectorEnv([lambda: Sampler(SPACES["box"], SPACES["discrete"])])
     with pytest.raises(SpaceError, match=r"records 3 sub-environment\(s\), found 1"):
-        RecordEpisodes(SyncVectorEnv([lambda: Sampler(SPACES["box"], SPACES["discrete"])]), path, mode="a")
+        RecordEpisodes(other, path, mode="a")
+    gc.collect()
+    assert not other.closed
 
 
 def test_a_batch_that_cannot_be_stored(tmp_path: Path) -> None:
@@ -242,3 +246,12 @@ def test_a_batch_that_cannot_be_stored(tmp_path: Path) -> None:
     assert [len(e) for e in Recording(tmp_path / "r.mcap").episodes] == [1] * 6
     with pytest.raises(RecordingError, match="is closed"):
         env.step([2, 3, 4])
+
+
+def test_the_first_sub_environment_is_in_the_file(tmp_path: Path) -> None:
+    envs = SyncVectorEnv([lambda: gym.make("CartPole-v1", sutton_barto_reward=True)] * 2)
+    with RecordEpisodes(envs, tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step([0, 1])
+    rebuilt = Recording(tmp_path / "r.mcap").benchmark.make_env()
+    assert rebuilt.unwrapped._sutton_barto_reward is True

@@ -22,6 +22,7 @@ from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
 from tupli_mcap.recording.vector import VectorRecorder, info_of
 from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
 
 __all__ = ["RecordEpisodes"]
 
@@ -31,7 +32,8 @@ StepCallback = Callable[[Step], Mapping[str, Any] | None]
 class RecordEpisodes(gym.vector.VectorWrapper):
     """Records every sub-environment of a vector environment (Sync, Async, custom) into the MCAP file `path`.
 
-    Arguments are those of `tupli_mcap.RecordEpisodes`. A metadata callback is copied for each sub-environment.
+    Arguments are those of `tupli_mcap.RecordEpisodes`; the environment in the file is the first sub-environment.
+    A metadata callback is copied for each sub-environment.
     `autoreset_mode` is the environment's own (`env.metadata["autoreset_mode"]`, next-step where it says nothing).
     """
 
@@ -64,6 +66,8 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         wanted = record_info is not False or step_callback is not None
         self._records_info = record_info is not False
         infos = InfoRecorder([] if record_info is False else record_info) if wanted else None
+        if attachments is None:
+            attachments = vector_benchmark_attachments(env)
         spaces = StepLayout(env.single_observation_space, env.single_action_space, reward_space)
         spaces.to_metadata()
         options = WriterOptions(
@@ -162,6 +166,8 @@ class RecordEpisodes(gym.vector.VectorWrapper):
 
     def close(self, **kwargs: Any) -> None:
         """Finishes the recording, then closes the environment. Calling it twice is fine."""
+        if "_finalizer" not in self.__dict__:
+            return  # collected after its constructor raised: Gymnasium 1.0 closes then, and the caller's env too
         try:
             self._finalizer()
         finally:
