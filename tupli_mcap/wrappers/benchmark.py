@@ -11,7 +11,7 @@ from tupli_mcap import trust
 from tupli_mcap.environment import capture
 from tupli_mcap.errors import TupliError
 
-__all__ = ["benchmark_attachments"]
+__all__ = ["benchmark_attachments", "vector_benchmark_attachments"]
 
 _MAX_PICKLE = 16 << 20
 
@@ -33,3 +33,9 @@ def benchmark_attachments(env: gym.Env[Any, Any]) -> dict[str, tuple[str, bytes]
         with contextlib.suppress(TupliError):  # recording goes on where no signature can be kept
             trust.trust(record.digest)
     return attachments
+
+
+def vector_benchmark_attachments(env: gym.vector.VectorEnv[Any, Any, Any]) -> dict[str, tuple[str, bytes]]:
+    """The first sub-environment as attachments; empty where it is in another process or there is none."""
+    envs = getattr(env.unwrapped, "envs", None)
+    return benchmark_attachments(envs[0]) if envs and isinstance(envs[0], gym.Env) else {}
