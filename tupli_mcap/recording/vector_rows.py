@@ -44,11 +44,11 @@ class VectorRows:
         self._channels = list(channels)
         n = len(channels)
         self._rows: Array = np.frombuffer(buffer, message.dtype).reshape(2, n, area.rows + 1)
-        header = np.frombuffer(message.header(0) + bytes(message.body_size), message.dtype)[0]
-        for name in ("#opcode", "#length", "#cdr"):
-            self._rows[name] = header[name]
-        self._rows["#channel"] = np.asarray(channels, dtype=np.uint16)[None, :, None]
-        self._rows["#sequence"] = HOLE
+        headers = b"".join(message.header(channel, HOLE) for channel in channels)
+        heads = np.dtype(
+            {"names": ["head"], "formats": [f"V{BODY}"], "offsets": [0], "itemsize": area.row_size}
+        )
+        self._rows.view(heads)["head"] = np.frombuffer(headers, f"V{BODY}")[None, :, None]
         self._derivers = list(derivers) if derivers else [RowDeriver() for _ in channels]
         self.counts = counts  # rows of each channel so far
         self._half = 0
@@ -145,11 +145,12 @@ class VectorRows:
     def _emit(self, half: int, begin: int, end: int) -> None:
         if begin == end:
             return
+        kept = self._sequence[half, :, begin:end] != HOLE
+        whole = kept.all(axis=1)
         for i, channel in enumerate(self._channels):
             rows = self._rows[half, i, begin:end]
-            kept = rows["#sequence"] != HOLE
-            if not kept.all():
-                rows = rows[kept]
+            if not whole[i]:
+                rows = rows[kept[i]]
             if len(rows):
                 self._derivers[i].fill(rows)
                 data = np.ascontiguousarray(rows).view(np.uint8)
