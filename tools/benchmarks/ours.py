@@ -109,9 +109,8 @@ def check_vector(
 
 def window(recording: Any, episode: int, start: int, length: int) -> tuple[NDArray[Any], ...]:
     """`length` steps of an episode, all five columns."""
-    e = recording.episodes[episode]
-    rows = slice(start, start + length)
-    return e.states[rows], e.actions[rows], e.rewards[rows], e.terminals[rows], e.timeouts[rows]
+    found = recording.episodes[episode][start : start + length]
+    return found.states, found.actions, found.rewards, found.terminals, found.timeouts
 
 
 def list_episodes(path: Path) -> list[tuple[int, int, float, str]]:

@@ -204,7 +204,7 @@ class _WarmWindows:
         self._recording = Recording(path)
         self._reference = reference
         for episode in range(len(self._recording.episodes)):
-            ours.window(self._recording, episode, 0, WINDOW)
+            ours.window(self._recording, episode, 0, len(self._recording.episodes[episode]))
 
     def __call__(self) -> float:
         watch = Stopwatch()

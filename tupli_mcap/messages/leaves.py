@@ -6,6 +6,7 @@ MultiDiscrete, MultiBinary), an image, or a value of variable size (Text, Sequen
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -69,7 +70,7 @@ class Leaf:
     @property
     def size(self) -> int:
         """Number of elements of one value."""
-        return int(np.prod(self.shape, dtype=np.int64))
+        return math.prod(self.shape)
 
     @property
     def is_scalar(self) -> bool:
