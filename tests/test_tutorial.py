@@ -172,6 +172,22 @@ def assert_aligned(tutorial: ModuleType, env: TupliEnvWrapper, dataset: TupliDat
         assert state.tobytes() == dataset.next_states[t].tobytes()
 
 
+def test_actions_that_are_kept_for_a_while_reach_the_flag(
+    tutorial: ModuleType, storage: FileStorage, env: TupliEnvWrapper
+) -> None:
+    tutorial.record_random_steps(env, steps=600, hold=30)
+    env.close()
+    dataset = dataset_of(storage, env)
+    ends = [header.end for header in dataset.preview()]
+    assert ends == ["terminal", "terminal", "interrupted"]
+    states, actions, _, terminals, timeouts = dataset.convert_to_numpy()
+    last = np.flatnonzero(terminals)
+    assert (states[last, 0] < 0.5).all()  # the states on which the last actions were chosen
+    assert (dataset.next_states[last, 0] >= 0.5).all()
+    assert np.flatnonzero(timeouts).tolist() == [599]  # where the interrupted one was cut
+    assert not np.any(actions.reshape(20, 30) != actions[::30, np.newaxis])
+
+
 def test_deleting_leaves_nothing_behind(
     tutorial: ModuleType, storage: FileStorage, env: TupliEnvWrapper
 ) -> None:
@@ -218,6 +234,7 @@ def test_d3rlpy_sees_the_episodes(tutorial: ModuleType, storage: FileStorage, en
     assert [len(episode) for episode in made.episodes] == [999, 999]
     assert [episode.terminated for episode in made.episodes] == [False, False]
     assert made.dataset_info.action_size == 3
+    tutorial.make_algorithm().build_with_env(env)
     transitions = made.transition_picker
     for t in (0, 500, 997):
         transition = transitions(made.episodes[1], t)

@@ -124,12 +124,13 @@ def list_benchmarks(directory: Path) -> None:
 # --- recording ---
 
 
-def record_random_steps(env: gym.Env, steps: int = RANDOM_STEPS, seed: int = 42) -> None:
-    """A random policy's steps; the environment records them by itself."""
+def record_random_steps(env: gym.Env, steps: int = RANDOM_STEPS, hold: int = 1, seed: int = 42) -> None:
+    """A random policy's steps, each action kept for `hold` of them; the environment records them by itself."""
     np.random.seed(seed)
     env.reset(seed=seed)
     for step in range(steps):
-        action = np.int64(np.random.randint(low=0, high=3))
+        if step % hold == 0:
+            action = np.int64(np.random.randint(low=0, high=3))
         _, _, done, truncated, _ = env.step(action)
         if done or truncated:
             print(f"Episode finished after {step + 1} timesteps")
@@ -156,18 +157,36 @@ def make_d3rlpy_dataset(dataset: TupliDataset) -> Any:
     )
 
 
+def make_algorithm() -> Any:
+    """Discrete CQL. A value travels back by one step at each update of the target, and the flag is some 150
+    steps away: hence many updates. Speeds are a twentieth of positions: hence the scaler."""
+    from d3rlpy.algos import DiscreteCQLConfig
+    from d3rlpy.models import VectorEncoderFactory
+    from d3rlpy.preprocessing import StandardObservationScaler
+
+    config = DiscreteCQLConfig(
+        batch_size=64,
+        alpha=0.1,
+        learning_rate=5e-4,
+        target_update_interval=50,
+        encoder_factory=VectorEncoderFactory([64, 64]),
+        observation_scaler=StandardObservationScaler(),
+    )
+    return config.create(device="cpu")
+
+
 def train(d3rlpy_dataset: Any, steps: int, seed: int = 1) -> Any:
-    """Fit discrete CQL with `steps` gradient steps; returns the algorithm."""
+    """Fit an algorithm with `steps` gradient steps; returns it."""
     import d3rlpy
 
     d3rlpy.seed(seed)
-    config = d3rlpy.algos.DiscreteCQLConfig(batch_size=64, alpha=2.0, target_update_interval=1000)
-    algo = config.create(device="cpu")
+    algo = make_algorithm()
     algo.fit(
         d3rlpy_dataset,
         n_steps=steps,
-        n_steps_per_epoch=min(steps, 1000),
+        n_steps_per_epoch=max(1, steps // 10),
         logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+        show_progress=False,
     )
     return algo
 
@@ -175,26 +194,23 @@ def train(d3rlpy_dataset: Any, steps: int, seed: int = 1) -> Any:
 def store_policy(storage: TupliStorage, algo: Any, benchmark_id: str) -> str:
     """Store the trained policy as an artifact that is linked to the benchmark; returns its id."""
     with tempfile.TemporaryDirectory() as directory:
-        path = Path(directory, "policy.pt")
-        algo.save_model(str(path))
+        path = Path(directory, "policy.d3")
+        algo.save(str(path))
         metadata = ArtifactMetadata(
             name="trained_cql_policy", description="Discrete CQL, trained offline", benchmark_id=benchmark_id
         )
         return storage.store_artifact(artifact=path.read_bytes(), metadata=metadata).id
 
 
-def load_policy(storage: TupliStorage, benchmark_id: str, env: gym.Env) -> Any:
-    """The policy that is linked to a benchmark."""
-    from d3rlpy.algos import DiscreteCQLConfig
+def load_policy(storage: TupliStorage, benchmark_id: str) -> Any:
+    """The policy that is linked to a benchmark. Loading one is running code: only do it with your own."""
+    import d3rlpy
 
-    found = storage.list_artifacts(filter=FilterEQ(key="benchmark_id", value=benchmark_id))
-    algo = DiscreteCQLConfig().create(device="cpu")
-    algo.build_with_env(env)
+    (found,) = storage.list_artifacts(filter=FilterEQ(key="benchmark_id", value=benchmark_id))
     with tempfile.TemporaryDirectory() as directory:
-        path = Path(directory, "policy.pt")
-        path.write_bytes(storage.load_artifact(found[0].id))
-        algo.load_model(str(path))
-    return algo
+        path = Path(directory, "policy.d3")
+        path.write_bytes(storage.load_artifact(found.id))
+        return d3rlpy.load_learnable(str(path), device="cpu")
 
 
 def play(algo: Any, env: gym.Env, episodes: int = 10) -> list[int | None]:
@@ -216,13 +232,20 @@ def play(algo: Any, env: gym.Env, episodes: int = 10) -> list[int | None]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--steps", type=int, default=10_000, help="gradient steps (default: %(default)s)")
-    steps = parser.parse_args().steps
+    parser.add_argument("--steps", type=int, default=20_000, help="gradient steps (default: %(default)s)")
+    parser.add_argument(
+        "--hold",
+        type=int,
+        default=30,
+        help="steps that the random policy keeps an action for (default: %(default)s). With 1, as in PyTupli's "
+        "introduction, no episode gets near the flag, and what can be learned from them is luck",
+    )
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
-        follow(Path(directory), steps)
+        follow(Path(directory), arguments.steps, arguments.hold)
 
 
-def follow(directory: Path, steps: int) -> None:
+def follow(directory: Path, steps: int, hold: int = 1) -> None:
     """Everything in order, in a storage that is made below `directory` and is empty again at the end."""
     write_wind(directory / "wind.csv")
     storage = FileStorage(directory / "storage")
@@ -231,11 +254,11 @@ def follow(directory: Path, steps: int) -> None:
     list_benchmarks(storage.root)
 
     env = MyTupliEnvWrapper.load(storage=storage, benchmark_id=benchmark_id, metadata_callback=MyCallback())
-    record_random_steps(env)
+    record_random_steps(env, hold=hold)
 
     dataset = TupliDataset(storage=storage).with_benchmark_filter(FilterEQ(key="id", value=env.id))
     for header in dataset.preview():
-        print(header.episode, header.n_tuples, header.end, header.metadata)
+        print(f"{header.n_tuples} steps, {header.end}, {header.metadata}")
     dataset.load()
     print(dataset)
 
@@ -245,7 +268,7 @@ def follow(directory: Path, steps: int) -> None:
     policy_id = store_policy(storage, algo, env.id)
 
     env.deactivate_recording()
-    results = play(load_policy(storage, env.id, env), env)
+    results = play(load_policy(storage, env.id), env)
     reached = [result for result in results if result is not None]
     print(f"The policy reached the flag in {len(reached)} of {len(results)} episodes; steps: {results}")
     env.close()
