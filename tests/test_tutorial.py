@@ -244,7 +244,6 @@ def test_d3rlpy_sees_the_episodes(tutorial: ModuleType, storage: FileStorage, en
 
 
 @pytest.mark.d3rlpy
-@pytest.mark.filterwarnings("ignore")  # what d3rlpy imports, gym for one, is of another time
 def test_a_policy_is_trained_stored_and_played(
     tutorial: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
