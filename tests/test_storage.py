@@ -161,6 +161,37 @@ class StorageContract:
         ):
             storage.store_benchmark(told)
 
+    def test_metadata_json_has_no_form_for_comes_back(self, storage: TupliStorage) -> None:
+        odd = {"inf": np.inf, "set": {1, 2}, "bytes": b"x", "text": "\udc80", "tag": {"$float": "nan"}}
+        told = query()
+        told.metadata.extra.update(odd, nan=np.nan)
+        found_hash = benchmark_hash(unpack(told.serialized), told.metadata)
+        header = storage.store_benchmark(told.model_copy(update={"hash": found_hash}))
+        storage.publish_benchmark(header.id, "lab")
+        found = storage.load_benchmark(header.id).metadata.extra
+        assert {name: found[name] for name in odd} == odd
+        assert np.isnan(found["nan"])
+        assert len(storage.list_benchmarks(F("metadata.extra.inf") > 0)) == 1
+        item = storage.store_artifact(b"abc", ArtifactMetadata(name="x", extra=dict(odd)))
+        assert item.extra == odd
+        storage.publish_artifact(item.id, "lab")
+        assert storage.list_artifacts()[0].extra == odd
+
+    @pytest.mark.parametrize("group", [None, 3, "", "a\0b"])
+    def test_a_group_has_a_name(self, storage: TupliStorage, group: Any) -> None:
+        header = storage.store_benchmark(query())
+        item = storage.store_artifact(b"abc", ArtifactMetadata(name="x"))
+        made = storage.record_episode(episode(header.id))
+        for publish, uri in (
+            (storage.publish_benchmark, header.id),
+            (storage.publish_artifact, item.id),
+            (storage.publish_episode, made.id),
+        ):
+            with pytest.raises(StorageError, match="expected the name of a group to publish in, found"):
+                publish(uri, group)
+        assert storage.list_episodes() == [made]
+        assert storage.list_benchmarks() == [header]
+
     # --- artifacts ---
 
     def test_artifact_round_trip(self, storage: TupliStorage) -> None:

@@ -25,6 +25,7 @@ from tupli_mcap.schema import (
     compile_predicate,
 )
 from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage.document import restored
 from tupli_mcap.storage.sidecar import Sidecar
 
 __all__ = ["DatasetError", "FilesSource", "Source", "StorageSource"]
@@ -212,8 +213,8 @@ def _benchmark_header(recording: Recording) -> BenchmarkHeader:
         metadata = BenchmarkMetadata(name=record.name)
         told = (record.benchmark or {}).get("metadata")
         if isinstance(told, dict):
-            with contextlib.suppress(ValidationError):  # somebody else's words
-                metadata = BenchmarkMetadata.model_validate(told)
+            with contextlib.suppress(ValidationError, FormatError):  # somebody else's words
+                metadata = BenchmarkMetadata.model_validate(restored(told))
     return BenchmarkHeader(
         id=recording.benchmark_id,
         created_by="",

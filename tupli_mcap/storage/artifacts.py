@@ -9,10 +9,11 @@ from pydantic import ValidationError
 
 from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError
+from tupli_mcap.messages.jsonvalue import loads
 from tupli_mcap.schema import ArtifactMetadata, ArtifactMetadataItem, BaseFilter, compile_predicate
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
 from tupli_mcap.storage.common import LOCAL_USER, first_defect, is_hash, published_in, to_json
-from tupli_mcap.storage.document import plain
+from tupli_mcap.storage.document import plain, restored
 
 __all__ = ["ArtifactFiles"]
 
@@ -34,7 +35,7 @@ class ArtifactFiles:
             if sidecar.exists() and (self._directory / uri).exists():
                 return self._read(sidecar)
             item = ArtifactMetadataItem.create_new(
-                **{**plain(metadata), "id": uri, "hash": uri, "created_by": LOCAL_USER}
+                **{**restored(plain(metadata)), "id": uri, "hash": uri, "created_by": LOCAL_USER}
             )
             # The bytes first: a crash in between leaves bytes that nothing names.
             write_bytes(self._directory / uri, data)
@@ -94,7 +95,9 @@ class ArtifactFiles:
         with os_errors("cannot read the artifact", sidecar):
             text = sidecar.read_bytes()
         try:
-            item = ArtifactMetadataItem.model_validate_json(text)
+            item = ArtifactMetadataItem.model_validate(loads(text))
+        except FormatError as err:
+            raise FormatError(f"{sidecar}: {err}") from err
         except ValidationError as err:
             raise FormatError(f"{sidecar}: expected an artifact's metadata: {first_defect(err)}") from err
         if item.id != sidecar.stem:

@@ -15,7 +15,7 @@ from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
 from tupli_mcap.storage.common import LOCAL_USER, first_defect, is_hash, published_in, to_json
-from tupli_mcap.storage.document import artifacts_of, benchmark_hash, pack, plain, unpack
+from tupli_mcap.storage.document import artifacts_of, benchmark_hash, pack, plain, restored, unpack
 
 __all__ = ["BenchmarkFiles"]
 
@@ -28,7 +28,7 @@ class BenchmarkFiles:
         self._lock = lock
 
     def store(self, query: BenchmarkQuery, *, created_by: str = LOCAL_USER) -> BenchmarkHeader:
-        metadata = plain(query.metadata)
+        metadata = restored(plain(query.metadata))
         uri, document, pickle = _document(query)
         path = self._path(uri)
         with self._lock, os_errors("cannot store the benchmark", path):
@@ -118,7 +118,9 @@ class BenchmarkFiles:
 
     def _header(self, uri: str, document: dict[str, Any]) -> BenchmarkHeader:
         try:
-            header = BenchmarkHeader.model_validate(document.get("benchmark"))
+            header = BenchmarkHeader.model_validate(restored(document.get("benchmark")))
+        except FormatError as err:
+            raise FormatError(f"{self._path(uri)}: expected a benchmark: {err}") from err
         except ValidationError as err:
             raise FormatError(f"{self._path(uri)}: expected a benchmark: {first_defect(err)}") from err
         if header.id != uri:

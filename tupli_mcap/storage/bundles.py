@@ -34,6 +34,7 @@ from tupli_mcap.storage.document import (
     declared_spaces,
     pack,
     plain,
+    restored,
     unpack,
 )
 from tupli_mcap.storage.recordings import episode_id
@@ -298,7 +299,7 @@ def _header(record: EnvironmentRecord, path: Path) -> BenchmarkHeader:
             "copy the file into the storage's directory, where its episodes are found"
         )
     try:
-        return BenchmarkHeader.model_validate(record.benchmark)
+        return BenchmarkHeader.model_validate(restored(record.benchmark))
     except ValidationError as err:
         raise FormatError(f"{path}: {DOCUMENT_NAME}: {first_defect(err)}") from err
 
@@ -319,7 +320,7 @@ def _read_artifacts(
         if sha256(data) != uri:
             raise FormatError(f"{path}: expected artifact {uri}, found bytes with SHA-256 {sha256(data)}")
         try:
-            found.append((data, ArtifactMetadata.model_validate(facts.get(uri, {"name": uri}))))
+            found.append((data, ArtifactMetadata.model_validate(restored(facts.get(uri, {"name": uri})))))
         except ValidationError as err:
             raise FormatError(f"{path}: artifact {uri}: {first_defect(err)}") from err
     return found

@@ -8,6 +8,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from tupli_mcap.errors import StorageError
+
 __all__ = ["LOCAL_USER", "first_defect", "is_hash", "published_in", "to_json"]
 
 LOCAL_USER = "local_storage"
@@ -20,7 +22,13 @@ def is_hash(value: object) -> bool:
 
 
 def published_in(groups: Sequence[str], group: str) -> list[str]:
-    """The groups that see an item, and one more."""
+    """The groups that see an item, and one more.
+
+    Raises:
+        StorageError: That is no name of a group.
+    """
+    if not isinstance(group, str) or not group or not group.isprintable():
+        raise StorageError(f"expected the name of a group to publish in, found {group!r:.80}")
     return [*groups, *([] if group in groups else [group])]
 
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
 from tupli_mcap.errors import FormatError, SpaceError, StorageError
-from tupli_mcap.messages.jsonvalue import dumps_plain
+from tupli_mcap.messages.jsonvalue import dumps_plain, loads
 from tupli_mcap.messages.spaces import space_from_json, space_to_json
 from tupli_mcap.schema import BenchmarkMetadata
 from tupli_mcap.storage.common import is_hash
@@ -26,6 +26,7 @@ __all__ = [
     "pack",
     "plain",
     "recording_attachments",
+    "restored",
     "unpack",
 ]
 
@@ -52,6 +53,15 @@ def plain(model: BaseModel) -> dict[str, Any]:
     except (TypeError, ValueError) as err:
         raise StorageError(f"{type(model).__name__}: expected values that JSON can hold: {err}") from err
     return value
+
+
+def restored(value: Any) -> Any:
+    """What `plain` was given, from JSON read back: `{"$float": "nan"}` is NaN again.
+
+    Raises:
+        FormatError: It is nothing that `plain` made.
+    """
+    return loads(json.dumps(value))
 
 
 def benchmark_hash(content: BenchmarkContent, metadata: BenchmarkMetadata) -> str:
