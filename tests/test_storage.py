@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import textwrap
@@ -20,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from tupli_mcap.environment import capture
 from tupli_mcap.errors import (
@@ -42,7 +44,7 @@ from tupli_mcap.schema import (
     FilterIN,
     RLTuple,
 )
-from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, recordings
+from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, database, recordings
 from tupli_mcap.storage.catalog import Catalog
 from tupli_mcap.storage.document import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
 from tupli_mcap.storage.handmade import conform, infer_space
@@ -525,6 +527,33 @@ class TestFileStorage(StorageContract):
         assert storage.list_benchmarks() == [header]
         assert storage.list_artifacts() == []
         assert [p.name for p in storage.root.rglob(".*")] == [".lock"]  # no temporary file is left
+
+    @pytest.mark.parametrize("code", [sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, None])
+    def test_a_catalog_that_cannot_be_written_is_replaced(
+        self, storage: FileStorage, monkeypatch: pytest.MonkeyPatch, code: int | None
+    ) -> None:
+        header = storage.store_benchmark(query())
+        made = [storage.record_episode(episode(header.id)).id for _ in range(2)]
+        storage.close()
+        (storage.root / "catalog.sqlite").unlink()
+        if code is None:
+            (storage.root / "catalog.sqlite").mkdir()
+        put_recording = Catalog.put_recording
+
+        def refuse(self: Catalog, *args: Any, **facts: Any) -> None:
+            put_recording(self, *args, **facts)
+            if code is not None and self.path.parent == storage.root:
+                err = sqlite3.OperationalError("database or disk is full")
+                err.sqlite_errorcode = code
+                with database._translated(self.path):
+                    raise OperationalError("INSERT", None, err)
+
+        monkeypatch.setattr(Catalog, "put_recording", refuse)
+        with FileStorage(storage.root) as other:
+            with pytest.warns(UserWarning, match="cannot be used: .*; the episodes are listed with a temp"):
+                assert sorted(h.id for h in other.list_episodes()) == sorted(made)
+            other.delete_episode(made[0])
+            assert [h.id for h in other.list_episodes()] == made[1:]
 
     def test_a_storage_that_can_only_be_read(
         self, storage: FileStorage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

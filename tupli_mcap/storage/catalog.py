@@ -15,7 +15,7 @@ from sqlalchemy import Connection, Select, delete, func, insert, select
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, split_key
-from tupli_mcap.storage.database import CatalogDamagedError, Database
+from tupli_mcap.storage.database import CatalogDamagedError, CatalogUnusableError, Database
 from tupli_mcap.storage.rows import (
     EpisodeRow,
     RecordingStamp,
@@ -38,7 +38,7 @@ from tupli_mcap.storage.tables import (
     of_one_recording,
 )
 
-__all__ = ["Catalog", "CatalogDamagedError", "EpisodeRow", "RecordingStamp"]
+__all__ = ["Catalog", "CatalogDamagedError", "CatalogUnusableError", "EpisodeRow", "RecordingStamp"]
 
 _ROWS_AT_ONCE: Final = 20_000
 _OWN_COLUMNS: Final = ("n_tuples", "env", "end", "episode_return", "seed", "created_at", "created_by")

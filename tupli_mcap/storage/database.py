@@ -7,7 +7,7 @@ import fcntl
 import os
 import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -21,12 +21,23 @@ from tupli_mcap.storage.tables import APPLICATION_ID, METADATA, VERSION
 
 _BUSY_MS: Final = 30_000
 _CACHE_KIB: Final = 32 * 1024  # rows come in no order of a declared key: its index has to stay in memory
+_UNUSABLE: Final = (
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_PERM,
+)
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _TOO_LARGE: Final = ("too many SQL variables", "Expression tree is too large", "parser stack overflow")
 
 
 class CatalogDamagedError(StorageError):
     """The catalog's file is damaged; `Catalog.reset` makes an empty one, to be filled from the recordings."""
+
+
+class CatalogUnusableError(StorageError):
+    """The system does not let the catalog be written: the disk is full, the file is another user's, ..."""
 
 
 class Database:
@@ -95,7 +106,7 @@ class Database:
         try:
             self._open_or_create()
         except OSError as err:
-            raise StorageError(f"catalog {str(self.path)!r} cannot be used: {err}") from err
+            raise CatalogUnusableError(f"catalog {str(self.path)!r} cannot be used: {err}") from err
 
     def _open_or_create(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -202,11 +213,16 @@ def _translated(path: Path) -> Iterator[None]:
             ) from err
         if any(reason in str(err.orig) for reason in _TOO_LARGE):
             raise FilterError(f"the filter has too many values or parts for SQLite ({err.orig})") from err
-        raise StorageError(f"catalog {str(path)!r} cannot be used: {err.orig}") from err
+        kind = CatalogUnusableError if _has_code(err, _UNUSABLE) else StorageError
+        raise kind(f"catalog {str(path)!r} cannot be used: {err.orig}") from err
     except SQLAlchemyError as err:
         raise StorageError(f"catalog {str(path)!r} cannot be used: {err}") from err
 
 
 def _is_damage(err: DBAPIError) -> bool:
+    return _has_code(err, _DAMAGED)
+
+
+def _has_code(err: DBAPIError, codes: Sequence[int]) -> bool:
     code = getattr(err.orig, "sqlite_errorcode", None)
-    return code is not None and code & 0xFF in _DAMAGED
+    return code is not None and code & 0xFF in codes

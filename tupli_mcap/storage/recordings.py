@@ -16,7 +16,7 @@ from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.recording.lock import FileLock, is_locked
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
-from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, RecordingStamp
+from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, CatalogUnusableError, RecordingStamp
 from tupli_mcap.storage.common import LOCAL_USER, published_in
 from tupli_mcap.storage.entries import catalog_rows
 from tupli_mcap.storage.scan import scan, stamp_of
@@ -124,12 +124,23 @@ class RecordingFiles:
         if self._opened is None:
             try:
                 self._opened = Catalog(self._root / "catalog.sqlite")
-            except StorageError:
-                if os.access(self._root, os.W_OK):
-                    raise
-                self._opened = Catalog(None)  # a storage that can only be read
-            self._declare_all(self._opened)
+                self._declare_all(self._opened)
+            except StorageError as err:
+                self.close()
+                if os.access(self._root, os.W_OK):  # else a storage that can only be read, as it should be
+                    if not isinstance(err, CatalogUnusableError):
+                        raise
+                    _warn_of_temporary(err)
+                self._opened = Catalog(None)
+                self._declare_all(self._opened)
         return self._opened
+
+    def _use_temporary(self, err: CatalogUnusableError) -> None:
+        """Go on with a catalog that lies elsewhere: what is recorded can be read even on a full disk."""
+        _warn_of_temporary(err)
+        self.close()
+        self._opened = Catalog(None)
+        self._declare_all(self._opened)
 
     def _declare_all(self, catalog: Catalog) -> None:
         for key in self._declared_keys:
@@ -138,10 +149,14 @@ class RecordingFiles:
     def sync(self) -> None:
         """Bring the catalog up to date with the files."""
         try:
-            self._sync()
-        except CatalogDamagedError:
-            self._catalog.reset()
-            self._declare_all(self._catalog)
+            try:
+                self._sync()
+            except CatalogDamagedError:
+                self._catalog.reset()
+                self._declare_all(self._catalog)
+                self._sync()
+        except CatalogUnusableError as err:
+            self._use_temporary(err)
             self._sync()
 
     def reindex(self) -> None:
@@ -165,7 +180,12 @@ class RecordingFiles:
                 f"expected a recording below {str(self._root)!r}, found {str(path)!r}"
             ) from err
         with self._lock:
-            if not self._put(relative, path, stamp_of(path)) and not is_locked(path):
+            try:
+                held = self._put(relative, path, stamp_of(path))
+            except CatalogUnusableError as err:
+                self._use_temporary(err)
+                held = self._put(relative, path, stamp_of(path))
+            if not held and not is_locked(path):
                 self._remove(relative, path)
 
     def _sync(self) -> None:
@@ -310,6 +330,10 @@ class RecordingFiles:
         Sidecar(published_in=groups).write(path)
         self.ingest(path)
         return before - path.stat().st_size
+
+
+def _warn_of_temporary(err: CatalogUnusableError) -> None:
+    warnings.warn(f"{err}; the episodes are listed with a temporary one, made anew", stacklevel=6)
 
 
 def episode_id(uuid: str, episode: int) -> str:
