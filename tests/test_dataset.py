@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
 import threading
 import tracemalloc
@@ -305,6 +306,15 @@ def test_a_function_sees_an_rltuple(cart: tuple[TupliDataset, Taken]) -> None:
     assert all(same(item.state, step[0]) for item, step in zip(seen, taken, strict=True))
     assert {type(item.reward) for item in seen} == {float}
     assert {type(item.terminal) for item in seen} == {bool}
+
+
+def test_a_pickled_dataset_reads_the_same(cart: tuple[TupliDataset, Taken]) -> None:
+    dataset, _ = cart
+    left = dataset.with_tuple_filter(filter_fcn=F("action") == 0)
+    left.load()
+    copy = pickle.loads(pickle.dumps(left))
+    assert len(copy) == len(left)
+    assert np.array_equal(copy.observations, left.observations)
 
 
 def test_episode_filters_and_their_replacement(cart: tuple[TupliDataset, Taken]) -> None:

@@ -454,6 +454,14 @@ class TestConstruction:
             (lambda: nested(33), "nest at most 32 deep"),
             (lambda: bool(F("a") == 1), "no truth value"),
             (lambda: 1 < F("a") < 3, "no truth value"),
+            (lambda: F("a") and F("b") > 1, 'F\\("a"\\) has no truth value: compare it'),
+            (lambda: F("a") > 1 & F("b") < 3, r"needs parentheses: \(F\('a'\) > 1\) & \(F\('b'\) < 3\)"),
+            (lambda: F("a") | (F("b") > 1), "is compared with nothing"),
+            (lambda: ~F("a") == 1, "needs parentheses"),
+            (lambda: F(3), "expected the name of a key, such as 'metadata.score', found 3"),  # type: ignore[arg-type]
+            (lambda: F("a").isin("abc"), "isin on 'a' takes a list of values, found 'abc'"),
+            (lambda: F("a").isin(3), "isin on 'a' takes a list of values, found 3"),  # type: ignore[arg-type]
+            (lambda: compile_predicate(F("id"), EpisodeHeader), r'expected a filter, .*, found F\("id"\)'),  # type: ignore[arg-type]
         ],
     )
     def test_what_has_no_meaning_is_refused(self, make: Any, message: str) -> None:

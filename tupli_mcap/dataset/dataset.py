@@ -108,18 +108,18 @@ class TupliDataset:
         """
         return self._with(episode_filter=filter)
 
-    def with_tuple_filter(self, filter: TupleFilter | None) -> Self:
+    def with_tuple_filter(self, filter_fcn: TupleFilter | None) -> Self:
         """The dataset of steps a filter is true of, in place of any such filter.
 
         Args:
-            filter: an expression over state, action, reward, terminal, timeout, info, next_state and step
+            filter_fcn: an expression over state, action, reward, terminal, timeout, info, next_state and step
                 (counted from 0 in each episode), such as `F("state.0") > 1`, which is evaluated on whole
                 columns; or a function of one `RLTuple` that returns True or False, called for every step.
 
         Raises:
             FilterError: it is neither, or names an unknown field.
         """
-        return self._with(tuple_filter=filter)
+        return self._with(tuple_filter=filter_fcn)
 
     def _with(self, **filters: Any) -> Self:
         made = type(self).__new__(type(self))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from typing import NoReturn
 
+from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.filters import (
     FilterEQ,
     FilterGEQ,
@@ -28,6 +30,11 @@ class F:
     key: str
 
     def __init__(self, *segments: str) -> None:
+        for segment in segments:
+            if not isinstance(segment, str):
+                raise FilterError(
+                    f"expected the name of a key, such as 'metadata.score', found {segment!r:.80}"
+                )
         self.key = segments[0] if len(segments) == 1 else join_key(segments)
         split_key(self.key)
 
@@ -51,7 +58,25 @@ class F:
 
     def isin(self, values: Iterable[object]) -> FilterIN:
         """True where the key's value equals one of `values`."""
+        if isinstance(values, str) or not isinstance(values, Iterable):
+            raise FilterError(f"isin on {self.key!r} takes a list of values, found {values!r:.80}")
         return FilterIN(key=self.key, value=list(values))
+
+    def __and__(self, other: object) -> NoReturn:
+        """`F("a") > 1 & F("b") < 3` binds `1 & F("b")` first."""
+        raise FilterError(
+            f"{self!r} is compared with nothing, or its comparison needs parentheses: (F('a') > 1) & (F('b') < 3)"
+        )
+
+    __rand__ = __or__ = __ror__ = __and__
+
+    def __invert__(self) -> NoReturn:
+        raise FilterError(
+            f"{self!r} is compared with nothing, or its comparison needs parentheses: ~(F('a') > 1)"
+        )
+
+    def __bool__(self) -> bool:
+        raise FilterError(f"{self!r} has no truth value: compare it, {self!r} == True")
 
     __hash__ = None  # type: ignore[assignment]
 

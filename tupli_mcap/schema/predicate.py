@@ -28,7 +28,11 @@ def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
 
 
 def check_keys(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> None:
-    """Raises FilterError if the filter names a top-level key that is not among `fields`."""
+    """Raises FilterError if it is no filter, or names a top-level key that is not among `fields`."""
+    if not isinstance(filter, BaseFilter):
+        raise FilterError(
+            f"expected a filter, such as FilterEQ(key=..., value=...) or F(...) > 3, found {filter!r:.80}"
+        )
     known = filter_keys(fields)
     for comparison in comparisons(filter):
         if path_of(comparison)[0] not in known:
