@@ -221,6 +221,26 @@ def test_delete_keeps_what_others_need(storage: FileStorage) -> None:
     assert WindyWrapper.load(storage, other).unwrapped.data is not None  # type: ignore[attr-defined]
 
 
+def test_delete_where_an_artifact_is_gone_already(storage: FileStorage) -> None:
+    env = WindyWrapper(windy(), storage)
+    env.store(name="one")
+    storage.delete_artifact(storage.list_artifacts()[0].id, force=True)
+    done = env.delete(delete_artifacts=True)
+    assert (done.artifacts, dict(done.kept), storage.list_benchmarks()) == ((), {}, [])
+
+
+def test_pytupli_s_keywords(storage: FileStorage) -> None:
+    env = WindyWrapper(
+        env=windy(), storage=storage, benchmark_id=None, metadata_callback=None, rl_tuple_cls=RLTuple
+    )
+    env.store(name="a", description="b", difficulty="c", version="d", metadata={"e": 1})
+    text = env.serialize_env(env=env.env)
+    made = WindyWrapper.deserialize_env(serialized_env=text, storage=storage)
+    assert made.unwrapped.data.shape == (50,)  # type: ignore[attr-defined]
+    with pytest.raises(StorageError, match="expected metadata with names as keys: extra"):
+        env.store(name="a", metadata={1: 2})  # type: ignore[dict-item]
+
+
 def test_delete_can_leave_episodes_and_artifacts(storage: FileStorage) -> None:
     env = WindyWrapper(windy(), storage)
     benchmark = env.store(name="windy")

@@ -271,6 +271,19 @@ class StorageContract:
         with pytest.raises(FilterError, match="unknown filter key 'score'"):
             storage.list_episodes(FilterEQ(key="score", value=1))
 
+    @pytest.mark.parametrize("number", [-1, 2.0, True, "2", 1 << 63])
+    def test_pages_are_counted_from_zero(self, storage: TupliStorage, number: Any) -> None:
+        with pytest.raises(StorageError, match="expected limit to be an integer from 0, found"):
+            storage.list_episodes(limit=number)
+        with pytest.raises(StorageError, match="expected offset to be an integer from 0, found"):
+            storage.list_episodes(offset=number)
+
+    @pytest.mark.parametrize("filter", ["metadata.score > 3", {"key": "id"}, True, F("id"), lambda h: True])
+    def test_what_is_no_filter(self, storage: TupliStorage, filter: Any) -> None:
+        for ask in (storage.list_episodes, storage.list_benchmarks, storage.delete_episodes):
+            with pytest.raises(FilterError, match="expected a filter, such as FilterEQ"):
+                ask(filter)
+
     def test_delete_episodes(self, storage: TupliStorage) -> None:
         benchmark = storage.store_benchmark(query()).id
         headers = storage.record_episodes([episode(benchmark, score=float(i)) for i in range(5)])
@@ -295,6 +308,20 @@ class StorageContract:
         benchmark = storage.store_benchmark(query()).id
         with pytest.raises(StorageError, match="at least one tuple"):
             storage.record_episode(Episode(benchmark_id=benchmark, metadata={}, tuples=[]))
+
+    def test_what_cannot_be_recorded_leaves_nothing(self, storage: TupliStorage) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        for reward in (None, "much"):
+            made = Episode(
+                benchmark_id=benchmark, metadata={}, tuples=[RLTuple(state=1, action=1, reward=reward)]
+            )
+            with pytest.raises(SpaceError, match="reward: expected a number, or an array of them, found"):
+                storage.record_episode(made)
+        made = episode(benchmark)
+        made.metadata["what"] = object()
+        with pytest.raises(StorageError, match=r"metadata of an episode that JSON can hold: .*what"):
+            storage.record_episode(made)
+        assert storage.list_episodes() == []
 
     def test_structured_values(self, storage: TupliStorage) -> None:
         benchmark = storage.store_benchmark(query()).id
@@ -783,6 +810,7 @@ BOX_3 = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
         ([1, 2], gym.spaces.Box(-(2**63), 2**63 - 1, (), np.int64)),
         ([1, 2.5], gym.spaces.Box(-np.inf, np.inf, (), np.float64)),
         ([True, False], gym.spaces.Box(0, 1, (), np.bool_)),
+        ([2**64 - 1, 1], gym.spaces.Box(0, 2**64 - 1, (), np.uint64)),
         ([[1.0, 2.0], [3.0, 4.0]], gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)),
         ([np.zeros((2, 3), np.uint8)], gym.spaces.Box(0, 255, (2, 3), np.uint8)),
         ([np.float32(1)], gym.spaces.Box(-np.inf, np.inf, (), np.float32)),
@@ -823,5 +851,10 @@ def test_conform_changes_nothing() -> None:
     with pytest.raises(SpaceError, match="expected a value of Box"):
         conform(0.1, box)
     assert conform(0.5, box) == 0.5
+    double = gym.spaces.Box(-np.inf, np.inf, (), np.float64)
+    assert conform(2**53, double) == 2.0**53
+    for odd in (2**53 + 1, 2**63 - 1, np.uint64(2**64 - 1), [2**53 + 1]):
+        with pytest.raises(SpaceError, match="expected a value of Box"):
+            conform(odd, double)
     with pytest.raises(SpaceError, match="expected a value of Discrete"):
         conform(1.5, gym.spaces.Discrete(3))

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self, SupportsFloat
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
+from pydantic import ValidationError
 
 from tupli_mcap import trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
@@ -18,6 +19,7 @@ from tupli_mcap.environment import Snapshot, build, record_environment
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError
 from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, FilterEQ, RLTuple
 from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage.common import first_defect
 from tupli_mcap.storage.document import benchmark_hash, facts_about, pack, recording_attachments, unpack
 from tupli_mcap.wrappers import RecordEpisodes
 
@@ -226,9 +228,16 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             TupliError: The environment cannot be pickled.
             StorageError: The storage refuses, or the metadata is no JSON.
         """
-        told = BenchmarkMetadata(
-            name=name, description=description, difficulty=difficulty, version=version, extra=metadata or {}
-        )
+        try:
+            told = BenchmarkMetadata(
+                name=name,
+                description=description,
+                difficulty=difficulty,
+                version=version,
+                extra=metadata or {},
+            )
+        except ValidationError as err:
+            raise StorageError(f"expected metadata with names as keys: {first_defect(err)}") from err
         serialized = self.serialize_env(self.env, by_reference=by_reference)
         content = unpack(serialized)
         query = BenchmarkQuery(hash=benchmark_hash(content, told), serialized=serialized, metadata=told)
@@ -297,8 +306,9 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             if users:
                 kept[artifact] = users
                 continue
-            self.storage.delete_artifact(artifact)
-            gone.append(artifact)
+            with contextlib.suppress(NotFoundError):  # gone already
+                self.storage.delete_artifact(artifact)
+                gone.append(artifact)
         return DeletedBenchmark(uri, episodes, tuple(gone), MappingProxyType(kept))
 
     def _stored_id(self) -> str:
@@ -321,10 +331,10 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     @classmethod
     def deserialize_env(
-        cls, serialized: str, storage: TupliStorage, *, trust: bool = False
+        cls, serialized_env: str, storage: TupliStorage, *, trust: bool = False
     ) -> gym.Env[Any, Any]:
         """The environment that `serialize_env` made a text of. Raises as `load` does."""
-        return cls._deserialize(build(unpack(serialized).record, trust=trust), storage)
+        return cls._deserialize(build(unpack(serialized_env).record, trust=trust), storage)
 
     def _serialize(self, env: gym.Env[Any, Any]) -> tuple[gym.Env[Any, Any], list[str]]:
         """To be overridden: move data out of an environment before it is stored.

@@ -179,6 +179,9 @@ class FileStorage(TupliStorage):
         limit: int | None = None,
         offset: int = 0,
     ) -> list[EpisodeHeader] | list[EpisodeItem]:
+        for name, number in (("limit", 0 if limit is None else limit), ("offset", offset)):
+            if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 1 << 63:
+                raise StorageError(f"expected {name} to be an integer from 0, found {number!r:.80}")
         headers = self._recordings.headers(filter, limit=limit, offset=offset)
         return list(with_tuples(headers, self.open_recording)) if include_tuples else headers
 

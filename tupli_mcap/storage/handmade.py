@@ -9,7 +9,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.errors import SpaceError
+from tupli_mcap.errors import SpaceError, StorageError
+from tupli_mcap.messages.jsonvalue import dumps_plain
 from tupli_mcap.recording import EpisodeData
 from tupli_mcap.schema import Episode
 
@@ -17,6 +18,7 @@ __all__ = ["conform", "episode_data", "infer_space"]
 
 _NUMBERS = (bool, int, float, np.generic)
 _KINDS = "biuf"
+_NUMBER = spaces.Box(-np.inf, np.inf, (), np.float64)
 
 
 def infer_space(values: Sequence[Any], where: str = "value") -> gym.Space[Any]:
@@ -62,23 +64,40 @@ def conform(value: Any, space: gym.Space[Any]) -> Any:
         array = given.astype(dtype)
     except (TypeError, ValueError, OverflowError) as err:
         raise SpaceError(f"expected a value of {space}, found {value!r:.80}") from err
-    if given.dtype.kind not in _KINDS or not np.array_equal(array, given, equal_nan=True):
+    if given.dtype.kind not in _KINDS or not _same_numbers(given, array):
         raise SpaceError(f"expected a value of {space}, found {value!r:.80}")
     return dtype.type(array) if isinstance(space, spaces.Discrete) else array  # type: ignore[union-attr]
+
+
+def _same_numbers(given: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bool:
+    if given.dtype.kind in "iu" and cast.dtype.kind == "f":
+        # NumPy would compare them as floats, where neighbours beyond 2**53 are one.
+        with np.errstate(invalid="ignore"):
+            return np.array_equal(cast.astype(given.dtype), given)
+    return np.array_equal(cast, given, equal_nan=True)
 
 
 def episode_data(
     episode: Episode, space: tuple[gym.Space[Any], gym.Space[Any], gym.Space[Any] | None]
 ) -> EpisodeData:
     """An episode's values in the form of its spaces (states, actions, rewards; None where rewards are
-    numbers)."""
+    numbers).
+
+    Raises:
+        SpaceError: A value does not have the space's structure, or would be changed.
+        StorageError: The metadata holds something that has no JSON form.
+    """
     states, actions, rewards = space
     tuples = episode.tuples
+    try:
+        dumps_plain(episode.metadata)
+    except (TypeError, ValueError) as err:
+        raise StorageError(f"expected metadata of an episode that JSON can hold: {err}") from err
     infos = [dict(item.info) for item in tuples]
     return EpisodeData(
         states=[conform(item.state, states) for item in tuples],
         actions=[conform(item.action, actions) for item in tuples],
-        rewards=[float(item.reward) if rewards is None else conform(item.reward, rewards) for item in tuples],
+        rewards=[conform(item.reward, _NUMBER if rewards is None else rewards) for item in tuples],
         terminals=[bool(item.terminal) for item in tuples],
         timeouts=[bool(item.timeout) for item in tuples],
         metadata=episode.metadata,
@@ -98,6 +117,9 @@ def episode_spaces(
         for i, (column, where) in enumerate(zip(columns, ("state", "action"), strict=True))
     )
     rewards = [item.reward for item in tuples]
+    for reward in rewards:
+        if reward is None or isinstance(reward, str):
+            raise SpaceError(f"reward: expected a number, or an array of them, found {reward!r:.80}")
     if all(isinstance(reward, _NUMBERS) or np.shape(reward) == () for reward in rewards):
         return state, action, None
     return state, action, infer_space(rewards, "reward")
@@ -127,6 +149,8 @@ def _dict_space(values: Sequence[Any], where: str) -> gym.Space[Any]:
 def _array_space(values: Sequence[Any], where: str) -> gym.Space[Any]:
     arrays = [_array(value, where) for value in values]
     dtype = np.result_type(*{array.dtype for array in arrays})
+    if dtype.kind == "f" and all(array.dtype.kind in "iu" and array.min(initial=0) >= 0 for array in arrays):
+        dtype = np.dtype(np.uint64)  # which NumPy does not take for signed and unsigned integers
     if dtype.kind not in _KINDS:
         raise SpaceError(f"{where}: expected numbers or flags of one kind, found {dtype}")
     shapes = {array.shape for array in arrays}
