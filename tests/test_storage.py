@@ -590,11 +590,21 @@ class TestFileStorage(StorageContract):
         storage.close()
         copy = tmp_path / "read only"
         shutil.copytree(storage.root, copy, ignore=shutil.ignore_patterns("catalog*"))
-        monkeypatch.setattr(os, "access", lambda *_: False)  # permissions do not bind root
-        monkeypatch.setattr(recordings, "Catalog", _refuse_path)
-        with FileStorage(copy) as other:
-            assert [h.id for h in other.list_episodes()] == [made.id]
-        assert not (copy / "catalog.sqlite").exists()
+        open_file = os.open
+
+        def refuse_lock(path: Any, *args: Any, **kwargs: Any) -> int:
+            if str(path) == str(copy / ".lock"):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            return open_file(path, *args, **kwargs)
+
+        monkeypatch.setattr(os, "open", refuse_lock)  # permissions do not bind root
+        monkeypatch.setattr(os, "access", lambda *_: False)
+        for catalog in (recordings.Catalog, _refuse_path):
+            monkeypatch.setattr(recordings, "Catalog", catalog)
+            with FileStorage(copy) as other:
+                assert [h.id for h in other.list_episodes(include_tuples=True)] == [made.id]
+                with pytest.raises(StorageError, match="cannot change the storage: .*Permission denied"):
+                    other.delete_episode(made.id)
 
     def test_a_killed_recording_is_there(self, storage: FileStorage, monkeypatch: pytest.MonkeyPatch) -> None:
         header = storage.store_benchmark(query())

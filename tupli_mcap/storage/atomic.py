@@ -14,7 +14,7 @@ from typing import Self
 
 from tupli_mcap.errors import StorageError
 
-__all__ = ["Lock", "fill", "os_errors", "write_bytes"]
+__all__ = ["Lock", "LockError", "fill", "os_errors", "write_bytes"]
 
 
 def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
@@ -60,9 +60,17 @@ def os_errors(what: str, path: Path) -> Iterator[None]:
         raise StorageError(f"{what} {str(path)!r}: {err.strerror or err}") from err
 
 
+class LockError(StorageError):
+    """The lock's file cannot be opened: the storage can only be read, or the disk is full."""
+
+
 class Lock:
     """Keeps the other processes and threads out while a block reads, changes and writes. Reentrant in a
-    thread."""
+    thread.
+
+    Raises:
+        LockError: The file cannot be opened.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -74,15 +82,23 @@ class Lock:
         self._thread_lock.acquire()
         try:
             if self._depth == 0:
-                with os_errors("cannot lock the storage with", self._path):
-                    self._path.parent.mkdir(parents=True, exist_ok=True)
-                    self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-                    fcntl.flock(self._fd, fcntl.LOCK_EX)
+                self._open()
             self._depth += 1
         except BaseException:
             self._thread_lock.release()
             raise
         return self
+
+    def _open(self) -> None:
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            fcntl.flock(self._fd, fcntl.LOCK_EX)
+        except OSError as err:
+            raise LockError(
+                f"cannot change the storage: its lock {str(self._path)!r} cannot be taken: "
+                f"{err.strerror or err}"
+            ) from err
 
     def __exit__(
         self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None

@@ -72,6 +72,11 @@ class Catalog:
             self.close()
             raise
 
+    @property
+    def is_temporary(self) -> bool:
+        """Whether nobody else sees it."""
+        return self._temporary is not None
+
     def close(self) -> None:
         """Release the file; closing twice is fine."""
         self._finalizer()

@@ -15,7 +15,7 @@ from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, Storag
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.recording.lock import FileLock, is_locked
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
-from tupli_mcap.storage.atomic import Lock, os_errors
+from tupli_mcap.storage.atomic import Lock, LockError, os_errors
 from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, CatalogUnusableError, RecordingStamp
 from tupli_mcap.storage.common import LOCAL_USER, published_in
 from tupli_mcap.storage.entries import catalog_rows
@@ -126,21 +126,19 @@ class RecordingFiles:
                 self._opened = Catalog(self._root / "catalog.sqlite")
                 self._declare_all(self._opened)
             except StorageError as err:
-                self.close()
-                if os.access(self._root, os.W_OK):  # else a storage that can only be read, as it should be
-                    if not isinstance(err, CatalogUnusableError):
-                        raise
-                    _warn_of_temporary(err)
-                self._opened = Catalog(None)
-                self._declare_all(self._opened)
+                if not isinstance(err, CatalogUnusableError) and os.access(self._root, os.W_OK):
+                    raise
+                return self._use_temporary(err)
         return self._opened
 
-    def _use_temporary(self, err: CatalogUnusableError) -> None:
+    def _use_temporary(self, err: StorageError) -> Catalog:
         """Go on with a catalog that lies elsewhere: what is recorded can be read even on a full disk."""
-        _warn_of_temporary(err)
+        if os.access(self._root, os.W_OK):  # else a storage that can only be read, as its owner wants it
+            warnings.warn(f"{err}; the episodes are listed with a temporary one, made anew", stacklevel=7)
         self.close()
         self._opened = Catalog(None)
         self._declare_all(self._opened)
+        return self._opened
 
     def _declare_all(self, catalog: Catalog) -> None:
         for key in self._declared_keys:
@@ -155,7 +153,7 @@ class RecordingFiles:
                 self._catalog.reset()
                 self._declare_all(self._catalog)
                 self._sync()
-        except CatalogUnusableError as err:
+        except (CatalogUnusableError, LockError) as err:
             self._use_temporary(err)
             self._sync()
 
@@ -192,7 +190,7 @@ class RecordingFiles:
         if not self._changes():
             return
         # One process at a time: what another one read a moment ago must not replace what is newer.
-        with self._lock:
+        with contextlib.nullcontext() if self._catalog.is_temporary else self._lock:
             for relative, path in self._changes().items():
                 if path is None:
                     self._catalog.remove_recording(relative)
@@ -330,10 +328,6 @@ class RecordingFiles:
         Sidecar(published_in=groups).write(path)
         self.ingest(path)
         return before - path.stat().st_size
-
-
-def _warn_of_temporary(err: CatalogUnusableError) -> None:
-    warnings.warn(f"{err}; the episodes are listed with a temporary one, made anew", stacklevel=6)
 
 
 def episode_id(uuid: str, episode: int) -> str:
