@@ -375,6 +375,19 @@ def test_recording_off_accepts_anything(storage: FileStorage) -> None:
     assert storage.list_episodes() == []
 
 
+def test_the_working_directory_may_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with FileStorage("lab") as storage:
+        env = TupliEnvWrapper(windy(), storage)
+        env.store(name="windy")
+        roll(env, 10)
+        monkeypatch.chdir(tmp_path / "elsewhere")
+        env.close()
+        assert storage.count_episodes() == 1
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 def test_a_recording_without_steps_leaves_no_file(storage: FileStorage) -> None:
     env = TupliEnvWrapper(gym.make("CartPole-v1"), storage)
     env.store(name="cart")

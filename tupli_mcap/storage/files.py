@@ -64,7 +64,8 @@ class FileStorage(TupliStorage):
         *,
         storage_base_dir: str | os.PathLike[str] | None = None,
     ) -> None:
-        self.root = Path(root if storage_base_dir is None else storage_base_dir)
+        # Absolute: the working directory may change while something is recorded.
+        self.root = Path(root if storage_base_dir is None else storage_base_dir).absolute()
         with os_errors("cannot make the storage", self.root):
             self.root.mkdir(parents=True, exist_ok=True)
         self._lock = Lock(self.root / ".lock")
