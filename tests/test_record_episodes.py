@@ -536,3 +536,208 @@ def test_the_environment_is_in_the_file(tmp_path: Path) -> None:
         roll(env, 10)
     rebuilt = Recording(tmp_path / "r.mcap").benchmark.make_env()
     assert rebuilt.unwrapped._sutton_barto_reward is True
+
+
+@pytest.mark.parametrize(
+    ("space", "reward", "total"),
+    [
+        (BOX, lambda n: [1.0 * n, 2.0], 12.0),
+        (BOX, lambda n: np.array([n, 0.5], np.float32), 7.5),
+        (
+            spaces.Dict({"a": BOX, "b": spaces.Discrete(9)}),
+            lambda n: {"a": np.ones(2, np.float32), "b": n},
+            12.0,
+        ),
+        (spaces.Tuple([spaces.Text(3), spaces.Box(0, 9, ())]), lambda n: ("x", np.float32(n)), 6.0),
+    ],
+)
+@pytest.mark.parametrize("state", [spaces.Discrete(9), spaces.Text(9)], ids=["constant", "variable"])
+def test_rewards_of_any_space(
+    tmp_path: Path, state: gym.Space[Any], space: gym.Space[Any], reward: Any, total: float
+) -> None:
+    text = isinstance(state, spaces.Text)
+    inner = Scripted(lambda n: "x" * n if text else n, state, reward=reward)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        with RecordEpisodes(inner, tmp_path / "r.mcap", reward_space=space) as env:
+            env.reset()
+            given = [env.step(0)[1] for _ in range(3)]
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert episode.return_ == total
+    for step, expected in zip(episode, given, strict=True):
+        for found, want in zip(_flat(step.reward), _flat(expected), strict=True):
+            assert np.array_equal(found, want)
+
+
+def _flat(value: Any) -> list[Any]:
+    if isinstance(value, dict):
+        return list(value.values())
+    return list(value) if isinstance(value, tuple) else [value]
+
+
+@pytest.mark.parametrize("size", [3, 3000])
+def test_a_masked_array_is_refused_at_any_step(tmp_path: Path, size: int) -> None:
+    values = np.ones(size, np.float32)
+    masked = np.ma.MaskedArray(values, mask=np.arange(size) % 2)
+    inner = Scripted(lambda n: masked if n == 3 else values, spaces.Box(0, 1, (size,)))
+    with RecordEpisodes(inner, tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step(0)
+        env.step(0)
+        with pytest.raises(StepError, match="whose mask cannot be recorded"):
+            env.step(0)
+    assert Recording(tmp_path / "r.mcap").num_steps == 2
+
+
+def test_named_tuples_are_tuples(tmp_path: Path) -> None:
+    from typing import NamedTuple
+
+    class Pair(NamedTuple):
+        a: int
+        b: int
+
+    space = spaces.Tuple([spaces.Discrete(9), spaces.Discrete(9)])
+    with RecordEpisodes(Scripted(lambda n: Pair(n, 1), space), tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step(0)
+    assert Recording(tmp_path / "r.mcap").episodes[0].final_state == (1, 1)
+
+
+@pytest.mark.parametrize("which", ["metadata_callback", "step_callback"])
+def test_a_callback_that_raises_does_not_change_how_an_episode_ends(tmp_path: Path, which: str) -> None:
+    calls = []
+
+    class Fails(EpisodeMetadataCallback):
+        def reset(self) -> None:
+            pass
+
+        def __call__(self, tuple: Any) -> dict[str, Any]:
+            calls.append(tuple.state.copy())
+            if len(calls) in (2, 3):
+                raise ValueError("mistake")
+            return {"n": len(calls)}
+
+    inner = Scripted(lambda n: np.full(2, n, np.float32), BOX, length=3)
+    with RecordEpisodes(inner, tmp_path / "r.mcap", **{which: Fails()}) as env:  # type: ignore[arg-type]
+        env.reset()
+        env.step(0)
+        for _ in range(2):
+            with pytest.raises(ValueError, match="mistake"):
+                env.step(0)
+        env.reset()
+        env.step(0)
+    assert [state[0] for state in calls] == [0, 1, 2, 0]
+    first, second = Recording(tmp_path / "r.mcap").episodes
+    assert (len(first), first.end) == (3, "terminal")
+    assert (len(second), second.end) == (1, "interrupted")
+    if which == "metadata_callback":
+        assert (first.metadata, second.metadata) == ({"n": 1}, {"n": 4})
+
+
+@pytest.mark.parametrize("metadata", [[1], 5, {"x": object()}])
+def test_metadata_that_is_none_is_refused(tmp_path: Path, metadata: Any) -> None:
+    class Odd(Totals):
+        def __call__(self, tuple: RLTuple) -> Any:
+            return metadata
+
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", metadata_callback=Odd()) as env:
+        env.reset()
+        with pytest.raises(RecordingError, match="metadata_callback: "):
+            env.step(0)
+    assert Recording(tmp_path / "r.mcap").episodes[0].metadata == {}
+
+
+def test_metadata_is_kept_when_a_step_is_refused(tmp_path: Path) -> None:
+    inner = Scripted(lambda n: np.zeros(3 if n == 2 else 2, np.float32), BOX)
+    with RecordEpisodes(inner, tmp_path / "r.mcap", metadata_callback=Totals()) as env:
+        env.reset()
+        env.step(0)
+        with pytest.raises(StepError, match="expected shape"):
+            env.step(0)
+    assert Recording(tmp_path / "r.mcap").episodes[0].metadata["total"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("select", "expected"),
+    [
+        (["x"], {"x": 1.0, "log_prob": -0.5}),
+        ("x", {"x": 1.0, "log_prob": -0.5}),
+        ([], {"log_prob": -0.5}),
+        (False, {"log_prob": -0.5}),
+        (lambda info: {"y": info["y"]}, {"y": 2, "log_prob": -0.5}),
+        (lambda info: None, {"log_prob": -0.5}),
+        (True, {"x": 1.0, "y": 2, "log_prob": -0.5}),
+    ],
+)
+def test_a_step_callback_adds_to_infos_of_any_choice(tmp_path: Path, select: Any, expected: Any) -> None:
+    inner = Scripted(lambda n: n, spaces.Discrete(9), info=lambda n: {"x": 1.0, "y": 2})
+    with RecordEpisodes(
+        inner, tmp_path / "r.mcap", record_info=select, step_callback=lambda step: {"log_prob": -0.5}
+    ) as env:
+        env.reset()
+        env.step(0)
+    assert Recording(tmp_path / "r.mcap").episodes[0].infos == [expected]
+
+
+def test_no_info_and_no_option_ends_a_rollout(tmp_path: Path) -> None:
+    class Mute:
+        def __repr__(self) -> str:
+            raise RuntimeError("no repr")
+
+    loop: dict[str, Any] = {"n": 1}
+    loop["self"] = loop
+    infos: list[Any] = [{}, {"mute": Mute(), "loop": loop, "x": 1.5}, None, {(1, 2): loop}]
+    inner = Scripted(lambda n: n, spaces.Discrete(9), info=lambda n: infos[n])
+    with RecordEpisodes(inner, tmp_path / "r.mcap", record_info=True) as env:
+        env.reset(options={"loop": loop, "mute": Mute()})
+        for _ in range(3):
+            env.step(0)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert episode.infos is not None
+    found = episode.infos[0]
+    assert found is not None
+    assert (found["x"], found["loop"]) == (1.5, "{'n': 1, 'self': {...}}")
+    assert found["mute"].endswith("Mute>")
+    assert episode.infos[1:] == [{}, {(1, 2): "{'n': 1, 'self': {...}}"}]
+    assert episode.options["loop"] == "{'n': 1, 'self': {...}}"
+
+
+def test_the_journal_stays_where_the_recording_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("here", "there", "journals"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "there" / "link.mcap").symlink_to(tmp_path / "here" / "linked.mcap")
+
+    def files(name: str) -> list[str]:
+        return sorted(path.name for path in (tmp_path / name).iterdir())
+
+    monkeypatch.chdir(tmp_path / "here")
+    plain = RecordEpisodes(gym.make("CartPole-v1"), "plain.mcap")
+    elsewhere = RecordEpisodes(gym.make("CartPole-v1"), "other.mcap", journal_dir="../journals")
+    linked = RecordEpisodes(gym.make("CartPole-v1"), "../there/link.mcap", mode="w")
+    monkeypatch.chdir(tmp_path)
+    for env in (plain, elsewhere, linked):
+        env.reset()
+        env.step(0)
+    assert files("here") == [
+        "linked.mcap",
+        "linked.mcap.journal",
+        "other.mcap",
+        "plain.mcap",
+        "plain.mcap.journal",
+    ]
+    assert (files("there"), files("journals")) == (["link.mcap"], ["other.mcap.journal"])
+    for path in ("here/plain.mcap", "here/other.mcap", "here/linked.mcap", "there/link.mcap"):
+        assert Recording(path).num_steps == 1
+    for env in (plain, elsewhere, linked):
+        env.close()
+    assert files("here") == ["linked.mcap", "other.mcap", "plain.mcap"]
+    assert files("journals") == []
+
+
+@pytest.mark.parametrize(
+    ("options", "match"), [({"chunk_size": 0}, "chunk_size"), ({"journal_dir": "/nowhere"}, "journal_dir")]
+)
+def test_options_are_checked_before_a_file_is_made(tmp_path: Path, options: Any, match: str) -> None:
+    with pytest.raises(RecordingError, match=match):
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", **options)
+    assert not list(tmp_path.iterdir())

@@ -333,3 +333,18 @@ def test_recordings_from_values(path: Path) -> None:
             action_space=spaces.Discrete(2),
             mode="w",
         )
+
+
+def test_episodes_are_chosen_by_positions_or_a_mask(path: Path) -> None:
+    record(path, "box")
+    recording = Recording(path)
+    n = len(recording)
+    mask = np.arange(n) % 2 == 1
+    expected = recording.read(np.flatnonzero(mask).tolist()).states
+    for chosen in (mask, mask.tolist(), np.flatnonzero(mask).astype(np.uint8), range(1, n, 2)):
+        assert np.array_equal(recording.read(chosen).states, expected)
+    for wrong in ([1.5], 2, mask[:-1], ["1"], slice(1, 2), recording.episodes[:2], [[0, 1]]):
+        with pytest.raises(RecordingError, match="expected a list of positions from 0 to"):
+            recording.read(wrong)
+    assert np.array_equal(recording.read([]).states, expected[:0])
+    assert np.array_equal(recording.read(fields="states").states, recording.read().states)

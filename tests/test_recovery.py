@@ -275,3 +275,43 @@ def test_vector_recordings_are_finished_by_append(tmp_path: Path) -> None:
     assert after.complete
     assert np.array_equal(after.read(range(len(before.index))).states, states)
     assert after.num_steps == before.num_steps + 2
+
+
+def test_nothing_is_recorded_after_a_full_disk(tmp_path: Path) -> None:
+    code = (
+        "import resource, signal, sys, gymnasium as gym\n"
+        "from tupli_mcap import RecordEpisodes, RecordingError\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "env = RecordEpisodes(gym.make('CartPole-v1'), sys.argv[1], chunk_size=20_000, compression='none')\n"
+        "env.reset(seed=1); env.step(0); done = 1\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))\n"
+        "for _ in range(4000):\n"
+        "    try:\n"
+        "        _, _, a, b, _ = env.step(0); done += 1\n"
+        "        if a or b: env.reset()\n"
+        "    except RecordingError:\n"
+        "        pass\n"
+        "print(done)\n"
+        "try: env.close()\n"
+        "except RecordingError: pass\n"
+    )
+    path = tmp_path / "r.mcap"
+    child = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, str(path)], capture_output=True, text=True, timeout=60
+    )
+    assert int(child.stdout) > 500
+    assert 0 <= Recording(path).num_steps - int(child.stdout) <= 1
+
+
+def test_finishing_removes_the_journal_of_the_killed(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    pid = os.fork()
+    if pid == 0:
+        env = cart_pole(path)
+        roll(env, 5)
+        os.kill(os.getpid(), 9)
+    os.waitpid(pid, 0)
+    assert journal_path(path).exists()
+    cart_pole(path, mode="a").close()
+    assert not journal_path(path).exists()
+    assert (Recording(path).complete, Recording(path).num_steps) == (True, 5)

@@ -255,3 +255,118 @@ def test_the_first_sub_environment_is_in_the_file(tmp_path: Path) -> None:
         env.step([0, 1])
     rebuilt = Recording(tmp_path / "r.mcap").benchmark.make_env()
     assert rebuilt.unwrapped._sutton_barto_reward is True
+
+
+class Batches(gym.vector.VectorEnv[Any, Any, Any]):
+    """A custom environment of `N`: states count, everybody's episode ends with every third step."""
+
+    def __init__(self, infos: Any = None, flags: Any = None, mode: str = "NextStep") -> None:
+        self.num_envs = N
+        self.single_observation_space = spaces.Box(0, 99, (2,), np.float32)
+        self.single_action_space = spaces.Discrete(3)
+        self.observation_space = spaces.Box(0, 99, (N, 2), np.float32)
+        self.action_space = spaces.MultiDiscrete([3] * N)
+        self.metadata = {"autoreset_mode": mode}
+        self.infos = infos or dict
+        self.flags = flags or (lambda done: np.full(N, done))
+        self.count = 0
+
+    def _state(self) -> Any:
+        return np.full((N, 2), self.count, np.float32)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.count = 0
+        return self._state(), {}
+
+    def step(self, actions: Any) -> Any:
+        self.count = 0 if self.count == 3 else self.count + 1
+        return self._state(), np.ones(N), self.flags(self.count == 3), np.zeros(N, bool), self.infos()
+
+
+def test_infos_without_masks(tmp_path: Path) -> None:
+    infos = {
+        "x": np.arange(3.0),
+        "note": "all",
+        "episode": {"r": np.arange(3)},
+        "items": [4, 5, 6],
+        "pair": (1, 2),
+    }
+    with RecordEpisodes(Batches(lambda: infos), tmp_path / "r.mcap", record_info=True) as env:
+        env.reset()
+        env.step([0, 1, 2])
+    for episode in Recording(tmp_path / "r.mcap").episodes:
+        i = episode.env
+        expected = {"x": float(i), "note": "all", "episode": {"r": i}, "items": 4 + i, "pair": (1, 2)}
+        assert episode.infos == [expected]
+
+
+def test_statistics_of_episodes_are_recorded(tmp_path: Path) -> None:
+    envs = gym.wrappers.vector.RecordEpisodeStatistics(make(SPACES["box"], None))
+    with RecordEpisodes(envs, tmp_path / "r.mcap", record_info=True) as env:
+        env.reset()
+        for _ in range(20):
+            env.step(env.action_space.sample())
+    for episode in Recording(tmp_path / "r.mcap").episodes:
+        *before, last = episode.infos or []
+        assert all(info == {} for info in before)
+        if episode.end != "interrupted":
+            assert last is not None
+            assert (last["episode"]["r"], last["episode"]["l"]) == (episode.return_, len(episode))
+
+
+@pytest.mark.parametrize("mode", MODES, ids=name_of)
+def test_lists_of_infos(tmp_path: Path, mode: Any) -> None:
+    inner = gym.wrappers.vector.RecordEpisodeStatistics(make(SPACES["box"], mode))
+    envs = gym.wrappers.vector.DictInfoToList(inner)
+    with RecordEpisodes(envs, tmp_path / "r.mcap", record_info=True) as env:
+        env.reset()
+        for _ in range(3):
+            env.step(env.action_space.sample())
+        *_, infos = env.step(env.action_space.sample())  # ends the first one's episode
+    first = Recording(tmp_path / "r.mcap").episodes[0]
+    assert (first.env, len(first), first.end) == (0, 4, "terminal")
+    if name_of(mode) == "SameStep":
+        assert same(first.final_state, infos[0]["final_obs"])
+    assert first.infos is not None
+    assert first.infos[:3] == [{}] * 3
+
+
+def test_a_callback_that_raises_splices_nothing(tmp_path: Path) -> None:
+    def fails(step: Any) -> None:
+        if step.terminal:
+            raise ValueError("mistake")
+
+    with RecordEpisodes(Batches(), tmp_path / "r.mcap", step_callback=fails) as env:
+        env.reset()
+        for n in range(1, 12):
+            if n % 4 == 3:
+                with pytest.raises(ValueError, match="mistake"):
+                    env.step([0, 1, 2])
+            else:
+                env.step([0, 1, 2])
+    for episode in Recording(tmp_path / "r.mcap").episodes:
+        assert (episode.states[:, 0].tolist(), episode.end) == ([0.0, 1.0, 2.0], "terminal")
+
+
+@pytest.mark.parametrize("flags", [lambda done: done, lambda done: np.full((N, 1), done)])
+def test_flags_of_another_shape_are_refused(tmp_path: Path, flags: Any) -> None:
+    with RecordEpisodes(Batches(flags=flags), tmp_path / "r.mcap") as env:
+        env.reset()
+        with pytest.raises(StepError, match=r"terminal: expected shape \(3,\)"):
+            env.step([0, 1, 2])
+
+
+def test_the_first_batch_is_refused_as_others_are(tmp_path: Path) -> None:
+    env = RecordEpisodes(Batches(flags=lambda done: done), tmp_path / "r.mcap")
+    env.reset()
+    for match in ("expected shape", "could not be recorded; call env.reset"):
+        with pytest.raises(StepError, match=match):
+            env.step([0, 1, 2])
+    env.close()
+    assert len(Recording(tmp_path / "r.mcap")) == 0
+
+
+def test_nested_rewards_are_refused_before_a_file_is_made(tmp_path: Path) -> None:
+    with pytest.raises(SpaceError, match="reward: expected a space of arrays"):
+        RecordEpisodes(Batches(), tmp_path / "r.mcap", reward_space=spaces.Dict({"a": spaces.Discrete(2)}))
+    assert not list(tmp_path.iterdir())

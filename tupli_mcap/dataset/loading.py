@@ -180,7 +180,7 @@ def _read_block(
     recorded = [field for field in fields if field in _RECORDED]
     # "All of it" is cheaper than a list of all: it leaves the cache alone.
     everything = len(positions) == len(recording) and (np.diff(positions) == 1).all()
-    found = recording.read(None if everything else positions, fields=recorded)  # type: ignore[arg-type]
+    found = recording.read(None if everything else positions, fields=recorded)
     columns = {field: getattr(found, field) for field in recorded}
     now = found.episode_lengths
     if "steps" in fields:

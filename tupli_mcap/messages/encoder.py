@@ -156,7 +156,11 @@ def make_row_encoder(
         *state_stores,
         *firsts,
     ]
-    text = _render(put_lines, first_lines, size)
+    amount = "reward"
+    if layout.reward_space is not None:
+        put_lines.append(f"amount = {source.bind('total', layout.reward_total)}(reward)")
+        amount = "amount"
+    text = _render(put_lines, first_lines, size, amount)
     namespace = dict(
         source.names,
         buffer=buffer,
@@ -182,7 +186,7 @@ def _shift(head: _Packed, size: int, tail: _Packed) -> _Packed:
     return joined
 
 
-def _render(put_lines: Sequence[str], first_lines: Sequence[str], size: int) -> str:
+def _render(put_lines: Sequence[str], first_lines: Sequence[str], size: int, amount: str) -> str:
     def block(lines: Sequence[str]) -> str:
         return "".join(f"        {line}\n" for line in lines)
 
@@ -193,7 +197,7 @@ def _render(put_lines: Sequence[str], first_lines: Sequence[str], size: int) -> 
         "        raise diagnose(action, state, reward, err) from err\n"
         f"    commit(buffer, offset + {SEQUENCE_OFFSET}, cursor.sequence, time_ns())\n"
         "    cursor.sequence += 1\n"
-        "    cursor.total += reward\n"
+        f"    cursor.total += {amount}\n"
         f"    cursor.offset = offset = offset + {size}\n"
         "    if offset == cursor.end:\n"
         "        switch()\n\n"
@@ -210,7 +214,7 @@ def _structure_checks(source: _Source, space: Any, expression: str) -> None:
     n = len(space.spaces)
     if type(space) is spaces.Tuple:
         source.lines.append(
-            f"if {expression}.__class__ is not tuple or len({expression}) != {n}: raise TypeError"
+            f"if not isinstance({expression}, tuple) or len({expression}) != {n}: raise TypeError"
         )
         children = list(enumerate(space.spaces))
     else:
@@ -269,11 +273,13 @@ def _leaf(
         large = nbytes >= _LARGE
         exact = source.bind("exact", _exact_plain(leaf, dtype) if large else _exact_bytes(leaf, dtype))
         fast = value if large else f"{value}.tobytes()"
-        source.lines += [
-            "try:",
-            f"    {raw} = {fast} if {value}.dtype is {kind} and {value}.shape == {shape} else {exact}({value})",
-            f"except AttributeError: {raw} = {exact}({value})",
-        ]
+        # of exactly this class: a subclass may mean something else by its bytes, as a masked array does
+        plain = f"{value}.__class__ is {source.bind('array', np.ndarray)}"
+        if leaf.shape == ():
+            plain = f"({plain} or {value}.__class__ is {source.bind('scalar', dtype.type)})"
+        source.lines.append(
+            f"{raw} = {fast} if {plain} and {value}.dtype is {kind} and {value}.shape == {shape} else {exact}({value})"
+        )
         if large:
             stores.append(
                 f"view[offset + {offset}:offset + {offset + nbytes}].view({kind}).reshape({shape})[...] = {raw}"

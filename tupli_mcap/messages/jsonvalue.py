@@ -30,7 +30,7 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 
-__all__ = ["MAX_DEPTH", "dumps", "dumps_plain", "loads"]
+__all__ = ["MAX_DEPTH", "dumps", "dumps_any", "dumps_plain", "loads"]
 
 MAX_DEPTH = 64
 """Deepest nesting of values."""
@@ -62,6 +62,35 @@ def dumps(value: Any, *, fallback: Fallback | None = None) -> str:
         ValueError: nesting beyond `MAX_DEPTH`.
     """
     return _text(_Encoder(fallback, plain=False), value)
+
+
+def dumps_any(value: Any) -> str:
+    """Return `dumps` of any value at all: what has no exact form is stored as its `repr`.
+
+    An object without a `repr` becomes the name of its type, an entry of a dict that is nested too deep (or in
+    itself) the `repr` of the entry.
+    """
+    try:
+        return dumps(value, fallback=_describe)
+    except ValueError:
+        if type(value) is not dict:
+            return dumps(_describe(value))
+    return dumps({key: _shallow(item) for key, item in value.items()}, fallback=_describe)
+
+
+def _shallow(value: Any) -> Any:
+    try:
+        dumps([value], fallback=_describe)
+    except ValueError:
+        return _describe(value)
+    return value
+
+
+def _describe(value: Any) -> str:
+    try:
+        return repr(value)
+    except Exception:  # noqa: BLE001 (somebody else's code, and nothing depends on it)
+        return f"<{type(value).__module__}.{type(value).__qualname__}>"
 
 
 def dumps_plain(value: Any, *, fallback: Fallback | None = None) -> str:

@@ -143,6 +143,13 @@ class StepLayout:
         """Layouts of the image channels, by ROS name of the leaf."""
         return {leaf.name: image_layout(leaf) for leaf in self.images}
 
+    def reward_total(self, reward: Any) -> float:
+        """What a reward that can be stored adds to the return: the sum of its numbers."""
+        if self.reward_space is None:
+            return float(reward)
+        numbers = [leaf.get(reward) for leaf in self.reward if leaf.kind != "variable"]
+        return float(sum(np.sum(number, dtype=np.float64) for number in numbers))
+
     @cached_property
     def step_schema(self) -> str:
         """The ros2msg text of `/step`."""

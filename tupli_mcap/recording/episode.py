@@ -153,11 +153,12 @@ class Episode:
         layout = self._recording.layout
         state = _item(layout.observation_space, columns.states)
         action = _item(layout.action_space, columns.actions)
+        reward = _reward(layout.reward_space, columns.rewards)
         for i in range(len(self)):
             yield Step(
                 state(i),
                 action(i),
-                columns.rewards[i].item() if columns.rewards.ndim == 1 else columns.rewards[i],
+                reward(i),
                 bool(columns.terminals[i]),
                 bool(columns.timeouts[i]),
                 None if infos is None else infos[i],
@@ -165,6 +166,13 @@ class Episode:
 
     def __repr__(self) -> str:
         return f"<Episode {self.number}: {len(self)} steps, return {self.return_:g}, {self.end}>"
+
+
+def _reward(space: Any, column: Any) -> Any:
+    """A function from a step's index to its reward: a Python number where it is a scalar."""
+    if isinstance(column, np.ndarray):
+        return lambda i: column[i].item() if column.ndim == 1 else column[i]
+    return _item(space, column)
 
 
 def _item(space: Any, columns: Any) -> Any:

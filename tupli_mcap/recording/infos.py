@@ -31,7 +31,9 @@ class InfoRecorder:
     """Chooses and encodes infos. `select` True: everything; names: those; a callable: what it returns."""
 
     def __init__(self, select: RecordInfo) -> None:
-        self._names = [] if isinstance(select, bool) or callable(select) else list(select)
+        if isinstance(select, str):
+            select = [select]
+        self._names = [] if isinstance(select, bool) or callable(select) else list(dict.fromkeys(select))
         self._select = select
         registry = NameRegistry(("episode", "step", "json"))
         self._fields = [registry.take(name, ("", "has_", "pad_")) for name in self._names]
@@ -42,21 +44,25 @@ class InfoRecorder:
         lines += [f"float64 {field}\nbool has_{field}\nuint8[7] pad_{field}\n" for field in self._fields]
         return "".join([*lines, "string json\n"]), {"fields": jsonvalue.dumps(self._names)}
 
+    def chosen(self, info: Mapping[str, Any] | None) -> dict[str, Any]:
+        """The entries of an environment's info that are to be recorded."""
+        info = info or {}
+        if callable(self._select):
+            return dict(self._select(dict(info)) or {})
+        if self._select is True:
+            return dict(info)
+        return {name: info[name] for name in self._names if name in info}  # of no name where it is False
+
     def put(self, writer: RecordingWriter, episode: int, step: int, info: Mapping[str, Any]) -> None:
-        """Appends the info of one step to the journal."""
+        """Appends the entries of one step to the journal."""
         if writer.infos is None or writer.channels.info is None:
             return
         body = self.encode(episode, step, info)
         writer.infos.append(time.time_ns(), (writer.channels.info, body))
 
     def encode(self, episode: int, step: int, info: Mapping[str, Any]) -> bytes:
-        """The CDR body of a step's info."""
-        if callable(self._select):
-            rest = dict(self._select(dict(info)))
-        elif self._names:
-            rest = {name: info[name] for name in self._names if name in info}
-        else:
-            rest = dict(info)
+        """The CDR body of a step's entries."""
+        rest = dict(info)
         parts = [_HEAD.pack(episode, step)]
         for name in self._names:
             value = rest.get(name)
@@ -65,7 +71,7 @@ class InfoRecorder:
                 parts.append(_FIELD.pack(value, True))
             else:
                 parts.append(_FIELD.pack(0.0, False))
-        text = jsonvalue.dumps(rest, fallback=repr).encode() if rest else b"{}"
+        text = jsonvalue.dumps_any(rest).encode() if rest else b"{}"
         return b"".join([*parts, struct.pack("<I", len(text) + 1), text, b"\0"])
 
 

@@ -35,8 +35,8 @@ _MAX_HEADER = 64 << 20
 
 
 def journal_path(path: str | os.PathLike[str], directory: str | os.PathLike[str] | None = None) -> Path:
-    """Where the journal of a recording lies: beside it, or in `directory`."""
-    path = Path(path)
+    """Where the journal of a recording lies: beside it (links followed), or in `directory`."""
+    path = Path(os.path.realpath(path))
     return (path.parent if directory is None else Path(directory)) / f"{path.name}.journal"
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError, StepError
-from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value
+from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value, shorten
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
@@ -166,10 +166,10 @@ class PreparedState(NamedTuple):
 
 
 class PreparedStep(NamedTuple):
-    """A step encoded: its whole record but the header, its reward, and the state after it."""
+    """A step encoded: its whole record but the header, what it adds to the return, and the state after it."""
 
     record: bytearray
-    reward: Any
+    reward: float
     after: PreparedState
 
 
@@ -247,8 +247,13 @@ class StepLog:
         out = bytearray(self._pending)
         self._encode(out, self._action, action)
         self._encode(out, self._reward, reward)
-        out += bytes((bool(terminal), bool(timeout)))
-        return PreparedStep(out, reward, self.prepare_state(state))
+        try:
+            out += bytes((bool(terminal), bool(timeout)))
+        except ValueError as err:
+            raise StepError(
+                f"expected terminal and timeout to be true or false, found {shorten((terminal, timeout))}"
+            ) from err
+        return PreparedStep(out, self._layout.reward_total(reward), self.prepare_state(state))
 
     def commit(self, prepared: PreparedStep) -> None:
         """Completes and commits the running record; the prepared state starts the next one."""

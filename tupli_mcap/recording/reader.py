@@ -269,29 +269,24 @@ class Recording:
 
     def read(
         self,
-        episodes: Sequence[int] | None = None,
+        episodes: Sequence[int] | np.ndarray[Any, Any] | None = None,
         fields: Sequence[str] | None = None,
         threads: int | None = None,
     ) -> Columns:
         """Columns of the given episodes (all by default), one after another in the order given.
 
         Args:
-            episodes: positions in `self.episodes`.
+            episodes: positions in `self.episodes`, or a bool for each of them.
             fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states"; the first five by
                 default.
             threads: how many threads decompress; by default as many as there are cores, at most 4.
 
         Where an episode's final state is not known, `next_states` repeats its last state.
         """
-        fields = FIELDS[:5] if fields is None else list(fields)
+        fields = FIELDS[:5] if fields is None else [fields] if isinstance(fields, str) else list(fields)
         rows = self.index
         if episodes is not None:
-            chosen = np.asarray(episodes, dtype=np.int64)
-            if len(chosen) and (chosen.min() < 0 or chosen.max() >= len(rows)):
-                raise RecordingError(
-                    f"{self.name}: expected episodes from 0 to {len(rows) - 1}, found {episodes!r:.100}"
-                )
-            rows = rows[chosen]
+            rows = rows[self._positions(episodes)]
         lengths = rows["length"].astype(np.int64)
         total = int(lengths.sum())
         limit = sum(self._store.count(channel) for channel in self._step_channels)
@@ -312,6 +307,24 @@ class Recording:
             if field in found:
                 setattr(columns, field, found[field])
         return columns
+
+    def _positions(self, episodes: Any) -> Any:
+        """Positions in the index, from positions or a mask; RecordingError if they are something else."""
+        try:
+            chosen = np.asarray(episodes)
+        except ValueError:  # values of different shapes
+            chosen = np.empty((), object)
+        n = len(self.index)
+        if chosen.dtype.kind == "b" and chosen.shape == (n,):
+            return np.flatnonzero(chosen)
+        if chosen.ndim != 1 or (len(chosen) and chosen.dtype.kind not in "iu"):
+            raise RecordingError(
+                f"{self.name}: expected a list of positions from 0 to {n - 1}, or a mask of {n} bools, "
+                f"found {episodes!r:.100}"
+            )
+        if len(chosen) and (chosen.min() < 0 or chosen.max() >= n):
+            raise RecordingError(f"{self.name}: expected episodes from 0 to {n - 1}, found {episodes!r:.100}")
+        return chosen.astype(np.int64)
 
     def read_steps(self, i: int, start: int, stop: int, fields: Sequence[str] = FIELDS[:5]) -> Columns:
         """Columns of the steps `start:stop` of episode `i`; the chunks they lie in stay in the cache."""

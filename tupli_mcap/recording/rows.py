@@ -19,8 +19,9 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.journal import RowArea
 
-__all__ = ["ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
+__all__ = ["HOLE", "ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
 
+HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 Array = np.ndarray[Any, Any]
 Sink = Callable[[Rows], None]
 
@@ -188,6 +189,7 @@ class ImageRows:
         template = np.frombuffer(record + bytes(dtype.itemsize - len(record)), dtype)[0]
         for name in ("#opcode", "#length", "#channel", "#cdr"):
             self._rows[name] = template[name]
+        self._rows["#sequence"] = HOLE  # zeros would look like the first row as soon as a time is written
         self._data: Array = self._rows["data"]
         if running is not None:
             self._rows[0, 0] = running

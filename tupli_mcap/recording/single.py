@@ -71,23 +71,29 @@ class SingleRecorder:
         Raises:
             StepError: the state cannot be stored exactly.
         """
-        if self._writer.closed:
+        if self._writer.closed or self._writer.failed is not None:
             self._closed()
         self.end(INTERRUPTED, metadata)
         rows = self._writer.rows
+        self.put = self._unreset
         if rows is None:
             check_structure(self._spaces.observation_space, state, "state")
             self._reset = (copy.deepcopy(state), facts)
             self.put = self._first
             return
-        self.put = self._unreset
-        rows.begin_episode(self._writer.next_episode)
-        rows.put_state(state)
-        self._episode = self._writer.start_episode(0, rows.count, facts)
-        self.put = rows.put
+        with self._writer.whole:
+            rows.begin_episode(self._writer.next_episode)
+            rows.put_state(state)
+            self._episode = self._writer.start_episode(0, rows.count, facts)
+            self.put = rows.put
 
     def end(self, end: int, metadata: str = "{}", *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
+        if self._episode is not None and self._writer.failed is None:
+            with self._writer.whole:
+                self._end(end, metadata, has_final_state)
+
+    def _end(self, end: int, metadata: str, has_final_state: bool) -> None:
         episode, rows = self._episode, self._writer.rows
         self._episode = None
         if episode is None or rows is None:
@@ -103,10 +109,18 @@ class SingleRecorder:
         self._writer.end_episode(episode, end, length, total, final, metadata)
         self.put = self._continue
 
-    def refuse(self) -> None:
+    def refuse(self, metadata: str = "{}") -> None:
         """After a step that could not be stored: the episode ends before it, and a reset must follow."""
-        self.end(INTERRUPTED)
-        self.put = self._refused
+        self.end(INTERRUPTED, metadata)
+        if self._writer.failed is None and not self._writer.closed:
+            self.put = self._refused
+
+    def forget_reset(self, metadata: str = "{}") -> None:
+        """After a reset that failed, wherever it left the environment: the episode ends, and a reset must follow."""
+        self.end(INTERRUPTED, metadata)
+        self._reset = None
+        if self._writer.failed is None and not self._writer.closed:
+            self.put = self._unreset
 
     @property
     def step_index(self) -> int:
@@ -118,7 +132,8 @@ class SingleRecorder:
     def put_info(self, info: Mapping[str, Any]) -> None:
         """Records the info of the step just put."""
         if self._infos is not None and self._episode is not None:
-            self._infos.put(self._writer, self._episode.number, self.step_index - 1, info)
+            with self._writer.whole:
+                self._infos.put(self._writer, self._episode.number, self.step_index - 1, info)
 
     def _first(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         if self._reset is None:

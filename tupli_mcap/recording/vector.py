@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -17,30 +17,20 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages import jsonvalue
-from tupli_mcap.messages.exact import decide_dtype, leaf_value
+from tupli_mcap.messages.exact import decide_dtype, leaf_value, shorten
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.logs import StepLog, leaf_encoders
 from tupli_mcap.recording.single import decide_layout
+from tupli_mcap.recording.vector_infos import info_of
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
 
-__all__ = ["Autoreset", "VectorRecorder", "info_of"]
+__all__ = ["Autoreset", "VectorRecorder"]
 
 Array = np.ndarray[Any, Any]
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
-
-
-def info_of(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """The info of sub-environment `i`, without what autoreset adds."""
-    found = {}
-    for key, value in infos.items():
-        mask = infos.get(f"_{key}")
-        if key in ("final_obs", "final_info") or not isinstance(mask, np.ndarray) or not mask[i]:
-            continue
-        found[key] = info_of(value, i) if isinstance(value, dict) else value[i]
-    return found
 
 
 class VectorRecorder:
@@ -85,6 +75,12 @@ class VectorRecorder:
         Raises:
             StepError: a state cannot be stored exactly.
         """
+        if self._writer.failed is not None:
+            raise self._writer.failed
+        with self._writer.whole:
+            self._reset(states, facts, mask)
+
+    def _reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None) -> None:
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
         ended = self._ended.copy()
         for i in chosen:
@@ -120,19 +116,28 @@ class VectorRecorder:
                     store[i].begin_episode(0)
                     store[i].put_state(state)
 
-    def _each(self, space: Any, batch: Any) -> Iterator[Any]:
-        return iter(iterate(space, batch))
+    def _each(self, space: Any, batch: Any) -> list[Any]:
+        """A batch's values by sub-environment; StepError if they are not as many, or the batch is no such thing."""
+        try:
+            values = list(iterate(space, batch))
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError) as err:
+            raise StepError(f"expected a batch of {space}, found {shorten(batch)}") from err
+        if len(values) != self._n:
+            raise StepError(f"expected {self._n} values in a batch of {space}, found {len(values)}")
+        return values
 
     # ---- steps
 
     def put(
-        self, actions: Any, states: Any, rewards: Any, terminals: Any, timeouts: Any, infos: Mapping[str, Any]
+        self, actions: Any, states: Any, rewards: Any, terminals: Any, timeouts: Any, infos: Any
     ) -> Array:
         """Records a batch; returns which sub-environments took a step (bool, `num_envs`).
 
         Raises:
             StepError: something cannot be stored exactly; nothing of this batch is recorded.
         """
+        if self._writer.failed is not None:
+            raise self._writer.failed
         if not self._was_reset or self._refused:
             why = (
                 "the step before this one could not be recorded"
@@ -140,21 +145,26 @@ class VectorRecorder:
                 else "there was no reset yet"
             )
             raise StepError(f"{why}; call env.reset() to go on")
-        rewards = np.asarray(rewards)
-        terminals, timeouts = np.asarray(terminals, dtype=np.bool_), np.asarray(timeouts, dtype=np.bool_)
-        if self._writer.vector is None:
-            self._begin(actions, states, rewards)
-        done = terminals | timeouts
-        any_done = bool(done.any())
-        holes = self._ended if self._any_ended and self._autoreset == "NextStep" else None
-        active = None if holes is None else ~holes
+        with self._writer.whole:
+            return self._put(actions, states, rewards, terminals, timeouts, infos)
+
+    def _put(
+        self, actions: Any, states: Any, rewards: Any, terminals: Any, timeouts: Any, infos: Any
+    ) -> Array:
         try:
+            rewards, terminals, timeouts = self._numbers_of(rewards, terminals, timeouts)
+            if self._writer.vector is None:
+                self._begin(actions, states, rewards)
+            done = terminals | timeouts
+            any_done = bool(done.any())
+            holes = self._ended if self._any_ended and self._autoreset == "NextStep" else None
+            active = None if holes is None else ~holes
             finals = self._finals(done, infos) if any_done and self._autoreset == "SameStep" else {}
             self._store(actions, states, rewards, terminals, timeouts, active, finals)
         except StepError:
             self.refuse()
             raise
-        totals = rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1)
+        totals = rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1, dtype=np.float64)
         if active is None:
             self._lengths += 1
             self._totals += totals
@@ -167,28 +177,38 @@ class VectorRecorder:
         self._any_ended = bool(self._ended.any())
         return active
 
+    def _numbers_of(self, rewards: Any, terminals: Any, timeouts: Any) -> tuple[Array, Array, Array]:
+        """Rewards and flags as arrays; the rewards' shape is checked when they are stored."""
+        flags = np.asarray(terminals, dtype=np.bool_), np.asarray(timeouts, dtype=np.bool_)
+        for name, flag in zip(("terminal", "timeout"), flags, strict=True):
+            if flag.shape != (self._n,):
+                raise StepError(f"{name}: expected shape {(self._n,)}, found shape {flag.shape}")
+        return np.asarray(rewards), *flags
+
     def note_metadata(self, texts: Sequence[str]) -> None:
         """The metadata (JSON texts) of the running episodes, by sub-environment."""
         self._texts = list(texts)
 
     def finish(self, terminals: Any, infos: Mapping[str, Any]) -> None:
         """Ends the episodes that ended in the batch just put; `infos` are that batch's."""
-        if not self._any_ended:
+        if not self._any_ended or self._writer.failed is not None:
             return
-        for i in np.flatnonzero(self._ended).tolist():
-            self._end(i, TERMINAL if terminals[i] else TIMEOUT)
-        if self._autoreset == "SameStep":
-            self._note_resets(self._ended, infos)
-            self._any_ended = False
+        with self._writer.whole:
+            for i in np.flatnonzero(self._ended).tolist():
+                self._end(i, TERMINAL if terminals[i] else TIMEOUT)
+            if self._autoreset == "SameStep":
+                self._note_resets(self._ended, infos)
+                self._any_ended = False
 
     def put_infos(self, stepped: Array, entries: Sequence[Mapping[str, Any]]) -> None:
         """Records infos of the batch just put."""
         if self._infos is None:
             return
-        for i in np.flatnonzero(stepped).tolist():
-            episode = self._episodes[i]
-            if episode is not None:
-                self._infos.put(self._writer, episode.number, int(self._lengths[i]) - 1, entries[i])
+        with self._writer.whole:
+            for i in np.flatnonzero(stepped).tolist():
+                episode = self._episodes[i]
+                if episode is not None:
+                    self._infos.put(self._writer, episode.number, int(self._lengths[i]) - 1, entries[i])
 
     def _begin(self, actions: Any, states: Any, rewards: Array) -> None:
         if self._spaces.constant:
@@ -199,7 +219,7 @@ class VectorRecorder:
             layout = decide_layout(
                 self._spaces,
                 firsts,
-                list(self._each(self._actions, actions)),
+                self._each(self._actions, actions),
                 list(rewards),
                 self._writer.layout,
             )
@@ -228,9 +248,14 @@ class VectorRecorder:
             self._spaces.observation_space, self._spaces.action_space, self._spaces.reward_space, dtypes
         )
 
-    def _finals(self, done: Array, infos: Mapping[str, Any]) -> dict[int, Any]:
+    def _finals(self, done: Array, infos: Any) -> dict[int, Any]:
         """The final states of a same-step autoreset."""
-        given = infos.get("final_obs", infos.get("final_observation"))
+        if isinstance(infos, Mapping):
+            given = infos.get("final_obs", infos.get("final_observation"))
+        else:
+            given = [(info or {}).get("final_obs") for info in infos]
+        if isinstance(given, dict):
+            given = self._each(self._observations, given)
         if given is None:
             raise StepError(
                 "expected infos['final_obs'] for episodes that end under same-step autoreset, found none"
@@ -303,6 +328,8 @@ class VectorRecorder:
         found = []
         for sinks, leaf in zip(self._writer.images, self._writer.layout.images, strict=True):  # type: ignore[union-attr]
             batch = leaf_value(states, leaf)
+            if np.shape(batch)[:1] != (self._n,):
+                raise StepError(f"{leaf.path}: expected {self._n} images, found shape {np.shape(batch)}")
             found.append((sinks, [sinks[i].check(batch[i]) for i in range(self._n)]))
         return found
 
@@ -317,8 +344,8 @@ class VectorRecorder:
     def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
         now = time.time_ns()
         for i in np.flatnonzero(holes).tolist():
-            info = info_of(infos, i) if infos else None
-            text = jsonvalue.dumps(info, fallback=repr) if info else "{}"
+            info = info_of(infos, i, self._n) if infos else None
+            text = jsonvalue.dumps_any(info) if info else "{}"
             self._facts[i] = ResetFacts(None, None, "", text, now)
         self._fresh = True
 
@@ -341,10 +368,13 @@ class VectorRecorder:
 
     def refuse(self) -> None:
         """After a batch that could not be stored: running episodes end before it, and a reset must follow."""
-        for i in range(self._n):
-            if self._episodes[i] is not None and self._lengths[i]:
-                self._end(i, INTERRUPTED)
         self._refused = True
+        if self._writer.failed is not None or self._writer.closed:
+            return
+        with self._writer.whole:
+            for i in range(self._n):
+                if self._episodes[i] is not None and self._lengths[i]:
+                    self._end(i, INTERRUPTED)
 
     def close(self) -> None:
         """Ends the running episodes as interrupted and closes the recording."""
@@ -352,8 +382,9 @@ class VectorRecorder:
             return
         try:
             if self._writer.failed is None:
-                for i in range(self._n):
-                    self._end(i, INTERRUPTED)
+                with self._writer.whole:
+                    for i in range(self._n):
+                        self._end(i, INTERRUPTED)
         finally:
             self._refused = True
             self._writer.close()

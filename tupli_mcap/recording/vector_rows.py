@@ -17,11 +17,9 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.journal import RowArea
-from tupli_mcap.recording.rows import Array, RowDeriver, Sink, even_rows
+from tupli_mcap.recording.rows import HOLE, Array, RowDeriver, Sink, even_rows
 
 __all__ = ["HOLE", "VectorRows"]
-
-HOLE = 0xFFFFFFFF
 
 
 class VectorRows:

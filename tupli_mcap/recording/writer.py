@@ -11,15 +11,17 @@ import os
 import struct
 import time
 import uuid
+import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.errors import RecordingError, SpaceError
+from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.container import Container, Rows
@@ -28,7 +30,7 @@ from tupli_mcap.recording.events import (
     EpisodeStart,
 )
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.journal import Area, Journal, journal_path
+from tupli_mcap.recording.journal import Area, Journal, journal_path, read_journal
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog, StepLog
 from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
@@ -63,9 +65,14 @@ class RecordingWriter:
 
     def __init__(self, path: str | os.PathLike[str], options: WriterOptions) -> None:
         self.path = Path(path)
-        self.options = options
+        # the process may change its directory before the journal is made
+        self._place = Path(os.path.realpath(path))
+        self.options = options = _checked(options)
         self.closed = False
         self.failed: RecordingError | None = None
+        self._broken_off = False
+        self._old_journal: Path | None = None  # on append: of the writer that was killed
+        self.whole = _Whole(self)
         self.layout: StepLayout | None = None
         self.index = IndexBuilder()
         self.next_episode = 0
@@ -101,7 +108,8 @@ class RecordingWriter:
         if self.options.mode == "a" and self.path.stat().st_size:
             from tupli_mcap.recording.append import resume
 
-            resume(self)
+            if not resume(self):
+                self._old_journal = self._journal_path()
             return
         try:
             os.ftruncate(self.lock.fd, 0)
@@ -118,7 +126,7 @@ class RecordingWriter:
             "benchmark_id": self.options.benchmark_id,
         }
         if self.options.journal_dir is not None:
-            values["journal"] = str(journal_path(self.path, self.options.journal_dir).resolve())
+            values["journal"] = str(self._journal_path())
         self.container.start(values["library"])
         self.container.add_metadata(RECORDING_METADATA, values)
         for name, (media_type, data) in (self.options.attachments or {}).items():
@@ -280,11 +288,22 @@ class RecordingWriter:
             raise RecordingError(
                 f"{self.path}: a channel holds at most {LAST_ROW} messages; go on in a new recording"
             )
-        try:
+        with self.whole:
             self.container.add_chunk(rows)
-        except RecordingError as err:
+
+    def stop(self, err: BaseException) -> None:
+        """After something that was left half done: nothing more is accepted, and the journal keeps what it holds."""
+        if self.failed is not None:
+            return
+        if isinstance(err, RecordingError):
             self.failed = err
-            raise
+        else:
+            self._broken_off = True
+            self.failed = RecordingError(
+                f"{self.path}: {type(err).__name__} broke off the recorder's work; every finished step is safe: "
+                'close the recording, and go on with mode="a"'
+            )
+        self.on_abandon()
 
     def _step_stores(self) -> list[Any]:
         if self.vector is None:
@@ -311,7 +330,8 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Writes everything recorded so far into chunks (the file still has no summary)."""
-        self._flush(keep_last=self.start_is_droppable())
+        with self.whole:
+            self._flush(keep_last=self.start_is_droppable())
 
     def _flush(self, *, keep_last: bool) -> None:
         self._flushed_at = time.monotonic()
@@ -349,7 +369,10 @@ class RecordingWriter:
             "channels": [channels.steps, channels.images, *channels[2:]],
             "definitions": {str(c): self.container.definitions(c).hex() for c in self.container.channels},
         }
-        return Journal(journal_path(self.path, self.options.journal_dir), list(areas), description)
+        return Journal(self._journal_path(), list(areas), description)
+
+    def _journal_path(self) -> Path:
+        return journal_path(self._place, self.options.journal_dir)
 
     def close(self) -> None:
         """Writes the rest, the episode index and the summary, and removes the journal."""
@@ -357,6 +380,9 @@ class RecordingWriter:
             return
         self.closed = True
         _live.discard(self)
+        if self._broken_off:
+            self._finish_broken_off()
+            return
         try:
             self.flush()
             data = self.index.encode(self.container.chunk_rows)
@@ -369,8 +395,23 @@ class RecordingWriter:
         else:
             if self.journal is not None:
                 self.journal.close(unlink=True)
+            elif self._old_journal is not None:
+                with contextlib.suppress(OSError, FormatError):
+                    if read_journal(self._old_journal).info.get("uuid") == self.uuid:
+                        self._old_journal.unlink()
         finally:
             self.lock.release()
+
+    def _finish_broken_off(self) -> None:
+        """What is in memory cannot be trusted; the file and the journal can, as after a killed process."""
+        if self.journal is not None:
+            self.journal.close(unlink=False)
+        self.lock.release()
+        place = self._journal_path()
+        place.with_name(f"{place.name}.tmp").unlink(missing_ok=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
+            RecordingWriter(self._place, WriterOptions(self.options.compression, "a")).close()
 
     def abandon(self) -> None:
         """In a forked child: lets go of the file and its lock without writing; the parent goes on."""
@@ -380,6 +421,37 @@ class RecordingWriter:
         )
         self.lock.abandon()
         self.on_abandon()
+
+
+class _Whole:
+    """A context for what must not be left half done, by Ctrl-C for one; a refused step is no such thing."""
+
+    __slots__ = ("_writer",)
+
+    def __init__(self, writer: RecordingWriter) -> None:
+        self._writer = writer
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if err is not None and not isinstance(err, StepError):
+            self._writer.stop(err)
+
+
+def _checked(options: WriterOptions) -> WriterOptions:
+    """The options, with a place for the journal that does not depend on the process's directory."""
+    if options.chunk_size < 1:
+        raise RecordingError(f"chunk_size: expected at least 1 byte, found {options.chunk_size!r}")
+    if options.journal_dir is None:
+        return options
+    if not Path(options.journal_dir).is_dir():
+        raise RecordingError(
+            f"journal_dir: expected a directory, found {str(options.journal_dir)!r}; make it"
+        )
+    return options._replace(journal_dir=os.path.realpath(options.journal_dir))
 
 
 class ResetFacts(NamedTuple):

@@ -24,7 +24,7 @@ from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, Write
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import benchmark_attachments
 
-__all__ = ["RecordEpisodes"]
+__all__ = ["RecordEpisodes", "metadata_text"]
 
 StepCallback = Callable[[Step], Mapping[str, Any] | None]
 
@@ -81,8 +81,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         if attachments is None:
             attachments = benchmark_attachments(env)
         wanted = record_info is not False or step_callback is not None
-        infos = InfoRecorder([] if record_info is False else record_info) if wanted else None
-        self._records_info = record_info is not False
+        self._infos = InfoRecorder(record_info) if wanted else None
         options = WriterOptions(
             compression, mode, benchmark_id, attachments, journal_dir, chunk_size, flush_seconds
         )
@@ -96,8 +95,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         except SpaceError:
             self._writer.close()
             raise
-        self._recorder = SingleRecorder(self._writer, spaces, infos)
-        self._watches = metadata_callback is not None or infos is not None
+        self._recorder = SingleRecorder(self._writer, spaces, self._infos)
+        self._watches = metadata_callback is not None or wanted
         self._episode_metadata: list[str] = [
             "{}"
         ]  # shared with the finalizer, which must not hold the wrapper
@@ -121,56 +120,67 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         try:
             self._recorder.put(action, state, reward, terminal, timeout)
         except StepError:
-            self._recorder.refuse()
+            self._recorder.refuse(self._taken_metadata())
             raise
-        if self._watches:
-            self._watch(action, state, reward, terminal, timeout, info)
-        if terminal or timeout:
-            self._end(TERMINAL if terminal else TIMEOUT)
+        except BaseException as err:  # a full disk, Ctrl-C
+            self._writer.stop(err)
+            raise
+        try:
+            if self._watches:
+                self._watch(action, state, reward, terminal, timeout, info)
+        finally:  # a callback that raises changes nothing about what the environment did
+            if terminal or timeout:
+                self._end(TERMINAL if terminal else TIMEOUT)
         return result
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         unseeded = seed is None and getattr(self.env.unwrapped, "_np_random", 0) is None
-        result = self.env.reset(seed=seed, options=options)
-        state, info = result
-        facts = ResetFacts(
-            seed,
-            _drawn_seed(self.env) if unseeded else None,
-            "" if options is None else jsonvalue.dumps(options, fallback=repr),
-            jsonvalue.dumps(info, fallback=repr) if info else "{}",
-            time.time_ns(),
-        )
-        interrupted, self._episode_metadata[0] = self._episode_metadata[0], "{}"
-        self._recorder.reset(state, facts, interrupted)
+        try:
+            result = self.env.reset(seed=seed, options=options)
+            state, info = result
+            facts = ResetFacts(
+                seed,
+                _drawn_seed(self.env) if unseeded else None,
+                "" if options is None else jsonvalue.dumps_any(options),
+                jsonvalue.dumps_any(info) if info else "{}",
+                time.time_ns(),
+            )
+            if self._watches:
+                self._state = copy.deepcopy(state)
+            self._recorder.reset(state, facts, self._taken_metadata())
+        except BaseException:  # wherever the environment is now: the running episode is over
+            self._recorder.forget_reset(self._taken_metadata())
+            raise
         if self._metadata_callback is not None and self._stepped:
             self._metadata_callback.reset()
         self._stepped = False
-        if self._watches:
-            self._state = copy.deepcopy(state)
         return result
+
+    def _taken_metadata(self) -> str:
+        metadata, self._episode_metadata[0] = self._episode_metadata[0], "{}"
+        return metadata
 
     def _watch(
         self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any, info: dict[str, Any]
     ) -> None:
-        before, entries = self._state, dict(info) if self._records_info else {}
-        if self._step_callback is not None:
-            extra = self._step_callback(Step(before, action, reward, terminal, timeout, info))
-            entries.update(extra or {})
-        self._recorder.put_info(entries)
+        before, self._state = self._state, copy.deepcopy(state)  # the environment may reuse its arrays
+        self._stepped = True
+        if self._infos is not None:
+            entries = self._infos.chosen(info)
+            if self._step_callback is not None:
+                extra = self._step_callback(Step(before, action, reward, terminal, timeout, info))
+                entries.update(extra or {})
+            self._recorder.put_info(entries)
         if self._metadata_callback is not None:
             rl_tuple = RLTuple.model_construct(
                 state=before, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
             )
-            metadata = self._metadata_callback(rl_tuple)
-            self._episode_metadata[0] = jsonvalue.dumps_plain(metadata) if metadata else "{}"
-        self._stepped = True
-        self._state = copy.deepcopy(state)  # the environment may reuse its arrays
+            self._episode_metadata[0] = metadata_text(self._metadata_callback(rl_tuple))
 
     def _end(self, end: int) -> None:
-        metadata, self._episode_metadata[0] = self._episode_metadata[0], "{}"
-        self._recorder.end(end, metadata)
+        self._recorder.end(end, self._taken_metadata())
         self._stepped = False
         if self._metadata_callback is not None:
             self._metadata_callback.reset()
@@ -197,6 +207,18 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         raise RecordingError(
             f"a wrapper that records to {self.path} cannot be pickled or copied; wrap the environment there"
         )
+
+
+def metadata_text(metadata: Any) -> str:
+    """What a metadata callback returned, as JSON; RecordingError unless it is a dict of what JSON can hold."""
+    if not metadata:
+        return "{}"
+    if not isinstance(metadata, Mapping):
+        raise RecordingError(f"metadata_callback: expected a dict, found {metadata!r:.100}")
+    try:
+        return jsonvalue.dumps_plain(dict(metadata))
+    except (TypeError, ValueError) as err:
+        raise RecordingError(f"metadata_callback: {err}") from err
 
 
 def _close(recorder: SingleRecorder, metadata: list[str]) -> None:

@@ -19,10 +19,12 @@ from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
-from tupli_mcap.recording.vector import VectorRecorder, info_of
+from tupli_mcap.recording.vector import VectorRecorder
+from tupli_mcap.recording.vector_infos import final_info_of, info_of
 from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
+from tupli_mcap.wrappers.single import metadata_text
 
 __all__ = ["RecordEpisodes"]
 
@@ -64,10 +66,13 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         )
         self._step_callback = step_callback
         wanted = record_info is not False or step_callback is not None
-        self._records_info = record_info is not False
-        infos = InfoRecorder([] if record_info is False else record_info) if wanted else None
+        self._infos = InfoRecorder(record_info) if wanted else None
         if attachments is None:
             attachments = vector_benchmark_attachments(env)
+        if reward_space is not None and reward_space.shape is None:
+            raise SpaceError(
+                f"reward: expected a space of arrays for a vector environment, found {reward_space}"
+            )
         spaces = StepLayout(env.single_observation_space, env.single_action_space, reward_space)
         spaces.to_metadata()
         options = WriterOptions(
@@ -79,7 +84,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         except SpaceError:
             self._writer.close()
             raise
-        self._recorder = VectorRecorder(self._writer, spaces, n, self._autoreset, infos)
+        self._recorder = VectorRecorder(self._writer, spaces, n, self._autoreset, self._infos)
         self._texts = ["{}"] * n
         self._states: list[Any] = []
         self._watches = wanted or metadata_callback is not None
@@ -91,19 +96,34 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         if self._writer.closed:
             raise RecordingError(f"{self.path} is closed; wrap the environment again to record")
         stepped = self._recorder.put(actions, states, rewards, terminals, timeouts, infos)
-        if self._watches:
-            self._watch(stepped, actions, result)
-        self._recorder.finish(terminals, infos)
+        try:
+            if self._watches:
+                self._watch(stepped, actions, result)
+        finally:  # a callback that raises changes nothing about what the environments did
+            self._recorder.finish(terminals, infos)
         return result
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        told = "" if options is None else jsonvalue.dumps(options, fallback=repr)
+        told = "" if options is None else jsonvalue.dumps_any(options)
         mask = None if options is None else options.get("reset_mask")
         mask = None if mask is None else np.array(mask, dtype=np.bool_)
-        result = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        states, infos = result
+        try:
+            result = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+            states, infos = result
+            facts = self._facts(seed, told, infos)
+            if self._watches:
+                self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
+            self._recorder.reset(states, facts, mask)
+        except BaseException:  # wherever the environments are now: the running episodes are over
+            self._recorder.refuse()
+            raise
+        if self._watches:
+            self._forget(range(self.num_envs) if mask is None else np.flatnonzero(mask))
+        return result
+
+    def _facts(self, seed: Any, options: str, infos: Any) -> list[ResetFacts]:
         n, now = self.num_envs, time.time_ns()
         seeds: list[int | None] = [None] * n
         if isinstance(seed, int | np.integer):
@@ -112,47 +132,50 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             seeds = list(seed)
         facts = []
         for i in range(n):
-            info = info_of(infos, i)
-            facts.append(
-                ResetFacts(seeds[i], None, told, jsonvalue.dumps(info, fallback=repr) if info else "{}", now)
-            )
-        self._recorder.reset(states, facts, mask)
-        if self._watches:
-            self._forget(range(n) if mask is None else np.flatnonzero(mask))
-            self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
-        return result
+            info = info_of(infos, i, n)
+            text = jsonvalue.dumps_any(info) if info else "{}"
+            facts.append(ResetFacts(seeds[i], None, options, text, now))
+        return facts
 
     def _watch(self, stepped: Any, actions: Any, result: Any) -> None:
         states, rewards, terminals, timeouts, infos = result
-        after = copy.deepcopy(list(iterate(self.env.observation_space, states)))
+        before = self._states
+        self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
         entries: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         chosen = list(iterate(self.env.action_space, actions))
-        for i in np.flatnonzero(stepped):
-            info = info_of(infos, int(i))
-            if (terminals[i] or timeouts[i]) and self._autoreset == "SameStep":
-                info = info_of(infos.get("final_info", {}), int(i))
-            entries[i] = dict(info) if self._records_info else {}
-            values = (self._states[i], chosen[i], rewards[i], bool(terminals[i]), bool(timeouts[i]))
-            if self._step_callback is not None:
-                entries[i].update(self._step_callback(Step(*values, info)) or {})
+        try:
+            for i in np.flatnonzero(stepped).tolist():
+                info = info_of(infos, i, self.num_envs)
+                if (terminals[i] or timeouts[i]) and self._autoreset == "SameStep":
+                    info = final_info_of(infos, i, self.num_envs)
+                step = Step(before[i], chosen[i], rewards[i], bool(terminals[i]), bool(timeouts[i]), info)
+                entries[i] = self._entries(step)
+                self._call(i, step)
+            self._recorder.put_infos(stepped, entries)
+        finally:
+            self._recorder.note_metadata(self._texts)
             if self._callbacks is not None:
-                state, action, reward, terminal, timeout = values
-                metadata = self._callbacks[i](
-                    RLTuple.model_construct(
-                        state=state,
-                        action=action,
-                        reward=float(reward),
-                        info=info,
-                        terminal=terminal,
-                        timeout=timeout,
-                    )
-                )
-                self._texts[i] = jsonvalue.dumps_plain(metadata) if metadata else "{}"
-        self._recorder.put_infos(stepped, entries)
-        self._recorder.note_metadata(self._texts)
-        if self._callbacks is not None:
-            self._forget([i for i in np.flatnonzero(stepped) if terminals[i] or timeouts[i]])
-        self._states = after
+                self._forget([i for i in np.flatnonzero(stepped) if terminals[i] or timeouts[i]])
+
+    def _entries(self, step: Step) -> dict[str, Any]:
+        entries = {} if self._infos is None else self._infos.chosen(step.info)
+        if self._step_callback is not None:
+            entries.update(self._step_callback(step) or {})
+        return entries
+
+    def _call(self, i: int, step: Step) -> None:
+        if self._callbacks is None:
+            return
+        state, action, reward, terminal, timeout, info = step
+        rl_tuple = RLTuple.model_construct(
+            state=state,
+            action=action,
+            reward=reward if np.ndim(reward) else float(reward),
+            info=info,
+            terminal=terminal,
+            timeout=timeout,
+        )
+        self._texts[i] = metadata_text(self._callbacks[i](rl_tuple))
 
     def _forget(self, chosen: Any) -> None:
         for i in chosen:

@@ -1,0 +1,191 @@
+"""Ctrl-C at any line of the recorder: what was returned is in the file, exactly, and the file opens."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Scripted, same
+from gymnasium import spaces
+
+from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+KINDS: dict[str, tuple[gym.Space[Any], Any]] = {
+    "box": (spaces.Box(-1, 1, (3,), np.float32), lambda n: np.full(3, n, np.float32)),
+    "text": (spaces.Text(50, min_length=0), lambda n: "x" * n),
+    "image": (spaces.Box(0, 255, (4, 4, 3), np.uint8), lambda n: np.full((4, 4, 3), n, np.uint8)),
+}
+
+
+class BreakAt:
+    """Raises KeyboardInterrupt at the `line`-th line of the package that is run."""
+
+    def __init__(self, line: int) -> None:
+        self.left = line
+
+    def __call__(self, frame: Any, event: str, arg: Any) -> Any:
+        return self.local if "tupli_mcap" in frame.f_code.co_filename else None
+
+    def local(self, frame: Any, event: str, arg: Any) -> Any:
+        if event == "line" and frame.f_code.co_name != "__del__":
+            self.left -= 1
+            if self.left == 0:
+                raise KeyboardInterrupt
+        return self.local
+
+
+def scripted(kind: str) -> gym.Env[Any, Any]:
+    space, observe = KINDS[kind]
+    return Scripted(observe, space, length=4)
+
+
+class Rollout:
+    """Steps, and what the policy saw of them."""
+
+    def __init__(self, env: Any, action: Any) -> None:
+        self.env, self.action = env, action
+        self.state: Any = None
+        self.seen: list[tuple[Any, Any]] = []
+
+    def run(self, steps: int) -> None:
+        self.state = copy.deepcopy(self.env.reset()[0])
+        for _ in range(steps):
+            state, _, terminal, timeout, _ = self.env.step(self.action)
+            state = copy.deepcopy(state)
+            self.seen.append((self.state, state))
+            self.state = state
+            if isinstance(terminal, bool) and (terminal or timeout):
+                self.state = copy.deepcopy(self.env.reset()[0])
+
+
+def broken_off(rollout: Rollout, line: int) -> bool:
+    sys.settrace(BreakAt(line))
+    try:
+        rollout.run(12)
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(None)
+    return False
+
+
+def transitions(path: Path) -> list[tuple[Any, Any]]:
+    found = []
+    for episode in Recording(path).episodes:
+        states = [step.state for step in episode] + [episode.final_state]
+        found += list(itertools.pairwise(states))
+    return found
+
+
+@pytest.mark.parametrize("go_on", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_anywhere(tmp_path: Path, kind: str, go_on: bool) -> None:
+    for line in range(1, 10_000, 29):
+        path = tmp_path / f"{line}.mcap"
+        env = RecordEpisodes(scripted(kind), path, chunk_size=400, record_info=True)
+        rollout = Rollout(env, 1)
+        hit = broken_off(rollout, line)
+        if go_on:
+            try:
+                rollout.run(6)
+            except RecordingError as err:
+                assert "KeyboardInterrupt broke off" in str(err)  # noqa: PT017 (mostly it does not raise)
+        env.close()
+        assert not list(tmp_path.glob("*.journal*"))
+        found = transitions(path)
+        assert len(rollout.seen) <= len(found) <= len(rollout.seen) + 1
+        assert all(any(same(step, one) for one in found) for step in rollout.seen)
+        for before, after in found:
+            size = [len(x) if isinstance(x, str) else int(x.flat[0]) for x in (before, after)]
+            assert size[1] == size[0] + 1  # nothing is spliced
+        assert Recording(path).complete
+        if not hit:
+            return
+    raise AssertionError("the rollout was never finished")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_anywhere_in_a_vector_rollout(tmp_path: Path, kind: str) -> None:
+    for line in range(1, 20_000, 61):
+        path = tmp_path / f"{line}.mcap"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            envs = gym.vector.SyncVectorEnv([lambda: scripted(kind)] * 2)
+        env = RecordVector(envs, path, chunk_size=400, record_info=True)
+        rollout = Rollout(env, np.array([1, 1]))
+        hit = broken_off(rollout, line)
+        env.close()
+        found = transitions(path)
+        ended = sum(
+            1 for _, after in rollout.seen if _number(after) == 0
+        )  # ignored steps of next-step autoreset
+        assert 2 * (len(rollout.seen) - ended) <= len(found) <= 2 * (len(rollout.seen) + 1)
+        for before, after in found:
+            assert _number(after) == _number(before) + 1
+        if not hit:
+            return
+    raise AssertionError("the rollout was never finished")
+
+
+def _number(state: Any) -> int:
+    if isinstance(state, str):
+        return len(state)
+    return len(state[0]) if isinstance(state, tuple) else int(np.asarray(state).flat[0])
+
+
+def test_the_next_session_goes_on(tmp_path: Path) -> None:
+    class Full:
+        def __call__(self, *_: Any) -> None:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "r.mcap"
+    env = RecordEpisodes(scripted("box"), path, chunk_size=400)
+    env.reset()
+    env.step(0)
+    env._writer.container.add_chunk = Full()  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        env.flush()
+    for use in (env.reset, lambda: env.step(0), env.flush):
+        with pytest.raises(RecordingError, match="every finished step is safe"):
+            use()  # type: ignore[operator]
+    env.close()
+    with RecordEpisodes(scripted("box"), path, mode="a") as env:
+        env.reset()
+        env.step(0)
+    assert [len(episode) for episode in Recording(path).episodes] == [1, 1]
+
+
+def test_a_reset_that_fails_ends_the_episode(tmp_path: Path) -> None:
+    class Fails(gym.Wrapper[Any, Any, Any, Any]):
+        fail = False
+
+        def reset(self, **kwargs: Any) -> Any:
+            result = self.env.reset(**kwargs)
+            if self.fail:
+                raise RuntimeError("no answer")
+            return result
+
+    inner = Fails(scripted("box"))
+    with RecordEpisodes(inner, tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step(0)
+        inner.fail = True
+        with pytest.raises(RuntimeError, match="no answer"):
+            env.reset()
+        inner.fail = False
+        with pytest.raises(StepError, match="call env.reset"):
+            env.step(0)
+        env.reset()
+        env.step(0)
+    episodes = Recording(tmp_path / "r.mcap").episodes
+    assert [(e.states[:, 0].tolist(), e.final_state[0], e.end) for e in episodes] == [
+        ([0.0], 1.0, "interrupted")
+    ] * 2
