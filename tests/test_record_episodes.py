@@ -523,6 +523,16 @@ def test_flush_in_any_state(tmp_path: Path) -> None:
     check_against(tmp_path / "r.mcap", taken)
 
 
+def test_chunks_by_time_where_asked_for(tmp_path: Path) -> None:
+    space = spaces.Box(-1, 1, (2,))
+    env = Sampler(space, spaces.Discrete(2), length=1000)
+    with RecordEpisodes(env, tmp_path / "r.mcap", flush_seconds=0.0) as recorded:
+        taken = roll(recorded, 20)
+        sizes = (tmp_path / "r.mcap").stat().st_size
+        assert sizes > 20 * 50  # every step has been written, though no half is full and no episode has ended
+    check_against(tmp_path / "r.mcap", taken)
+
+
 def test_wrappers_are_not_pickled(tmp_path: Path) -> None:
     import pickle
 

@@ -316,6 +316,8 @@ def test_statistics_of_episodes_are_recorded(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mode", MODES, ids=name_of)
 def test_lists_of_infos(tmp_path: Path, mode: Any) -> None:
+    if mode is None:
+        pytest.skip("DictInfoToList of Gymnasium 1.0 fails on the infos of its own RecordEpisodeStatistics")
     inner = gym.wrappers.vector.RecordEpisodeStatistics(make(SPACES["box"], mode))
     envs = gym.wrappers.vector.DictInfoToList(inner)
     with RecordEpisodes(envs, tmp_path / "r.mcap", record_info=True) as env:

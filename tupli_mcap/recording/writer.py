@@ -149,8 +149,8 @@ class RecordingWriter:
         self.channels = register_channels(
             self.container, str(self.path), layout, num_envs if vector else None, info_schema
         )
-        self.container.define_channels()
         self._make_stores(self._areas())
+        self.container.define_channels()  # after the journal: a file with channels has one
 
     def _areas(self, step_capacity: int = 0) -> list[Area]:
         has_infos = self.channels.info is not None
@@ -272,10 +272,12 @@ class RecordingWriter:
             number, env, end,
         )  # fmt: skip
         self.index.add(EpisodeRow._make(row), metadata)
-        if (
-            self.options.flush_seconds is not None
-            and time.monotonic() - self._flushed_at > self.options.flush_seconds
-        ):
+        self.flush_if_due()
+
+    def flush_if_due(self) -> None:
+        """Flushes if `flush_seconds` were asked for and have passed since the last flush."""
+        seconds = self.options.flush_seconds
+        if seconds is not None and time.monotonic() - self._flushed_at > seconds:
             self.flush()
 
     # ---- chunks

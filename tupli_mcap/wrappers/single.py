@@ -46,7 +46,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         reward_space: for rewards that are arrays.
         benchmark_id: the benchmark the episodes belong to.
         attachments: name -> (media type, bytes), written before the first step.
-        flush_seconds: also write a chunk when an episode ends this many seconds after the last one.
+        flush_seconds: also write chunks this many seconds after the last ones, full or not.
         journal_dir: where the journal goes, if not beside the recording (a local disk for a network path).
         chunk_size: bytes of a chunk before compression.
 
@@ -97,9 +97,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             raise
         self._recorder = SingleRecorder(self._writer, spaces, self._infos)
         self._watches = metadata_callback is not None or wanted
-        self._episode_metadata: list[str] = [
-            "{}"
-        ]  # shared with the finalizer, which must not hold the wrapper
+        # shared with the finalizer, which must not hold the wrapper
+        self._episode_metadata: list[str] = ["{}"]
+        self._flush_seconds = flush_seconds
         self._stepped = False
         self._state: Any = None
         self._finalizer = weakref.finalize(self, _close, self._recorder, self._episode_metadata)
@@ -128,6 +128,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         try:
             if self._watches:
                 self._watch(action, state, reward, terminal, timeout, info)
+            if self._flush_seconds is not None:
+                self._writer.flush_if_due()
         finally:  # a callback that raises changes nothing about what the environment did
             if terminal or timeout:
                 self._end(TERMINAL if terminal else TIMEOUT)

@@ -101,6 +101,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
                 self._watch(stepped, actions, result)
         finally:  # a callback that raises changes nothing about what the environments did
             self._recorder.finish(terminals, infos)
+        self._writer.flush_if_due()
         return result
 
     def reset(
