@@ -69,12 +69,13 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         FormatError: it is no recording of ours, or its first records are damaged.
     """
     metadata = _head(source)
+    found = scan(source)
     if isinstance(journal, Exception):
-        warnings.warn(_missing(source, journal), UserWarning, stacklevel=6)
+        if found.channels:  # defined when the journal is there: without them no step has been taken
+            warnings.warn(_missing(source, journal), UserWarning, stacklevel=6)
         journal = None
     elif journal is not None and journal.info.get("uuid") != metadata["uuid"]:
         journal = None  # a stale journal of another recording with this name is not ours to merge
-    found = scan(source)
     if journal is not None:
         _define(found, journal, source)
     tail = _Tail()
