@@ -847,3 +847,10 @@ def test_a_bar_after_a_second(
     assert out == ""
     assert "Loading" in err
     assert set(threading.enumerate()) == threads
+
+
+def test_explain_shows_the_sql(tmp_path: Path) -> None:
+    storage = FileStorage(tmp_path / "lab")
+    text = TupliDataset(storage).with_episode_filter(F("n_tuples") > 3).explain()
+    assert "SELECT" in text
+    assert "n_tuples" in text

@@ -134,6 +134,10 @@ class TupliDataset:
         """The episodes, listed anew; no step is read."""
         return list(self._query.refresh())
 
+    def explain(self) -> str:
+        """How the episodes are looked up: the SQL of the filters and its plan, for a storage with a catalog."""
+        return self._query.source.explain(self._query.benchmark_filter, self._query.episode_filter)
+
     def load(self) -> None:
         """List the episodes anew and read their steps (states, actions, rewards, terminals, timeouts) into
         memory.

@@ -50,6 +50,8 @@ class Source(Protocol):
         """The episodes both filters are true of; those of one recording follow each other."""
         ...
 
+    def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str: ...
+
     def open(self, recording: str) -> Recording:
         """The recording that a header names; the caller closes it."""
         ...
@@ -67,13 +69,23 @@ class StorageSource:
     def episodes(
         self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None
     ) -> list[EpisodeHeader]:
-        wanted = episode_filter
-        if benchmark_filter is not None:
-            ids = [header.id for header in self.benchmarks(benchmark_filter)]
-            wanted = FilterIN(key="benchmark_id", value=ids)
-            if episode_filter is not None:
-                wanted = wanted & episode_filter
+        wanted = self._wanted(benchmark_filter, episode_filter)
         return cast("list[EpisodeHeader]", self.storage.list_episodes(wanted))
+
+    def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
+        """How the storage looks the episodes up: SQL and plan where it has a catalog, else the filter."""
+        wanted = self._wanted(benchmark_filter, episode_filter)
+        explain = getattr(self.storage, "explain", None)
+        return str(wanted) if explain is None else str(explain(wanted))
+
+    def _wanted(
+        self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None
+    ) -> BaseFilter | None:
+        if benchmark_filter is None:
+            return episode_filter
+        ids = [header.id for header in self.benchmarks(benchmark_filter)]
+        wanted = FilterIN(key="benchmark_id", value=ids)
+        return wanted if episode_filter is None else wanted & episode_filter
 
     def open(self, recording: str) -> Recording:
         return self.storage.open_recording(recording)
@@ -134,6 +146,10 @@ class FilesSource:
             files.update((header.id, name) for header in new)
             found += [header for header in new if episode_filter is None or matches(header)]
         return found
+
+    def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
+        """Files have no SQL: what every episode is tried against."""
+        return f"every episode: benchmark {benchmark_filter}, episode {episode_filter}"
 
     def open(self, recording: str) -> Recording:
         return Recording(recording, cache_bytes=_CACHE_BYTES)
