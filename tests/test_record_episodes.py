@@ -751,3 +751,36 @@ def test_options_are_checked_before_a_file_is_made(tmp_path: Path, options: Any,
     with pytest.raises(RecordingError, match=match):
         RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_image_whose_values_stray_is_an_array(tmp_path: Path) -> None:
+    space = spaces.Box(0, 255, (4, 3, 3), np.uint8)
+    env = Scripted(lambda step: np.full((4, 3, 3), step / 4, np.float32), space)
+    with pytest.warns(UserWarning, match="state is declared uint8, but the values are float32"):
+        with RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
+            taken = roll(recorded, 12)
+    check_against(tmp_path / "r.mcap", taken)
+
+
+def test_environments_that_reset_themselves(tmp_path: Path) -> None:
+    env = gym.wrappers.Autoreset(Scripted(lambda step: step, spaces.Discrete(99), length=3))
+    with RecordEpisodes(env, tmp_path / "r.mcap", metadata_callback=Totals()) as recorded:
+        recorded.reset()
+        for _ in range(9):
+            recorded.step(1)
+    episodes = Recording(tmp_path / "r.mcap").episodes
+    assert [e.states.tolist() for e in episodes] == [[0, 1, 2], [0, 1, 2], [0]]
+    assert [e.final_state for e in episodes] == [3, 3, 1]
+    assert [e.metadata["total"] for e in episodes] == [3, 3, 1]
+
+
+def test_signalling_nans_are_not_quieted(tmp_path: Path) -> None:
+    odd = np.array([0x7FA00001, 0], np.uint32).view(np.float32)
+    env = Scripted(lambda step: odd if step == 2 else np.zeros(2), BOX)
+    with pytest.warns(UserWarning, match="float64"):
+        recorded = RecordEpisodes(env, tmp_path / "r.mcap")
+        recorded.reset()
+        recorded.step(0)
+    with pytest.raises(StepError, match="expected values that float64 holds exactly"):
+        recorded.step(0)
+    recorded.close()

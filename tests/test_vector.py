@@ -372,3 +372,12 @@ def test_nested_rewards_are_refused_before_a_file_is_made(tmp_path: Path) -> Non
     with pytest.raises(SpaceError, match="reward: expected a space of arrays"):
         RecordEpisodes(Batches(), tmp_path / "r.mcap", reward_space=spaces.Dict({"a": spaces.Discrete(2)}))
     assert not list(tmp_path.iterdir())
+
+
+def test_the_seeds_of_an_unseeded_first_reset_are_found(tmp_path: Path) -> None:
+    envs = SyncVectorEnv([lambda: gym.make("CartPole-v1")] * 2)
+    with RecordEpisodes(envs, tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step([0, 1])
+    for episode in Recording(tmp_path / "r.mcap").episodes:
+        assert np.array_equal(gym.make("CartPole-v1").reset(seed=episode.seed)[0], episode.states[0])

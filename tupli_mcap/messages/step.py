@@ -7,6 +7,7 @@ a reader refuses a file whose schema text says something else.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -70,6 +71,13 @@ class StepLayout:
             raise SpaceError(
                 f"dtypes are given for {sorted(given)}, which are no constant leaves of these spaces"
             )
+        # an image whose values are not uint8 is no image that viewers know, but an array like any other
+        self.state = [
+            replace(leaf, kind="array")
+            if leaf.kind == "image" and self.dtypes[leaf.name] != np.uint8
+            else leaf
+            for leaf in self.state
+        ]
         self.nest_state = structure(observation_space)
         self.nest_action = structure(action_space)
         self.nest_reward = structure(reward)

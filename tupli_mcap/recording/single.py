@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -37,7 +38,7 @@ def decide_layout(
                 inner[leaf.name] = variable_dtypes(leaf.space, values, leaf.path)
                 continue
             default_reward = leaf.name == "reward" and spaces.reward_space is None
-            dtype = leaf.dtype if default_reward or leaf.kind == "image" else decide_dtype(leaf, values)
+            dtype = leaf.dtype if default_reward else decide_dtype(leaf, values)
             for value in values:
                 exact_array(value, dtype, leaf.shape, leaf.path)
             dtypes[leaf.name] = dtype
@@ -58,6 +59,7 @@ class SingleRecorder:
         self._infos = infos
         self._reset: tuple[Any, ResetFacts] | None = None
         self._episode: StartedEpisode | None = None
+        self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset
         writer.on_abandon = self._abandon
         writer.start_is_droppable = lambda: self._episode is not None and self.step_index == 0
@@ -151,6 +153,9 @@ class SingleRecorder:
         rows = self._writer.rows
         if rows is None:
             raise StepError("expected a reset before the first step; call env.reset()")
+        if self.resets_itself:
+            self.reset(state, ResetFacts(None, None, "", "{}", time.time_ns()))
+            return
         rows.begin_episode(self._writer.next_episode)
         facts = ResetFacts(None, None, "", "{}", 0, continued=True)
         self._episode = self._writer.start_episode(0, rows.count, facts)

@@ -239,7 +239,7 @@ class VectorRecorder:
             (self._spaces.reward, rewards),
         ):
             for leaf in leaves:
-                if leaf.dtype is None or leaf.kind == "image":
+                if leaf.dtype is None:
                     continue
                 if leaf.name == "reward" and self._spaces.reward_space is None:
                     continue

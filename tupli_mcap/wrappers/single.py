@@ -23,6 +23,7 @@ from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import benchmark_attachments
+from tupli_mcap.wrappers.seeds import drawn_seed
 
 __all__ = ["RecordEpisodes", "metadata_text"]
 
@@ -96,6 +97,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             self._writer.close()
             raise
         self._recorder = SingleRecorder(self._writer, spaces, self._infos)
+        self._recorder.resets_itself = _resets_itself(env)
         self._watches = metadata_callback is not None or wanted
         # shared with the finalizer, which must not hold the wrapper
         self._episode_metadata: list[str] = ["{}"]
@@ -127,7 +129,10 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             raise
         try:
             if self._watches:
-                self._watch(action, state, reward, terminal, timeout, info)
+                if self._recorder.step_index == 0:  # a step that was a reset
+                    self._state = copy.deepcopy(state)
+                else:
+                    self._watch(action, state, reward, terminal, timeout, info)
             if self._flush_seconds is not None:
                 self._writer.flush_if_due()
         finally:  # a callback that raises changes nothing about what the environment did
@@ -144,7 +149,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             state, info = result
             facts = ResetFacts(
                 seed,
-                _drawn_seed(self.env) if unseeded else None,
+                drawn_seed(self.env) if unseeded else None,
                 "" if options is None else jsonvalue.dumps_any(options),
                 jsonvalue.dumps_any(info) if info else "{}",
                 time.time_ns(),
@@ -227,6 +232,9 @@ def _close(recorder: SingleRecorder, metadata: list[str]) -> None:
     recorder.close(metadata[0])
 
 
-def _drawn_seed(env: gym.Env[Any, Any]) -> int | None:
-    seed = getattr(env.unwrapped, "_np_random_seed", None)
-    return seed if isinstance(seed, int) and seed >= 0 else None
+def _resets_itself(env: gym.Env[Any, Any]) -> bool:
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.wrappers.Autoreset):
+            return True
+        env = env.env
+    return False

@@ -24,6 +24,7 @@ from tupli_mcap.recording.vector_infos import final_info_of, info_of
 from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
+from tupli_mcap.wrappers.seeds import drawn_seed
 from tupli_mcap.wrappers.single import metadata_text
 
 __all__ = ["RecordEpisodes"]
@@ -110,10 +111,11 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         told = "" if options is None else jsonvalue.dumps_any(options)
         mask = None if options is None else options.get("reset_mask")
         mask = None if mask is None else np.array(mask, dtype=np.bool_)
+        unseeded = [getattr(env.unwrapped, "_np_random", 0) is None for env in self._sub_environments()]
         try:
             result = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
             states, infos = result
-            facts = self._facts(seed, told, infos)
+            facts = self._facts(seed, unseeded, told, infos)
             if self._watches:
                 self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
             self._recorder.reset(states, facts, mask)
@@ -124,7 +126,12 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             self._forget(range(self.num_envs) if mask is None else np.flatnonzero(mask))
         return result
 
-    def _facts(self, seed: Any, options: str, infos: Any) -> list[ResetFacts]:
+    def _sub_environments(self) -> list[Any]:
+        """Those in this process; of the others no drawn seed can be known."""
+        envs = getattr(self.env.unwrapped, "envs", None)
+        return list(envs) if isinstance(envs, list | tuple) else []
+
+    def _facts(self, seed: Any, unseeded: list[bool], options: str, infos: Any) -> list[ResetFacts]:
         n, now = self.num_envs, time.time_ns()
         seeds: list[int | None] = [None] * n
         if isinstance(seed, int | np.integer):
@@ -135,7 +142,10 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         for i in range(n):
             info = info_of(infos, i, n)
             text = jsonvalue.dumps_any(info) if info else "{}"
-            facts.append(ResetFacts(seeds[i], None, options, text, now))
+            drawn = None
+            if seeds[i] is None and i < len(unseeded) and unseeded[i]:
+                drawn = drawn_seed(self._sub_environments()[i])
+            facts.append(ResetFacts(seeds[i], drawn, options, text, now))
         return facts
 
     def _watch(self, stepped: Any, actions: Any, result: Any) -> None:
