@@ -19,6 +19,7 @@ KINDS: dict[str, Any] = {
     "text": spaces.Dict({"note": spaces.Text(30), "x": spaces.Discrete(5)}),
     "image": spaces.Dict({"camera": spaces.Box(0, 255, (8, 8, 3), np.uint8), "x": spaces.Box(-1, 1, (1,))}),
     "large": spaces.Dict({"x": spaces.Discrete(5), "y": spaces.Box(-1, 1, (600,))}),
+    "frames": spaces.Box(0, 255, (80, 80, 3), np.uint8),
     "vector": spaces.Box(-1, 1, (4,), np.float32),
     "info": spaces.Box(-1, 1, (4,), np.float32),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
+import threading
 import warnings
 from pathlib import Path
 from typing import Any
@@ -784,3 +785,14 @@ def test_signalling_nans_are_not_quieted(tmp_path: Path) -> None:
     with pytest.raises(StepError, match="expected values that float64 holds exactly"):
         recorded.step(0)
     recorded.close()
+
+
+def test_a_thread_writes_large_images(tmp_path: Path) -> None:
+    space = spaces.Box(0, 255, (90, 80, 3), np.uint8)
+    with RecordEpisodes(Sampler(space, spaces.Discrete(3)), tmp_path / "r.mcap", chunk_size=1000) as env:
+        taken = roll(env, 60)
+        assert any(thread.name.startswith("tupli-mcap-chunks") for thread in threading.enumerate())
+        env.flush()
+        taken += roll(env, 5)
+    assert not any(thread.name.startswith("tupli-mcap-chunks") for thread in threading.enumerate())
+    check_against(tmp_path / "r.mcap", taken)

@@ -252,6 +252,46 @@ def test_a_full_disk_is_one_clear_error_and_the_rest_stays(tmp_path: Path) -> No
     assert Recording(path).num_steps == int(taken)
 
 
+def test_what_the_image_thread_cannot_write_is_raised(tmp_path: Path) -> None:
+    code = (
+        "import resource, signal, sys, numpy as np\n"
+        "from gymnasium import spaces\n"
+        "from environments import Sampler\n"
+        "from tupli_mcap import RecordEpisodes, RecordingError\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "env = Sampler(spaces.Box(0, 255, (80, 80, 3), np.uint8), spaces.Discrete(2), length=10**9)\n"
+        "env = RecordEpisodes(env, sys.argv[1], compression='none')\n"
+        "env.reset(seed=1); env.step(0)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, 600_000))\n"
+        "n = 1\n"
+        "try:\n"
+        "    while True:\n"
+        "        n += 1\n"
+        "        env.step(0)\n"
+        "except RecordingError as err:\n"
+        "    print(n, err)\n"
+        "try:\n"
+        "    env.close()\n"
+        "except RecordingError:\n"
+        "    pass\n"
+    )
+    path = tmp_path / "r.mcap"
+    child = subprocess.run(
+        [sys.executable, "-c", code, str(path)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        cwd=Path(__file__).parent,
+    )
+    assert child.stdout, child.stderr
+    taken, message = child.stdout.split(" ", 1)
+    assert "could not write" in message
+    recording = Recording(path)
+    assert int(taken) - 1 <= recording.num_steps <= int(taken)
+    assert recording.read().states.shape[1:] == (80, 80, 3)
+
+
 def test_vector_recordings_are_finished_by_append(tmp_path: Path) -> None:
     def make(path: Path, **kwargs: Any) -> Any:
         envs = gym.vector.SyncVectorEnv([lambda: Sampler(KINDS["box"], spaces.Discrete(9)) for _ in range(2)])

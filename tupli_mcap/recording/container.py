@@ -6,7 +6,9 @@ whole arrays.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import threading
 import zlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -65,7 +67,10 @@ class Rows(NamedTuple):
 
 
 class Container:
-    """Writes records to a file descriptor and remembers what the summary needs. Not thread-safe."""
+    """Writes records to a file descriptor and remembers what the summary needs.
+
+    `add_chunk` may be called from two threads, for different channels; nothing else.
+    """
 
     def __init__(self, fd: int, name: str, compression: Compression) -> None:
         if compression not in COMPRESSIONS:
@@ -73,7 +78,8 @@ class Container:
         self._fd = fd
         self._name = name
         self._compression = compression
-        self._zstd = zstandard.ZstdCompressor(level=1)
+        self._local = threading.local()  # a compressor is not to be shared
+        self._lock = threading.RLock()
         self.position = 0
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -94,8 +100,9 @@ class Container:
             while view:
                 view = view[os.write(self._fd, view) :]
         except OSError as err:
-            os.ftruncate(self._fd, start)
-            os.lseek(self._fd, start, os.SEEK_SET)
+            with contextlib.suppress(OSError):  # what stays behind is no whole record, and is not read
+                os.ftruncate(self._fd, start)
+                os.lseek(self._fd, start, os.SEEK_SET)
             raise RecordingError(
                 f"{self._name}: could not write {len(data)} bytes at offset {start}: {err.strerror}; "
                 "what was recorded before stays readable"
@@ -167,20 +174,27 @@ class Container:
         name = "" if self._compression == "none" else self._compression
         builder = RecordBuilder()
         Chunk(name, packed, end, start, crc, size).write(builder)
-        chunk = _built(builder)
         index = _message_index(rows, len(head))
+        with self._lock:
+            self._place_chunk(rows, _built(builder), index, (start, end, size, len(head), crc, len(packed)))
+
+    def _place_chunk(
+        self, rows: Rows, chunk: bytes, index: bytes, facts: tuple[int, int, int, int, int, int]
+    ) -> None:
+        start, end, size, skip, crc, packed = facts
+        name = "" if self._compression == "none" else self._compression
         entry = ChunkIndex(
             chunk_length=len(chunk),
             chunk_start_offset=self.position,
             compression=name,
-            compressed_size=len(packed),
+            compressed_size=packed,
             message_end_time=end,
             message_index_length=len(index),
             message_index_offsets={rows.channel: self.position + len(chunk)},
             message_start_time=start,
             uncompressed_size=size,
         )
-        row = (self.position, len(chunk), size, rows.first, len(rows.offsets), len(head), crc, rows.channel)
+        row = (self.position, len(chunk), size, rows.first, len(rows.offsets), skip, crc, rows.channel)
         self.write(chunk + index)
         self.note_chunk(entry, (*row, COMPRESSIONS.index(self._compression), 0))
 
@@ -199,10 +213,13 @@ class Container:
 
     def _pack(self, data: Any) -> bytes:
         if self._compression == "zstd":
-            return self._zstd.compress(data)
-        if self._compression == "lz4":
-            packed: bytes = lz4.frame.compress(data)
+            if not hasattr(self._local, "zstd"):
+                self._local.zstd = zstandard.ZstdCompressor(level=1)
+            packed: bytes = self._local.zstd.compress(data)
             return packed
+        if self._compression == "lz4":
+            framed: bytes = lz4.frame.compress(data)
+            return framed
         return bytes(data)
 
     def finish(self) -> None:

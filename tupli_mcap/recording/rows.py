@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.journal import RowArea
+from tupli_mcap.recording.worker import ChunkWorker
 
 __all__ = ["HOLE", "ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
 
@@ -165,7 +167,10 @@ class ImageRows:
         sink: Sink,
         first: int = 0,
         time_ns: int = 0,
+        worker: ChunkWorker | None = None,
     ) -> None:
+        self._worker = worker
+        self._jobs: dict[int, Future[None]] = {}  # chunks being written, by the half they are in
         self._leaf = leaf
         self._layout = layout
         self._channel = channel
@@ -225,18 +230,30 @@ class ImageRows:
         if self._row < self._area.rows:
             return
         half, rows, flushed = self._half, self._area.rows, self._flushed
+        self._wait(1 - half)  # a half is used again only when its chunk is in the file
         self._half, self._row, self._flushed = 1 - half, 0, 0
-        self._emit(half, flushed, rows, self._sequence - rows + flushed)
+        self._emit(half, flushed, rows, self._sequence - rows + flushed, self._worker)
 
     def flush(self) -> None:
         """Writes the rows before the running one."""
+        self._wait(1 - self._half)
         flushed, self._flushed = self._flushed, self._row
-        self._emit(self._half, flushed, self._row, self._sequence - self._row + flushed)
+        self._emit(self._half, flushed, self._row, self._sequence - self._row + flushed, None)
 
-    def _emit(self, half: int, begin: int, end: int, first: int) -> None:
+    def _wait(self, half: int) -> None:
+        """Until the chunk of a half is in the file; raises what its writing raised."""
+        job = self._jobs.pop(half, None)
+        if job is not None:
+            job.result()
+
+    def _emit(self, half: int, begin: int, end: int, first: int, worker: ChunkWorker | None) -> None:
         if begin == end:
             return
         size = self._area.row_size
         start = half * self._area.half
         data = self._buffer[start + begin * size : start + end * size]
-        self._sink(even_rows(self._channel, first, data, np.frombuffer(data, self._rows.dtype)))
+        rows = even_rows(self._channel, first, data, np.frombuffer(data, self._rows.dtype))
+        if worker is None:
+            self._sink(rows)
+        else:
+            self._jobs[half] = worker.submit(rows)

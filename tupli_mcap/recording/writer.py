@@ -35,6 +35,7 @@ from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog, StepLog
 from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
 from tupli_mcap.recording.vector_rows import VectorRows
+from tupli_mcap.recording.worker import ChunkWorker
 
 __all__ = ["FORMAT_VERSION", "RECORDING_METADATA", "Mode", "RecordingWriter", "WriterOptions"]
 
@@ -42,6 +43,7 @@ FORMAT_VERSION = "1"
 RECORDING_METADATA = "tupli_mcap.recording"
 Mode = Literal["x", "w", "a"]
 _NUMBERS = struct.Struct("<II")
+_LARGE_ROW = 16 * 1024  # bytes from which a thread writes the chunks
 LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
 
 
@@ -80,6 +82,7 @@ class RecordingWriter:
         self.rows: SingleRows | StepLog | None = None
         self.vector: VectorRows | list[StepLog] | None = None
         self.images: list[list[ImageRows]] = []
+        self.worker = ChunkWorker(self.add_chunk)
         self.events: EventLog | None = None
         self.infos: EventLog | None = None
         # set by the recorder: told of a fork (its encoder knows only its buffer), and asked whether the last event
@@ -182,6 +185,7 @@ class RecordingWriter:
                     ImageRows(
                         leaf, layout.image_messages[leaf.name], rows_area(f"{leaf.name}/{i}"),
                         buffer(f"{leaf.name}/{i}"), channel, self.add_chunk, counts[channel], before_ns,
+                        self.worker if leaf.size >= _LARGE_ROW else None,
                     )
                     for i, channel in enumerate(ids)
                 ]
@@ -402,10 +406,12 @@ class RecordingWriter:
                     if read_journal(self._old_journal).info.get("uuid") == self.uuid:
                         self._old_journal.unlink()
         finally:
+            self.worker.close()
             self.lock.release()
 
     def _finish_broken_off(self) -> None:
         """What is in memory cannot be trusted; the file and the journal can, as after a killed process."""
+        self.worker.close()
         if self.journal is not None:
             self.journal.close(unlink=False)
         self.lock.release()
