@@ -6,6 +6,7 @@ import functools
 import http.server
 import io
 import threading
+import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -348,3 +349,46 @@ def test_episodes_are_chosen_by_positions_or_a_mask(path: Path) -> None:
             recording.read(wrong)
     assert np.array_equal(recording.read([]).states, expected[:0])
     assert np.array_equal(recording.read(fields="states").states, recording.read().states)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gym.spaces.Box(-1, 1, (2,)),
+        gym.spaces.Dict({"frame": gym.spaces.Box(0, 255, (4, 4, 3), np.uint8), "n": gym.spaces.Discrete(5)}),
+        gym.spaces.Tuple((gym.spaces.Text(8), gym.spaces.Box(-1, 1, (0,)), gym.spaces.Box(-1, 1, (1, 1)))),
+    ],
+    ids=["box", "image", "text"],
+)
+def test_final_states_and_times_as_columns(tmp_path: Path, space: gym.Space[Any]) -> None:
+    path = tmp_path / "a.mcap"
+    before = time.time_ns()
+    with RecordEpisodes(Sampler(space, gym.spaces.Discrete(3), 4), path) as env:
+        roll(env, 18)
+    with Recording(path) as recording:
+        finals = recording.final_states([3, 0, 1])
+        columns = recording.read(fields=["times"])
+        one = recording.read_steps(1, 1, 3, ["times"])
+        leaves = recording.layout.state
+        for leaf in leaves:
+            for place, i in enumerate([3, 0, 1]):
+                assert same(leaf.get(recording.final_state(i)), leaf.get(finals)[place])
+        assert columns.times.dtype == np.int64 and len(columns.times) == 18
+        assert (np.diff(columns.times) >= 0).all() and before < columns.times[0] <= time.time_ns()
+        assert same(one.times, columns.times[5:7])
+        assert (recording.index["start_time"][1:4] <= columns.times[[4, 8, 12]]).all()
+        assert (columns.times[[3, 7, 11, 15]] <= recording.index["end_time"][:4]).all()
+        with pytest.raises(RecordingError, match="expected episodes from 0 to 4"):
+            recording.final_states([5])
+        for leaf in leaves:
+            assert len(leaf.get(recording.final_states([]))) == 0
+
+
+def test_a_final_state_that_is_not_known_is_no_column(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    steps = EpisodeData([0, 1], [0, 1], [0.0, 0.0], [False, True], [False, False])
+    write_recording(
+        path, [steps], observation_space=gym.spaces.Discrete(3), action_space=gym.spaces.Discrete(3)
+    )
+    with Recording(path) as recording, pytest.raises(RecordingError, match="of episode 0 is not known"):
+        recording.final_states([0])

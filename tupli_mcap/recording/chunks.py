@@ -31,6 +31,9 @@ _CHUNK_HEAD = struct.Struct(
 )  # opcode, length, start, end, uncompressed size, crc, compression length
 
 
+_TIME, _TIME_OFFSET = struct.Struct("<Q"), 15  # in a Message record
+
+
 class Span(NamedTuple):
     """Rows `begin:end` of chunk `chunk`."""
 
@@ -191,3 +194,10 @@ class ChunkStore:
             data = memoryview(self.load(span.chunk))
             for start, end in self.messages(span.chunk)[span.begin : span.end]:
                 yield data[start + BODY : end]
+
+    def times(self, channel: int, first: int, count: int) -> Iterator[int]:
+        """The log times (ns) of messages of a channel of variable layout."""
+        for span in self.spans(channel, first, count):
+            data = memoryview(self.load(span.chunk))
+            for start, _ in self.messages(span.chunk)[span.begin : span.end]:
+                yield _TIME.unpack_from(data, start + _TIME_OFFSET)[0]

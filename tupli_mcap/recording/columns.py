@@ -18,7 +18,8 @@ from tupli_mcap.recording.chunks import ChunkStore
 
 __all__ = ["FIELDS", "ColumnReader", "Columns", "Run", "runs_of"]
 
-FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states")
+FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
+_TIME = "#log_time"
 Array = np.ndarray[Any, Any]
 _FEW_TASKS = 4  # fewer are done before a thread pool has started
 
@@ -28,7 +29,8 @@ class Columns:
     """Columns of the asked fields, None for the others.
 
     A constant leaf is an array of shape (steps, *leaf shape), a leaf of variable size a list; both are nested as the
-    space is. `episode_lengths` (int64) says where episodes end.
+    space is. `episode_lengths` (int64) says where episodes end. `times` (int64, ns) is the wall clock when each step
+    returned.
     """
 
     episode_lengths: Array
@@ -38,6 +40,7 @@ class Columns:
     terminals: Any = None
     timeouts: Any = None
     next_states: Any = None
+    times: Any = None
 
     def __len__(self) -> int:
         return int(self.episode_lengths.sum())
@@ -80,6 +83,14 @@ def runs_of(episodes: Array, channels: Sequence[int]) -> list[Run]:
     ]
 
 
+def _final_runs(episodes: Array, channel: int) -> list[Run]:
+    """The runs of the final states of index rows in `/final_state`."""
+    rows = episodes["final_row"].astype(np.int64)
+    starts = np.flatnonzero(np.diff(rows, prepend=-2) != 1)
+    ends = np.append(starts[1:], len(rows))
+    return [Run(channel, int(rows[a]), int(b - a), int(a)) for a, b in zip(starts, ends, strict=True)]
+
+
 class ColumnReader:
     """Reads columns of a recording's layout."""
 
@@ -106,8 +117,14 @@ class ColumnReader:
         flags = [name for name in ("terminal", "timeout") if f"{name}s" in fields]
         out: dict[str, Any] = {leaf.name: self._empty(leaf, total) for leaf in leaves}
         out.update({name: np.empty(total, np.bool_) for name in flags})
+        if "times" in fields:
+            out[_TIME] = np.empty(total, np.int64)
         tasks: list[Callable[[], None]] = []
         plain = [leaf.name for leaf in leaves if leaf.kind != "image" and leaf.size] + flags
+        if layout.constant and "times" in fields:
+            plain.append(_TIME)
+        elif "times" in fields:
+            self._read_times(runs, out[_TIME])
         if plain and layout.constant:
             tasks += self._tasks(runs, plain, out, layout.step_message.dtype, keep)
         elif plain:
@@ -131,6 +148,8 @@ class ColumnReader:
             if field in fields
         }
         columns.update({f"{name}s": out[name] for name in flags})
+        if "times" in fields:
+            columns["times"] = out[_TIME]
         return columns
 
     def _empty(self, leaf: Leaf, total: int) -> Any:
@@ -177,6 +196,40 @@ class ColumnReader:
                 values = self._decoder.step(body)
                 for name in names:
                     out[name][run.out + i] = values[name]
+
+    def _read_times(self, runs: Sequence[Run], out: Array) -> None:
+        for run in runs:
+            times = self._store.times(run.channel, run.first, run.steps)
+            out[run.out : run.out + run.steps] = np.fromiter(times, np.int64, run.steps)
+
+    def final_columns(self, channel: int, episodes: Array) -> list[Any]:
+        """A column of final states for each leaf of the state, of index rows that all have one."""
+        if self._decoder is not None:
+            found = [values for values in self.final_states(channel, episodes) if values is not None]
+            return [
+                [values[leaf.name] for values in found]
+                if leaf.kind == "variable"
+                else np.array([values[leaf.name] for values in found], self._layout.dtypes[leaf.name])
+                for leaf in self._layout.state
+            ]
+        out = {leaf.name: self._empty(leaf, len(episodes)) for leaf in self._layout.state}
+        numbers = np.empty(len(episodes), np.uint32)
+        names = [leaf.name for leaf in self._layout.state if leaf.size] + ["episode"]
+        for task in self._tasks(
+            _final_runs(episodes, channel),
+            names,
+            {**out, "episode": numbers},
+            self._layout.final_message.dtype,
+            True,
+        ):
+            task()
+        wrong = np.flatnonzero(numbers != episodes["episode"])
+        if len(wrong):
+            first = int(wrong[0])
+            raise FormatError(
+                f"expected the final state of episode {episodes['episode'][first]}, found that of {numbers[first]}"
+            )
+        return [out[leaf.name] for leaf in self._layout.state]
 
     def final_states(self, channel: int, episodes: Array) -> list[dict[str, Any] | None]:
         """Leaf values of the final state of each given index row, by leaf name; None where there is none."""

@@ -233,6 +233,23 @@ class Recording:
             return None
         return self.layout.nest_state([values[leaf.name] for leaf in self.layout.state])
 
+    def final_states(self, episodes: Sequence[int] | np.ndarray[Any, Any]) -> Any:
+        """The final states of some episodes (positions or a mask) as columns, nested as the observation space is.
+
+        Raises:
+            RecordingError: the final state of one of them is not known (`index["final_row"]` is -1).
+        """
+        rows = self.index[self._positions(episodes)]
+        unknown = rows["episode"][rows["final_row"] < 0]
+        if len(unknown):
+            raise RecordingError(
+                f"{self.name}: the final state of episode {unknown[0]} is not known; leave it out"
+            )
+        if not len(rows):
+            return self.read([], fields=["states"]).states
+        columns = self._reader.final_columns(self._channel("/final_state"), rows)
+        return self.layout.nest_state(columns)
+
     def _channel(self, topic: str) -> int:
         if topic not in self._topics:
             raise FormatError(
@@ -277,8 +294,8 @@ class Recording:
 
         Args:
             episodes: positions in `self.episodes`, or a bool for each of them.
-            fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states"; the first five by
-                default.
+            fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states", "times"; the first
+                five by default.
             threads: how many threads decompress; by default as many as there are cores, at most 4.
 
         Where an episode's final state is not known, `next_states` repeats its last state.
@@ -342,26 +359,26 @@ class Recording:
         return columns
 
     def _next_states(self, states: Any, rows: Any, lengths: Any) -> Any:
-        finals = self._finals(rows) if len(rows) else []
         layout = self.layout
+        known = rows["final_row"] >= 0
         ends = np.cumsum(lengths) - 1
-        known = [(int(end), values) for end, values in zip(ends, finals, strict=True) if values is not None]
+        finals: list[Any] = []
+        if known.any():
+            finals = self._reader.final_columns(self._channel("/final_state"), rows[known])
         columns = []
-        for leaf in layout.state:
+        for i, leaf in enumerate(layout.state):
             column = leaf.get(states)
             if isinstance(column, list):
                 shifted: Any = column[1:] + column[-1:]
+                for end in ends[~known]:
+                    shifted[end] = column[end]
+                for end, value in zip(ends[known], finals[i] if finals else [], strict=True):
+                    shifted[end] = value
             else:
                 shifted = np.concatenate([column[1:], column[-1:]])
-            for end in ends[[values is None for values in finals]] if len(ends) else []:
-                shifted[end] = column[end]
-            if known and not isinstance(shifted, list):
-                shifted[[end for end, _ in known]] = np.array(
-                    [values[leaf.name] for _, values in known], shifted.dtype
-                )
-            else:
-                for end, values in known:
-                    shifted[end] = values[leaf.name]
+                shifted[ends[~known]] = column[ends[~known]]
+                if finals:
+                    shifted[ends[known]] = finals[i]
             columns.append(shifted)
         return layout.nest_state(columns)
 
