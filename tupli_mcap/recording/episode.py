@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.columns import Columns
     from tupli_mcap.recording.reader import Recording
 
-__all__ = ["Episode", "Episodes", "Step"]
+__all__ = ["Episode", "Episodes", "Step", "item_getter"]
 
 
 class Step(NamedTuple):
@@ -151,8 +151,8 @@ class Episode:
     def __iter__(self) -> Iterator[Step]:
         columns, infos = self._columns, self.infos
         layout = self._recording.layout
-        state = _item(layout.observation_space, columns.states)
-        action = _item(layout.action_space, columns.actions)
+        state = item_getter(layout.observation_space, columns.states)
+        action = item_getter(layout.action_space, columns.actions)
         reward = _reward(layout.reward_space, columns.rewards)
         for i in range(len(self)):
             yield Step(
@@ -172,18 +172,18 @@ def _reward(space: Any, column: Any) -> Any:
     """A function from a step's index to its reward: a Python number where it is a scalar."""
     if isinstance(column, np.ndarray):
         return lambda i: column[i].item() if column.ndim == 1 else column[i]
-    return _item(space, column)
+    return item_getter(space, column)
 
 
-def _item(space: Any, columns: Any) -> Any:
+def item_getter(space: Any, columns: Any) -> Any:
     """A function from a step's index to its value, of the type the space's own samples have."""
     from gymnasium import spaces
 
     if type(space) is spaces.Dict:
-        parts = {key: _item(sub, columns[key]) for key, sub in space.spaces.items()}
+        parts = {key: item_getter(sub, columns[key]) for key, sub in space.spaces.items()}
         return lambda i: {key: part(i) for key, part in parts.items()}
     if type(space) is spaces.Tuple:
-        items = [_item(sub, column) for sub, column in zip(space.spaces, columns, strict=True)]
+        items = [item_getter(sub, column) for sub, column in zip(space.spaces, columns, strict=True)]
         return lambda i: tuple(item(i) for item in items)
     if type(space) is spaces.Box and space.shape == () and columns.dtype.kind == "f":
         return lambda i: np.asarray(

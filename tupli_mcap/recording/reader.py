@@ -162,6 +162,11 @@ class Recording:
         return len(self._step_channels)
 
     @property
+    def is_vector(self) -> bool:
+        """True if a vector environment was recorded, of one sub-environment or more."""
+        return "/env_0/step" in self._topics
+
+    @property
     def num_steps(self) -> int:
         """Steps of all episodes."""
         return int(self.index["length"].sum())

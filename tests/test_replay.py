@@ -1,0 +1,216 @@
+"""Recordings replayed on real environments: what agrees, what does not, and what is said of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from tupli_mcap import EpisodeData, RecordEpisodes, Recording, RecordingError, UntrustedError, write_recording
+from tupli_mcap.replay import Certificate, certify
+from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
+
+
+def roll(env: gym.Env[Any, Any], steps: int, seed: int | None = 1) -> None:
+    """The usual loop: one seed at the start, none after it."""
+    env.action_space.seed(0)
+    env.reset(seed=seed)
+    for _ in range(steps):
+        _, _, terminal, timeout, _ = env.step(env.action_space.sample())
+        if terminal or timeout:
+            env.reset()
+
+
+def record(
+    path: Path, env: gym.Env[Any, Any], steps: int = 100, seed: int | None = 1, mode: Any = "x"
+) -> Path:
+    with RecordEpisodes(env, path, mode=mode) as recorder:
+        roll(recorder, steps, seed)
+    return path
+
+
+def forge(source: Path, target: Path, change: Callable[[int, EpisodeData], EpisodeData | None]) -> Path:
+    """The same episodes by hand, changed; None leaves one out."""
+    with Recording(source) as recording:
+        attachments = {
+            name: (info.media_type, recording.read_attachment(name))
+            for name, info in recording.attachments.items()
+        }
+        episodes = []
+        for i, episode in enumerate(recording.episodes):
+            columns = {
+                name: np.array(getattr(episode, name))
+                for name in ("states", "actions", "rewards", "terminals", "timeouts")
+            }
+            given = EpisodeData(
+                **columns, final_state=episode.final_state, seed=episode.seed, end=episode.end
+            )
+            changed = change(i, given)
+            if changed is not None:
+                episodes.append(changed)
+        spaces = {"observation_space": recording.observation_space, "action_space": recording.action_space}
+    write_recording(target, episodes, **spaces, attachments=attachments)
+    return target
+
+
+def check_complete(certificate: Certificate) -> None:
+    assert certificate.agrees and certificate.complete
+    assert certificate.first is None and not certificate.skipped
+
+
+@pytest.mark.parametrize("seed", [1, None])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "CartPole-v1",
+        "Pendulum-v1",
+        "MountainCar-v0",
+        "FrozenLake-v1",
+        "Taxi-v4",
+        "Blackjack-v1",
+        "Acrobot-v1",
+    ],
+)
+def test_an_environment_agrees_with_its_recording(tmp_path: Path, name: str, seed: int | None) -> None:
+    path = record(tmp_path / "a.mcap", gym.make(name), 250, seed)
+    certificate = certify(path)
+    check_complete(certificate)
+    assert certificate.environment == name
+    assert certificate.agreed.steps == 250
+    assert certificate.versions["gymnasium"] == certificate.recorded_versions["gymnasium"]
+
+
+@pytest.mark.parametrize("seed", [3, None])
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_sub_environments_agree_one_by_one(
+    tmp_path: Path, mode: gym.vector.AutoresetMode, seed: int | None
+) -> None:
+    made = gym.make_vec("FrozenLake-v1", 3, "sync", vector_kwargs={"autoreset_mode": mode})
+    with RecordVectorEpisodes(made, tmp_path / "a.mcap") as env:
+        env.action_space.seed(0)
+        env.reset(seed=seed)
+        for _ in range(100):
+            _, _, terminals, timeouts, _ = env.step(env.action_space.sample())
+            if mode == gym.vector.AutoresetMode.DISABLED and (terminals | timeouts).any():
+                env.reset(options={"reset_mask": terminals | timeouts})
+    certificate = certify(tmp_path / "a.mcap")
+    check_complete(certificate)
+    assert certificate.agreed.episodes > 20
+
+
+def test_one_changed_reward_is_found_at_its_place(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"))
+
+    def change(i: int, episode: EpisodeData) -> EpisodeData:
+        if i == 2:
+            episode.rewards[5] = np.nextafter(1.0, 2.0)
+        return episode
+
+    certificate = certify(forge(path, tmp_path / "b.mcap", change))
+    assert not certificate.agrees
+    assert certificate.diverged.episodes == 1
+    assert certificate.agreed.episodes == certificate.recorded.episodes - 1  # the others are still compared
+    first = certificate.first
+    assert first is not None
+    assert (first.kind, first.episode, first.step, first.leaf) == ("value", 2, 5, "reward")
+    assert (first.expected, first.found) == ("1.0000000000000002", "1.0")
+    assert first.largest_difference == 2.0**-52 and first.largest_step == 5
+    assert first.differing_steps == 1
+
+
+def test_a_state_is_compared_bit_for_bit(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 40)
+    with Recording(path) as recording:
+        length = len(recording.episodes[1])
+
+    def change(i: int, episode: EpisodeData) -> EpisodeData:
+        if i == 1:
+            episode.states[3, 2] += 0.5
+            episode.states[7, 2] = np.nan
+            episode.final_state = -np.asarray(episode.final_state)
+        return episode
+
+    first = certify(forge(path, tmp_path / "b.mcap", change)).first
+    assert first is not None
+    assert (first.episode, first.step, first.path) == (1, 3, "state[2]")
+    assert first.largest_difference is None  # of NaN there is none
+    assert first.differing_steps == 3 and first.length == length
+    assert float(first.expected) == pytest.approx(float(first.found) + 0.5)
+
+
+def test_a_different_end_is_named(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 60)
+
+    def change(i: int, episode: EpisodeData) -> EpisodeData:
+        if i == 0:
+            episode.terminals[4] = True
+        return dataclasses.replace(episode, end="terminal")
+
+    first = certify(forge(path, tmp_path / "b.mcap", change)).first
+    assert first is not None
+    assert (first.kind, first.step, first.leaf, first.expected, first.found) == (
+        "end", 4, "terminal", "True", "False"
+    )  # fmt: skip
+    assert "were not compared" in first.hint
+
+
+def test_an_unseeded_episode_after_a_missing_one_is_skipped(tmp_path: Path) -> None:
+    from tupli_mcap import rewrite_recording
+
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 120)
+    with Recording(path) as recording:
+        numbers = [int(n) for n in recording.index["episode"]]
+        rewrite_recording(recording, tmp_path / "b.mcap", episodes=[n for n in numbers if n != 1])
+    certificate = certify(tmp_path / "b.mcap")
+    assert certificate.agrees and not certificate.complete
+    assert certificate.agreed.episodes == 1
+    (skipped,) = certificate.skipped
+    assert (skipped.kind, skipped.first, skipped.episodes) == ("no_predecessor", 2, len(numbers) - 2)
+
+
+def test_some_episodes_are_checked_with_what_they_go_on_from(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("FrozenLake-v1"), 100)
+    certificate = certify(path, episodes=[2, 5])
+    assert certificate.agrees and not certificate.complete
+    assert certificate.chosen == certificate.agreed
+    assert certificate.chosen.episodes == 2
+    with pytest.raises(RecordingError, match="expected numbers of its .* episodes, found 999"):
+        certify(path, episodes=[999])
+
+
+class HiddenRandomness(gym.Env[Any, Any]):
+    """Draws from NumPy's global generator, which no seed of a reset reaches."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.np_random.normal(size=2), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.random.normal(size=2), 0.0, False, False, {}
+
+
+def test_hidden_randomness_is_named(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", HiddenRandomness(), 20)
+    certificate = certify(path)
+    first = certificate.first
+    assert first is not None
+    assert (first.episode, first.step, first.path) == (0, 1, "state[0]")
+    assert first.differing_steps == 20
+    assert "not deterministic" in first.hint and "np.random" in first.hint
+
+
+def test_code_from_a_stranger_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = record(tmp_path / "a.mcap", HiddenRandomness(), 20)
+    monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "stranger"))
+    with pytest.raises(UntrustedError, match="bytes of pickled Python code"):
+        certify(path)
+    assert certify(path, trust=True).chosen.episodes == 1
+    assert certify(path, env=HiddenRandomness()).environment_digest == ""

@@ -1,0 +1,116 @@
+"""One episode replayed and compared, and what can be said of why it differs."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Recording
+from tupli_mcap.replay.compare import Checker, Tally
+from tupli_mcap.replay.plan import EpisodePlan
+from tupli_mcap.replay.reapply import EnvironmentFailedError, Moment, Replayer, recorded_actions
+from tupli_mcap.replay.values import Block, RecordedValues
+
+__all__ = ["Attempt", "attempt", "repeats_itself"]
+
+_SAMPLE = 2000  # steps that are taken twice to see whether an environment repeats itself
+
+
+class Attempt(NamedTuple):
+    """The differences found; `error` is what the environment raised, if it did."""
+
+    tally: Tally
+    error: EnvironmentFailedError | None = None
+
+    @property
+    def agrees(self) -> bool:
+        return self.tally.first is None and self.error is None
+
+
+class _Actions:
+    """The actions of the block that is at work."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._get: Any = None
+        self._block: Block | None = None
+
+    def bind(self, block: Block) -> None:
+        self._block = block
+        self._get = recorded_actions(self._recording, block.columns.actions)
+
+    def __iter__(self) -> Iterator[Any]:
+        step = 0
+        while self._block is not None:
+            yield self._get(step - self._block.start)
+            step += 1
+
+
+def attempt(
+    recording: Recording, replayer: Replayer, plan: EpisodePlan, values: RecordedValues, checker: Checker
+) -> Attempt:
+    """Takes an episode again and compares it, up to its end or the environment's."""
+    tally = Tally()
+    actions = _Actions(recording)
+    moments = replayer.moments(plan, actions)
+    try:
+        moment = next(moments)
+        for block in values:
+            checker.bind(block.columns, block.start)
+            actions.bind(block)
+            for step in range(block.start, block.stop):
+                checker.state(step, moment.state, tally)
+                moment = next(moments)
+                if not checker.result(step, moment, tally) and step + 1 < values.length:
+                    tally.ended = step  # stepping on would tell nothing
+                    return Attempt(tally)
+        final = values.final_state
+        if final is not None:
+            checker.final_state(values.length, final, moment.state, tally)
+    except EnvironmentFailedError as err:
+        return Attempt(tally, err)
+    return Attempt(tally)
+
+
+def repeats_itself(
+    recording: Recording, plan: EpisodePlan, values: RecordedValues, replayers: tuple[Replayer, Replayer]
+) -> bool:
+    """Whether two new environments return the same in the first steps of an episode with a seed."""
+    first, second = (_prints(recording, plan, values, replayer) for replayer in replayers)
+    return list(first) == list(second)
+
+
+def _prints(
+    recording: Recording, plan: EpisodePlan, values: RecordedValues, replayer: Replayer
+) -> Iterator[bytes]:
+    actions = _Actions(recording)
+    moments = replayer.moments(plan, actions)
+    try:
+        yield _print(recording.layout, next(moments))
+        for block in values:
+            actions.bind(block)
+            for moment in islice(moments, min(block.stop, _SAMPLE) - block.start):
+                yield _print(recording.layout, moment)
+                if moment.terminal or moment.timeout:
+                    return
+            if block.stop >= _SAMPLE:
+                return
+    except EnvironmentFailedError as err:
+        yield str(err).encode()
+
+
+def _print(layout: StepLayout, moment: Moment) -> bytes:
+    digest = hashlib.sha256(repr((moment.reward, moment.terminal, moment.timeout)).encode())
+    for leaf in layout.state:
+        try:
+            value = leaf.get(moment.state)
+        except (KeyError, IndexError, TypeError):
+            value = None
+        known = isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf"
+        digest.update(value.tobytes() if known else repr(value).encode())
+    return digest.digest()

@@ -1,0 +1,136 @@
+"""The certificate: what was replayed, what agreed, and the first place where something did not."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from tupli_mcap.errors import FormatError
+
+__all__ = ["Certificate", "Counts", "Divergence", "SkipKind", "Skipped"]
+
+_HEX_DIGEST = r"^[0-9a-f]{64}$"
+SkipKind = Literal["unseeded", "after_divergence", "no_predecessor"]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+
+class Divergence(_Model):
+    """The first difference of an episode.
+
+    kind: "value", "end" (a flag: the episode ended earlier or later), or "error" (the environment raised).
+    episode, env: its number and its sub-environment. step: counts from 0; the episode's length for the final state, -1
+        for an error in reset.
+    leaf, path: the field's name in the file, and its place with the space's own keys (`state['pos'][1]`).
+    expected, found: recorded and replayed, as text.
+    largest_difference, largest_step: of this leaf in the whole episode; None if it is no number.
+    differing_steps, length: of the episode. hint: a likely cause, empty if there is none to tell.
+    """
+
+    kind: Literal["value", "end", "error"]
+    episode: int = Field(ge=0)
+    env: int = Field(ge=0)
+    step: int = Field(ge=-1)
+    leaf: str
+    path: str
+    expected: str
+    found: str
+    largest_difference: float | None
+    largest_step: int | None
+    differing_steps: int = Field(ge=0)
+    length: int = Field(ge=1)
+    hint: str = ""
+
+
+class Skipped(_Model):
+    """Episodes that could not be checked, for one reason."""
+
+    kind: SkipKind
+    reason: str
+    episodes: int = Field(ge=1)
+    steps: int = Field(ge=1)
+    first: int = Field(ge=0)
+
+
+class Counts(_Model):
+    """Episodes and their steps."""
+
+    episodes: int = Field(ge=0)
+    steps: int = Field(ge=0)
+
+
+class Certificate(_Model):
+    """The result of replaying a recording.
+
+    recorded: what the recording holds. chosen: what was asked for; it is agreed, diverged or skipped.
+    divergences: the first one of each episode that has some, at most 100, in the order of the recording.
+    versions, platform: of this replay. recorded_versions: what the recording says of its own making.
+    environment, environment_digest: its name, and the digest of what was rebuilt; "" for one that was passed in.
+    content_sha256: over the episodes' facts; tells whether the recording is still the one that was replayed.
+    created_ns: wall clock (ns).
+    """
+
+    format: Literal["tupli_mcap.replay_certificate"] = "tupli_mcap.replay_certificate"
+    version: Literal[1] = 1
+    recording: str = Field(pattern=r"^[0-9a-f]{32}$")
+    benchmark_id: str
+    environment: str
+    environment_digest: str
+    content_sha256: str = Field(pattern=_HEX_DIGEST)
+    created_ns: int = Field(ge=0)
+    recorded: Counts
+    chosen: Counts
+    agreed: Counts
+    diverged: Counts
+    skipped: list[Skipped]
+    divergences: list[Divergence] = Field(max_length=100)
+    notes: list[str] = []
+    versions: dict[str, str]
+    recorded_versions: dict[str, str]
+    platform: dict[str, str]
+
+    @property
+    def agrees(self) -> bool:
+        """True if something was replayed and nothing of it differs; see `complete`."""
+        return self.agreed.episodes > 0 and self.diverged.episodes == 0
+
+    @property
+    def complete(self) -> bool:
+        """True if every episode of the recording was replayed and agrees."""
+        return self.agreed == self.recorded and self.recorded.episodes > 0
+
+    @property
+    def first(self) -> Divergence | None:
+        """The first divergence; None if there is none."""
+        return self.divergences[0] if self.divergences else None
+
+    @property
+    def version_differences(self) -> dict[str, tuple[str, str]]:
+        """Package -> (version when recorded, version now), where they differ."""
+        here = self.versions
+        return {
+            name: (then, here[name])
+            for name, then in self.recorded_versions.items()
+            if here.get(name, then) != then
+        }
+
+    def to_json(self) -> bytes:
+        """The certificate as UTF-8 JSON."""
+        return self.model_dump_json(indent=2).encode()
+
+    @classmethod
+    def from_json(cls, data: bytes, *, where: str = "replay-certificate.json") -> Certificate:
+        """Reads what `to_json` wrote.
+
+        Raises:
+            FormatError: it is no certificate.
+        """
+        try:
+            return cls.model_validate_json(data)
+        except ValidationError as err:
+            first = err.errors(include_url=False, include_input=False)[0]
+            place = ".".join(str(part) for part in first["loc"]) or "the document"
+            raise FormatError(f"{where}: no replay certificate: {place}: {first['msg']}") from err

@@ -1,0 +1,289 @@
+"""`certify`: a whole recording replayed and compared."""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, BinaryIO, Literal
+
+import gymnasium as gym
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.recording import Recording
+from tupli_mcap.replay.attempt import Attempt, attempt, repeats_itself
+from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, SkipKind, Skipped
+from tupli_mcap.replay.compare import Checker, Difference
+from tupli_mcap.replay.facts import content_digest, platform_facts, versions_of
+from tupli_mcap.replay.plan import EpisodePlan, plan_episodes
+from tupli_mcap.replay.reapply import Replayer, brief
+from tupli_mcap.replay.values import RecordedValues, recorded_values
+
+__all__ = ["certify"]
+
+_MAX_DIVERGENCES = 100
+_REASONS: dict[SkipKind, str] = {
+    "unseeded": "reset without a seed, from a random state that the recording does not hold",
+    "after_divergence": "reset without a seed, after an episode that diverged",
+    "no_predecessor": "reset without a seed, after episodes that are not in the recording any more",
+}
+
+
+def certify(
+    recording: Recording | str | os.PathLike[str] | BinaryIO,
+    *,
+    trust: bool = False,
+    episodes: Sequence[int] | None = None,
+    env: gym.Env[Any, Any] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Certificate:
+    """Replays a recording and compares it bit for bit with what it holds.
+
+    Every episode is reset with its seed and options and stepped with its actions; states, rewards, flags and the final
+    state are compared. Episodes that were reset without a seed go on with the random stream of the one before, as
+    they did when they were recorded.
+
+    Args:
+        recording: an open recording, or what `Recording` opens.
+        trust: rebuild the environment even if that runs code from the file.
+        episodes: numbers of those to check (all by default); what they depend on is replayed too.
+        env: used instead of the environment in the file; it is not closed.
+        progress: called with the number of steps done.
+
+    Raises:
+        UntrustedError: rebuilding the environment would run code that nobody here has trusted.
+        RecordingError: the recording carries no environment, or has no such episode.
+        FormatError: the file is damaged.
+    """
+    if not isinstance(recording, Recording):
+        with Recording(recording) as opened:
+            return certify(opened, trust=trust, episodes=episodes, env=env, progress=progress)
+    certifier = _Certifier(recording, trust, _chosen(recording, episodes), env, progress)
+    return certifier.run()
+
+
+class _Certifier:
+    def __init__(
+        self,
+        recording: Recording,
+        trust: bool,
+        chosen: frozenset[int],
+        env: gym.Env[Any, Any] | None,
+        progress: Callable[[int], None] | None,
+    ) -> None:
+        self._recording = recording
+        self._trust = trust
+        self._chosen = chosen
+        self._given = env
+        self._progress = progress
+        self._record = recording.benchmark.record if env is None else None
+        self._versions: dict[str, str] | None = None
+        self._outcomes: dict[int, Divergence | SkipKind | None] = {}  # by position
+        self._done = 0
+        self._deterministic: bool | None = None
+
+    def run(self) -> Certificate:
+        captured = self._record is not None and self._record.pickle is not None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what the environment has to say, it said when it was recorded
+            if self._chosen:
+                self._checker = Checker(self._recording.layout, casts=self._recording.is_vector)
+                for plans in plan_episodes(self._recording, captured=captured):
+                    self._replay(_needed(plans, self._chosen))
+        return self._certificate()
+
+    def _make(self) -> gym.Env[Any, Any]:
+        env = (
+            self._given if self._given is not None else self._recording.benchmark.make_env(trust=self._trust)
+        )
+        if self._versions is None:
+            _check_spaces(self._recording, env)
+            self._versions = versions_of(env)
+        return env
+
+    def _replayer(self) -> Replayer:
+        return Replayer(self._make, owned=self._given is None)
+
+    def _replay(self, plans: list[EpisodePlan]) -> None:
+        """Episodes of one sub-environment, in order."""
+        replayer = self._replayer()
+        doubt: SkipKind | None = "unseeded"
+        try:
+            values = recorded_values(self._recording, [plan.position for plan in plans])
+            for plan, recorded in zip(plans, values, strict=True):
+                doubt = self._doubt(plan, doubt)
+                found, replayer = self._attempt(plan, recorded, replayer)
+                outcome: Divergence | SkipKind | None = None
+                if not found.agrees:
+                    outcome = doubt or self._divergence(plan, recorded, found)
+                    doubt = doubt or "after_divergence"
+                self._outcomes[plan.position] = outcome
+                self._done += recorded.length
+                if self._progress is not None:
+                    self._progress(self._done)
+        finally:
+            replayer.close()
+
+    def _doubt(self, plan: EpisodePlan, before: SkipKind | None) -> SkipKind | None:
+        """Why an episode may differ although nothing is wrong; None if it may not."""
+        if plan.starts_chain:
+            return None
+        if plan.gap:
+            return "no_predecessor"
+        return before if plan.needs_predecessor else "unseeded"
+
+    def _attempt(
+        self, plan: EpisodePlan, values: RecordedValues, replayer: Replayer
+    ) -> tuple[Attempt, Replayer]:
+        """The episode on the environment that took those before it, or else on a new one: a recording may have
+        been continued in another process."""
+        used = replayer.used
+        found = attempt(self._recording, replayer, plan, values, self._checker)
+        if found.agrees or not used or not plan.starts_chain or self._given is not None:
+            return found, replayer
+        fresh = self._replayer()
+        again = attempt(self._recording, fresh, plan, values, self._checker)
+        kept, dropped = (fresh, replayer) if again.agrees else (replayer, fresh)
+        dropped.close()
+        return (again if again.agrees else found), kept
+
+    # ---- what is said of a difference
+
+    def _divergence(self, plan: EpisodePlan, values: RecordedValues, found: Attempt) -> Divergence:
+        tally, first, error = found.tally, found.tally.first, found.error
+        known = not tally.unmeasured and tally.largest is not None
+        if first is None:
+            step = -1 if error is None else error.step
+            first = Difference(step, "", "", "", "" if error is None else brief(error.cause), None)
+            kind: Literal["value", "end", "error"] = "error"
+        else:
+            kind = "end" if first.leaf in ("terminal", "timeout") else "value"
+        return Divergence(
+            kind=kind,
+            episode=plan.number,
+            env=plan.env,
+            step=first.step,
+            leaf=first.leaf,
+            path=first.path,
+            expected=first.expected,
+            found=first.found,
+            largest_difference=tally.largest if known else None,
+            largest_step=tally.largest_step if known else None,
+            differing_steps=tally.steps,
+            length=values.length,
+            hint=" ".join(self._hints(plan, values, found)),
+        )
+
+    def _hints(self, plan: EpisodePlan, values: RecordedValues, found: Attempt) -> list[str]:
+        hints = []
+        tally = found.tally
+        if tally.ended is not None:
+            hints.append(_ended(tally.ended, values.length))
+        if plan.starts_chain and found.error is None and self._repeats_itself(plan, values) is False:
+            hints.append(
+                "The environment is not deterministic: replayed twice with the same seed it differs from itself "
+                "(it may draw from np.random, random or an unseeded space)."
+            )
+        if plan.env > 0:
+            hints.append("The file carries the first sub-environment; this one may have been made otherwise.")
+        if plan.needs_predecessor and not plan.after_end:
+            hints.append(
+                "It was reset without a seed after an interrupted episode: a step that is not recorded may lie between."
+            )
+        return hints
+
+    def _repeats_itself(self, plan: EpisodePlan, values: RecordedValues) -> bool | None:
+        if self._deterministic is None and self._given is None:
+            replayers = self._replayer(), self._replayer()
+            try:
+                self._deterministic = repeats_itself(self._recording, plan, values, replayers)
+            finally:
+                for replayer in replayers:
+                    replayer.close()
+        return self._deterministic
+
+    # ---- the result
+
+    def _certificate(self) -> Certificate:
+        recording, record = self._recording, self._record
+        rows = recording.index
+        outcomes = {
+            p: o for p, o in sorted(self._outcomes.items()) if int(rows["episode"][p]) in self._chosen
+        }
+        divergences = [o for o in outcomes.values() if isinstance(o, Divergence)]
+        return Certificate(
+            recording=recording.uuid,
+            benchmark_id=recording.benchmark_id,
+            environment=record.name if record is not None else str(self._given),
+            environment_digest=record.digest if record is not None else "",
+            content_sha256=content_digest(recording),
+            created_ns=time.time_ns(),
+            recorded=self._counts(range(len(rows))),
+            chosen=self._counts(outcomes),
+            agreed=self._counts([p for p, o in outcomes.items() if o is None]),
+            diverged=self._counts([p for p, o in outcomes.items() if isinstance(o, Divergence)]),
+            skipped=self._skipped(outcomes),
+            divergences=divergences[:_MAX_DIVERGENCES],
+            versions=self._versions or versions_of(None),
+            recorded_versions=dict(record.versions) if record is not None else {},
+            platform=platform_facts(),
+        )
+
+    def _counts(self, positions: Any) -> Counts:
+        chosen = list(positions)
+        return Counts(episodes=len(chosen), steps=int(self._recording.index["length"][chosen].sum()))
+
+    def _skipped(self, outcomes: dict[int, Divergence | SkipKind | None]) -> list[Skipped]:
+        skipped = []
+        for kind, reason in _REASONS.items():
+            positions = [p for p, o in outcomes.items() if o == kind]
+            if positions:
+                counts = self._counts(positions)
+                first = int(self._recording.index["episode"][positions[0]])
+                skipped.append(
+                    Skipped(
+                        kind=kind, reason=reason, episodes=counts.episodes, steps=counts.steps, first=first
+                    )
+                )
+        return skipped
+
+
+def _chosen(recording: Recording, episodes: Sequence[int] | None) -> frozenset[int]:
+    known = frozenset(recording.index["episode"].tolist())
+    if episodes is None:
+        return known
+    chosen = frozenset(int(number) for number in episodes)
+    missing = sorted(chosen - known)
+    if missing:
+        raise RecordingError(
+            f"{recording.name}: expected numbers of its {len(known)} episodes, found {missing[0]}; "
+            "`tupli-mcap episodes` lists them"
+        )
+    return chosen
+
+
+def _needed(plans: list[EpisodePlan], chosen: frozenset[int]) -> list[EpisodePlan]:
+    """The chosen episodes and those before them that they go on from."""
+    needed = []
+    wanted = False
+    for plan in reversed(plans):
+        wanted = wanted or plan.number in chosen
+        if wanted:
+            needed.append(plan)
+            wanted = not plan.starts_chain
+    return needed[::-1]
+
+
+def _check_spaces(recording: Recording, env: gym.Env[Any, Any]) -> None:
+    for name in ("observation_space", "action_space"):
+        recorded, found = getattr(recording, name), getattr(env, name)
+        if recorded != found:
+            raise RecordingError(
+                f"{recording.name}: expected an environment with the {name} {recorded}, found {found}"
+            )
+
+
+def _ended(step: int, length: int) -> str:
+    left = length - step - 1
+    return f"The episode ends differently here, so its last {left} steps were not compared."

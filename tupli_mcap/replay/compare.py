@@ -1,0 +1,223 @@
+"""Bit for bit: what an environment returned against what a recording holds.
+
+A value agrees if recording it again would store the same bytes: in the recorded dtype, with the same sign of zero and
+payload of NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import StepError
+from tupli_mcap.messages.exact import exact_array, leaf_value, shorten
+from tupli_mcap.messages.leaves import DType, Leaf
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.columns import Columns
+from tupli_mcap.replay.reapply import Moment
+
+__all__ = ["Checker", "Difference", "Tally"]
+
+_SMALL = 1024  # bytes up to which values are compared as bytes objects
+_BITS = {2: "u2", 4: "u4", 8: "u8"}
+Same = Callable[[int, Any], bool]
+_FLAGS = ("terminal", "timeout")
+
+
+class Difference(NamedTuple):
+    """A leaf that differs at a step; `largest` is the largest absolute difference of its numbers, None if they
+    cannot be subtracted. `path` names the first element that differs."""
+
+    step: int
+    leaf: str
+    path: str
+    expected: str
+    found: str
+    largest: float | None
+
+
+@dataclass
+class Tally:
+    """The differences of one episode: the first one, how many steps have some, and the largest of the first leaf."""
+
+    first: Difference | None = None
+    steps: int = 0
+    largest: float | None = None
+    largest_step: int = 0
+    unmeasured: bool = False  # of the first leaf, a difference that is no number
+    ended: int | None = None  # the step at which the environment ended before the recording did
+    _last: int = field(default=-1, repr=False)
+
+    def note(self, difference: Difference) -> None:
+        """Takes a difference in; they come in the order of the steps."""
+        if self.first is None:
+            self.first = difference
+        if difference.step != self._last:
+            self._last = difference.step
+            self.steps += 1
+        if difference.leaf != self.first.leaf:
+            return
+        if difference.largest is None:
+            self.unmeasured = True
+        elif self.largest is None or difference.largest > self.largest:
+            self.largest, self.largest_step = difference.largest, difference.step
+
+
+class Checker:
+    """Compares moments with the columns of a recording.
+
+    casts: the values were stored in a vector environment's batch, in the dtype of its space, before they were recorded.
+    """
+
+    def __init__(self, layout: StepLayout, *, casts: bool) -> None:
+        self._layout = layout
+        self._casts = casts
+        self._start = 0
+        self._states: list[tuple[Leaf, Any, Same]] = []
+        self._rewards: list[tuple[Leaf, Any, Same]] = []
+        self._flags: tuple[list[bool], list[bool]] = ([], [])
+
+    def bind(self, columns: Columns, start: int) -> None:
+        """Compares with these columns from now on; their first row is step `start`."""
+        self._start = start
+        self._states = [self._prepared(leaf, columns.states) for leaf in self._layout.state]
+        self._rewards = [self._prepared(leaf, columns.rewards) for leaf in self._layout.reward]
+        self._flags = (columns.terminals.tolist(), columns.timeouts.tolist())
+
+    def state(self, step: int, state: Any, tally: Tally) -> None:
+        """Compares the state of a step."""
+        self._compare(step, state, self._states, tally)
+
+    def result(self, step: int, moment: Moment, tally: Tally) -> bool:
+        """Compares reward and flags of a step; True if the flags agree."""
+        self._compare(step, moment.reward, self._rewards, tally)
+        i = step - self._start
+        terminals, timeouts = self._flags
+        if moment.terminal == terminals[i] and moment.timeout == timeouts[i]:
+            return True
+        for name, found, recorded in zip(
+            _FLAGS, (moment.terminal, moment.timeout), (terminals[i], timeouts[i]), strict=True
+        ):
+            if bool(found) != recorded:
+                tally.note(Difference(step, name, name, str(recorded), str(bool(found)), None))
+        return bool(moment.terminal) == terminals[i] and bool(moment.timeout) == timeouts[i]
+
+    def final_state(self, step: int, recorded: Any, state: Any, tally: Tally) -> None:
+        """Compares the state after the last step."""
+        prepared = []
+        for leaf in self._layout.state:
+            value = leaf.get(recorded)
+            column = [value] if leaf.kind == "variable" else np.asarray(value)[None]
+            prepared.append((leaf, column, self._same(leaf, column)))
+        self._start = step
+        self._compare(step, state, prepared, tally)
+
+    def _compare(self, step: int, value: Any, leaves: Sequence[tuple[Leaf, Any, Same]], tally: Tally) -> None:
+        i = step - self._start
+        for leaf, column, same in leaves:
+            try:
+                found = leaf_value(value, leaf) if leaf.keys else value
+                if same(i, found):
+                    continue
+            except StepError as err:
+                tally.note(Difference(step, leaf.name, leaf.path, shorten(column[i]), str(err), None))
+                continue
+            tally.note(self._difference(step, leaf, column[i], found))
+
+    def _prepared(self, leaf: Leaf, columns: Any) -> tuple[Leaf, Any, Same]:
+        column = leaf.get(columns)
+        return leaf, column, self._same(leaf, column)
+
+    def _same(self, leaf: Leaf, column: Any) -> Same:
+        if leaf.kind == "variable":
+            return self._same_variable(leaf, column)
+        dtype = self._layout.dtypes[leaf.name]
+        return self._same_array(leaf, dtype, np.ascontiguousarray(column, dtype))
+
+    def _same_variable(self, leaf: Leaf, column: Any) -> Same:
+        field_codec = self._layout.variable[leaf.name]
+
+        def stored(value: Any) -> bytes:
+            out = bytearray()
+            field_codec.encode(value, out, 0)
+            return bytes(out)
+
+        return lambda i, value: stored(value) == stored(column[i])
+
+    def _same_array(self, leaf: Leaf, dtype: DType, column: Any) -> Same:
+        shape, size = leaf.shape, dtype.itemsize * leaf.size
+        small = size <= _SMALL
+        data = column.tobytes() if small else b""
+        plain = column.tolist() if shape == () else []
+        atom = {"i": int, "u": int, "b": bool}.get(dtype.kind) if shape == () else None
+
+        def same(i: int, value: Any) -> bool:
+            if type(value) is atom:
+                return bool(value == plain[i])
+            if isinstance(value, np.ndarray | np.generic) and value.dtype == dtype and value.shape == shape:
+                if small:
+                    return bool(value.tobytes() == data[i * size : (i + 1) * size])
+                return bool((_bits(value) == _bits(column[i])).all())
+            return bool(self._stored(leaf, dtype, value).tobytes() == column[i].tobytes())
+
+        if dtype == np.float64 and shape == ():
+
+            def same_float(i: int, value: Any) -> bool:
+                # zeros have signs, and NaN has payloads
+                if type(value) is float and value == plain[i] and value:
+                    return True
+                return same(i, value)
+
+            return same_float
+        return same
+
+    def _stored(self, leaf: Leaf, dtype: DType, value: Any) -> np.ndarray[Any, Any]:
+        """What a recorder makes of a value.
+
+        Raises:
+            StepError: it cannot be recorded.
+        """
+        if self._casts:
+            array = np.asarray(value)
+            if array.shape == leaf.shape and np.can_cast(array.dtype, dtype, "same_kind"):
+                with np.errstate(all="ignore"):
+                    return array.astype(dtype)
+        return exact_array(value, dtype, leaf.shape, leaf.path)
+
+    def _difference(self, step: int, leaf: Leaf, expected: Any, found: Any) -> Difference:
+        if leaf.kind == "variable":
+            return Difference(step, leaf.name, leaf.path, shorten(expected), shorten(found), None)
+        dtype = self._layout.dtypes[leaf.name]
+        expected = np.asarray(expected, dtype).reshape(leaf.shape)
+        array = self._stored(leaf, dtype, found)
+        at = np.argwhere(_bits(expected) != _bits(array))
+        first = tuple(int(i) for i in at[0])
+        path = leaf.path + (f"[{', '.join(map(str, first))}]" if first else "")
+        told, seen = _text(expected[first]), _text(array[first])
+        where = tuple(at.T)
+        return Difference(step, leaf.name, path, told, seen, _largest(expected[where], array[where]))
+
+
+def _bits(array: Any) -> Any:
+    """An array's bits as integers; itself where equality already is that of bits."""
+    array = np.asarray(array, order="C")
+    return array.view(_BITS[array.itemsize]) if array.dtype.kind == "f" else array
+
+
+def _text(value: Any) -> str:
+    text = str(value.item() if value.dtype.kind in "biu" else value)
+    return f"{text} (bits 0x{int(_bits(value).item()):x})" if text == "nan" else text
+
+
+def _largest(expected: Any, found: Any) -> float | None:
+    """The largest absolute difference; None unless it is a finite number."""
+    if expected.dtype.kind in "iu" and expected.dtype.itemsize == 8:
+        pairs = zip(expected.tolist(), found.tolist(), strict=True)
+        return float(max((abs(a - b) for a, b in pairs), default=0))
+    with np.errstate(all="ignore"):
+        largest = float(np.max(np.abs(found.astype(np.float64) - expected.astype(np.float64)), initial=0.0))
+    return largest if math.isfinite(largest) else None

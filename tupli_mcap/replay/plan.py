@@ -1,0 +1,90 @@
+"""How each episode of a recording is started again, decided from what the recording says, before anything runs.
+
+A reset with a seed starts a chain. A reset without one goes on with the random stream of the episode before it, so
+it can be repeated only by repeating all episodes from the chain's start, in their order, on one environment.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.events import INTERRUPTED
+
+__all__ = ["EpisodePlan", "How", "plan_episodes"]
+
+How = Literal["seeded", "drawn", "captured", "follows", "continues", "unknown"]
+
+
+class EpisodePlan(NamedTuple):
+    """How an episode starts.
+
+    position, number, env: in `Recording.episodes`, its own number, its sub-environment.
+    how: "seeded" (a seed was given to reset), "drawn" (a new environment drew it), "captured" (no seed, but the
+        environment in the file is as it was before that reset), "follows" (no seed, the episode before it is
+        recorded), "continues" (no reset at all), "unknown" (no seed, and what came before it is not recorded).
+    after_end: the episode before it in its sub-environment came to an end, so that it was not cut short by this reset.
+    gap: episodes that came before it are not in the recording any more.
+    auto: it may have been started by `gymnasium.wrappers.Autoreset`, which resets in `step`.
+    """
+
+    position: int
+    number: int
+    env: int
+    how: How
+    seed: int | None
+    options: str
+    after_end: bool
+    gap: bool
+    auto: bool
+
+    @property
+    def starts_chain(self) -> bool:
+        """True if nothing that came before it needs to be repeated."""
+        return self.how in ("seeded", "drawn")
+
+    @property
+    def needs_predecessor(self) -> bool:
+        return self.how in ("follows", "continues")
+
+
+def plan_episodes(recording: Recording, *, captured: bool) -> list[list[EpisodePlan]]:
+    """The plans of each sub-environment, in the order of the recording.
+
+    captured: the environment in the file has its state from before the first reset (a pickle, not a spec).
+    """
+    plans: list[list[EpisodePlan]] = [[] for _ in range(recording.num_envs)]
+    last: dict[int, int] = {}  # sub-environment -> row of its last episode
+    rows = recording.index
+    for position in range(len(rows)):
+        env = int(rows["env"][position])
+        plans[env].append(_plan(recording, position, last.get(env), captured and env == 0))
+        last[env] = position
+    return plans
+
+
+def _plan(recording: Recording, position: int, before: int | None, captured: bool) -> EpisodePlan:
+    row = recording.index[position]
+    start = recording.episode_start(position)
+    number = int(row["episode"])
+    # Numbers count over all sub-environments: whose episode is missing cannot be said.
+    gap = number != position if before is None else number - position != _shift(recording, before)
+    after_end = before is not None and recording.index[before]["end"] != INTERRUPTED
+    how: How
+    if start.continued:
+        how = "unknown" if before is None else "continues"
+    elif start.seed_number is not None:
+        how = "seeded" if start.seed_given else "drawn"
+    elif before is not None:
+        how = "follows"
+    else:
+        how = "captured" if captured and not gap else "unknown"
+    plain = not start.options and start.reset_info == "{}"
+    return EpisodePlan(
+        position, number, int(row["env"]), how, start.seed_number, start.options, after_end, gap,
+        auto=how == "follows" and plain and after_end,
+    )  # fmt: skip
+
+
+def _shift(recording: Recording, position: int) -> int:
+    return int(recording.index[position]["episode"]) - position

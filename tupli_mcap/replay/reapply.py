@@ -1,0 +1,149 @@
+"""An episode taken again: the environment is reset with the recorded seed and options, and stepped with its actions.
+
+Only what the environment returns is given; comparing, rendering and showing it are for others.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+
+from tupli_mcap.errors import TupliError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.episode import item_getter
+from tupli_mcap.replay.plan import EpisodePlan
+
+__all__ = ["EnvironmentFailedError", "Moment", "Replayer", "recorded_actions"]
+
+
+class EnvironmentFailedError(TupliError):
+    """The environment raised: at `step` (-1: in reset)."""
+
+    def __init__(self, step: int, cause: Exception) -> None:
+        self.step = step
+        self.cause = cause
+        where = "reset" if step < 0 else f"step {step}"
+        super().__init__(f"the environment failed in {where} with {brief(cause)}")
+
+
+class Moment(NamedTuple):
+    """What the environment returned; reward and flags are None for a reset.
+
+    The state is the environment's own: it may change it at its next step.
+    """
+
+    state: Any
+    reward: Any = None
+    terminal: Any = None
+    timeout: Any = None
+    info: Any = None
+
+
+class Replayer:
+    """Takes the episodes of one sub-environment again, in the order in which it is asked to.
+
+    make: builds the environment; owned: it is closed when it is not needed any more, otherwise it is the caller's.
+
+    One environment serves all episodes, since wrappers may carry state from one to the next, until an episode says
+    that it began in a new one.
+    """
+
+    def __init__(self, make: Callable[[], gym.Env[Any, Any]], *, owned: bool = True) -> None:
+        self._make = make
+        self._owned = owned
+        self._env: gym.Env[Any, Any] | None = None
+        self._resets_itself = False
+        self._used = False
+        self._last: Moment | None = None
+        self._last_action: Any = None
+
+    @property
+    def used(self) -> bool:
+        """True if the environment has been reset before."""
+        return self._env is not None and self._used
+
+    @property
+    def env(self) -> gym.Env[Any, Any]:
+        """The environment; built when first asked for."""
+        if self._env is None:
+            self._env = self._make()
+            self._resets_itself = _resets_itself(self._env)
+            self._used = False
+        return self._env
+
+    def moments(self, plan: EpisodePlan, actions: Iterable[Any]) -> Iterator[Moment]:
+        """The reset's moment, then one for each action; it goes on after an end, as the recording may have.
+
+        Raises:
+            EnvironmentFailedError: the environment raised.
+        """
+        if plan.how == "drawn" and self.used:
+            self.close()  # an environment draws its own seed in its first reset only: it was another one
+        moment = self._start(plan)
+        yield moment
+        step = self.env.step
+        for i, action in enumerate(actions):
+            try:
+                moment = Moment(*step(action))
+            except Exception as err:
+                raise EnvironmentFailedError(i, err) from err
+            self._last, self._last_action = moment, action
+            yield moment
+
+    def _start(self, plan: EpisodePlan) -> Moment:
+        if plan.how == "continues" and self._last is not None:
+            return Moment(self._last.state)
+        env = self.env
+        if plan.auto and self._resets_itself and self._last is not None:
+            try:
+                state, *_ = env.step(self._last_action)  # the action is not looked at
+            except Exception as err:
+                raise EnvironmentFailedError(-1, err) from err
+            self._last = Moment(state)
+            return self._last
+        options = jsonvalue.loads(plan.options) if plan.options else None
+        if isinstance(options, dict):
+            options.pop("reset_mask", None)  # meant for the vector environment, which takes it out too
+        return self._reset(plan.seed, options)
+
+    def _reset(self, seed: int | None, options: Any) -> Moment:
+        env = self.env
+        self._used = True
+        try:
+            state, info = env.reset(seed=seed, options=options)
+        except Exception as err:
+            raise EnvironmentFailedError(-1, err) from err
+        self._last = Moment(state, info=info)
+        return self._last
+
+    def close(self) -> None:
+        """Closes the environment; another one is made for the next episode."""
+        env, self._env = self._env, None
+        self._last = None
+        if env is not None and self._owned:
+            with contextlib.suppress(Exception):  # nothing depends on it any more
+                env.close()
+
+
+def recorded_actions(recording: Recording, columns: Any) -> Callable[[int], Any]:
+    """From a step's index to its action, of the type that the action space's own samples have."""
+    get: Callable[[int], Any] = item_getter(recording.action_space, columns)
+    return get
+
+
+def brief(err: BaseException, limit: int = 200) -> str:
+    """An exception in one line."""
+    text = " ".join(str(err).split())
+    return f"{type(err).__name__}: {text[:limit]}" if text else type(err).__name__
+
+
+def _resets_itself(env: gym.Env[Any, Any]) -> bool:
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.wrappers.Autoreset):
+            return True
+        env = env.env
+    return False

@@ -1,0 +1,97 @@
+"""The recorded values of episodes in memory: many short episodes at once, a long one in parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.columns import Columns
+
+__all__ = ["Block", "RecordedValues", "recorded_values"]
+
+_BLOCK = 8 << 20  # bytes of columns
+
+
+class Block(NamedTuple):
+    """Columns of the steps `start:stop` of an episode."""
+
+    start: int
+    stop: int
+    columns: Columns
+
+
+class RecordedValues:
+    """The values of one episode; iterating gives its blocks, as often as wanted."""
+
+    def __init__(self, recording: Recording, position: int, columns: Columns | None, steps: int) -> None:
+        self._recording = recording
+        self._columns = columns
+        self._steps = steps
+        self.position = position
+        self.length = int(recording.index["length"][position])
+
+    def __iter__(self) -> Iterator[Block]:
+        if self._columns is not None:
+            yield Block(0, self.length, self._columns)
+            return
+        for start in range(0, self.length, self._steps):
+            stop = min(self.length, start + self._steps)
+            yield Block(start, stop, self._recording.read_steps(self.position, start, stop))
+
+    @property
+    def final_state(self) -> Any:
+        """The state after the last step; None if it is not known."""
+        return self._recording.final_state(self.position)
+
+
+def recorded_values(recording: Recording, positions: Sequence[int]) -> Iterator[RecordedValues]:
+    """The values of the episodes at `positions`, in that order; a few MiB of them are in memory at a time."""
+    steps = max(1, _BLOCK // _row_size(recording))
+    lengths = recording.index["length"]
+    batch: list[int] = []
+    total = 0
+    for position in positions:
+        length = int(lengths[position])
+        if batch and total + length > steps:
+            yield from _together(recording, batch)
+            batch, total = [], 0
+        if length > steps:
+            yield RecordedValues(recording, position, None, steps)
+            continue
+        batch.append(position)
+        total += length
+    yield from _together(recording, batch)
+
+
+def _together(recording: Recording, positions: Sequence[int]) -> Iterator[RecordedValues]:
+    if not positions:
+        return
+    columns = recording.read(list(positions))
+    start = 0
+    for position, length in zip(positions, columns.episode_lengths.tolist(), strict=True):
+        part = _cut(recording.layout, columns, start, start + length)
+        yield RecordedValues(recording, position, part, length)
+        start += length
+
+
+def _cut(layout: StepLayout, columns: Columns, start: int, stop: int) -> Columns:
+    part = slice(start, stop)
+    return Columns(
+        columns.episode_lengths[:0],
+        layout.nest_state([leaf.get(columns.states)[part] for leaf in layout.state]),
+        layout.nest_action([leaf.get(columns.actions)[part] for leaf in layout.action]),
+        layout.nest_reward([leaf.get(columns.rewards)[part] for leaf in layout.reward]),
+        columns.terminals[part],
+        columns.timeouts[part],
+    )
+
+
+def _row_size(recording: Recording) -> int:
+    """Bytes of a step in memory, about."""
+    layout = recording.layout
+    sizes = [
+        leaf.size * layout.dtypes[leaf.name].itemsize for leaf in layout.leaves if leaf.dtype is not None
+    ]
+    return sum(sizes) + (2 if layout.constant else 4096)
