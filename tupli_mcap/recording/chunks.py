@@ -17,6 +17,7 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import BODY
+from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.compression import decompress
 from tupli_mcap.recording.container import COMPRESSIONS
 from tupli_mcap.recording.logs import iter_records
@@ -25,7 +26,6 @@ from tupli_mcap.recording.source import Source
 __all__ = ["IN_MEMORY", "ChunkStore", "Span"]
 
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
-MAX_CHUNK = 1 << 31
 _CHUNK_HEAD = struct.Struct(
     "<BQQQQII"
 )  # opcode, length, start, end, uncompressed size, crc, compression length
@@ -148,8 +148,8 @@ class ChunkStore:
                 f"{where}: expected a chunk of {size} bytes ({name or 'none'}), found another record"
             )
         data = decompress(name, memoryview(record)[start:], size, where)
-        if zlib.crc32(data) != crc:
-            raise FormatError(f"{where}: its CRC differs, the chunk is damaged")
+        if zlib.crc32(data) != crc or crc != row["crc"]:
+            raise FormatError(f"{where}: its CRC differs, the chunk is damaged or another one")
         return memoryview(data)[skip:] if skip else data
 
     def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> np.ndarray[Any, Any]:

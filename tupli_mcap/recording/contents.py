@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.claims import check_chunks
 from tupli_mcap.recording.container import CHUNK_ROWS, Rows
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME, EpisodeIndex
 from tupli_mcap.recording.source import Source
@@ -23,6 +25,10 @@ from tupli_mcap.recording.summary import (
 __all__ = ["Contents", "read_contents"]
 
 RECORDING_METADATA = "tupli_mcap.recording"
+_VALUES = (
+    ("uuid", "32 hexadecimal digits", re.compile("[0-9a-f]{32}")),
+    ("created_ns", "a time in decimal digits", re.compile("[0-9]{1,19}")),
+)
 
 
 @dataclass
@@ -74,6 +80,7 @@ def read_contents(source: Source) -> Contents:
         raise FormatError(
             f"{source.name}: the episode index lists {len(index.chunks)} chunks, the summary {summary.chunks}"
         )
+    check_chunks(index.chunks, attachment.offset, source.name)
     return Contents(
         metadata,
         summary.schemas,
@@ -107,8 +114,7 @@ def check_version(source: Source, metadata: dict[str, str]) -> dict[str, str]:
     version = metadata.get("format_version")
     if version != "1":
         raise FormatError(f"{source.name}: expected format version '1', found {version!r}; update tupli-mcap")
-    if len(metadata.get("uuid", "")) != 32:
-        raise FormatError(
-            f"{source.name}: expected a uuid of 32 hex digits, found {metadata.get('uuid')!r:.60}"
-        )
+    for key, what, pattern in _VALUES:
+        if not pattern.fullmatch(metadata.get(key, "")):
+            raise FormatError(f"{source.name}: expected {key!r} of {what}, found {metadata.get(key)!r:.60}")
     return metadata

@@ -136,7 +136,7 @@ def _spread(values: np.ndarray[Any, Any]) -> Spread | None:
     if len(values) == 0:
         return None
     numbers = values.astype(np.float64)
-    with np.errstate(invalid="ignore"):  # infinite returns have no spread
+    with np.errstate(invalid="ignore", over="ignore"):  # infinite returns have no spread
         return Spread(float(numbers.mean()), float(numbers.std()), float(numbers.min()), float(numbers.max()))
 
 

@@ -206,7 +206,7 @@ def read_journal(path: Path) -> JournalContents:
         body = json.loads(text)
         areas = [_area(entry) for entry in body["areas"]]
         info = dict(body["info"])
-    except (ValueError, KeyError, TypeError) as err:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
         raise FormatError(f"{path}: expected areas in the journal's header, found {text[:80]!r}") from err
     offsets, _ = _place(areas, _HEAD.size + length)
     data = {}
@@ -222,6 +222,7 @@ def read_journal(path: Path) -> JournalContents:
 
 def _area(entry: Mapping[str, Any]) -> Area:
     values = {key: value for key, value in entry.items() if key != "kind"}
-    if any(type(value) is not int or value < 0 for key, value in values.items() if key != "name"):
+    sizes = [value for key, value in values.items() if key != "name"]
+    if type(entry["name"]) is not str or any(type(n) is not int or not 0 <= n < 1 << 48 for n in sizes):
         raise ValueError(entry)
     return RowArea(**values) if entry["kind"] == "rows" else LogArea(**values)

@@ -17,6 +17,7 @@ from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.claims import EPISODE_TOPICS, check_episodes
 from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns, Run, runs_of
 from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
@@ -94,6 +95,8 @@ class Recording:
         self._columns: ColumnReader | None = None
         self._topics = {topic: channel.id for topic, channel in topics.items()}
         self._infos: dict[int, dict[int, dict[str, Any]]] | None = None
+        counts = {topic: self._store.count(self._topics.get(topic, 0)) for topic in EPISODE_TOPICS}
+        check_episodes(self.index, [self._store.count(c) for c in self._step_channels], counts, self.name)
         if steps:
             self._layout = StepLayout.from_metadata(steps[0].metadata)
             description = {key: value for key, value in steps[0].metadata.items() if key != "env"}
@@ -311,9 +314,6 @@ class Recording:
             rows = rows[self._positions(episodes)]
         lengths = rows["length"].astype(np.int64)
         total = int(lengths.sum())
-        limit = sum(self._store.count(channel) for channel in self._step_channels)
-        if episodes is None and total > limit:
-            raise FormatError(f"{self.name}: the episode index names {total} steps, the chunks hold {limit}")
         columns = Columns(lengths)
         if self._layout is None:
             return columns

@@ -5,7 +5,6 @@ Nothing is written. Repeating it changes nothing.
 
 from __future__ import annotations
 
-import io
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from tupli_mcap.errors import FormatError
@@ -35,7 +34,7 @@ from tupli_mcap.recording.salvage import (
 )
 from tupli_mcap.recording.scan import Scan, is_ours, scan
 from tupli_mcap.recording.source import Source
-from tupli_mcap.recording.summary import foreign, records
+from tupli_mcap.recording.summary import foreign, parse_record, records
 
 __all__ = ["find_journal", "recover_contents"]
 
@@ -125,15 +124,20 @@ def _missing(source: Source, err: Exception) -> str:
 
 
 def _define(found: Scan, journal: JournalContents, source: Source) -> None:
-    for text in journal.info.get("definitions", {}).values():
-        for opcode, _, body in records(bytes.fromhex(text), 0, f"{source.name}: journal"):
-            stream = ReadDataStream(io.BytesIO(body))
-            if opcode == 3:
-                schema = Schema.read(stream)
-                found.schemas.setdefault(schema.id, schema)
-            elif opcode == 4:
-                channel = Channel.read(stream)
-                found.channels.setdefault(channel.id, channel)
+    """What the journal defines is under its checksum, what the file defines outside of chunks is not."""
+    where = f"{source.name}: journal"
+    try:
+        texts = [bytes.fromhex(text) for text in dict(journal.info.get("definitions", {})).values()]
+    except (TypeError, ValueError) as err:
+        raise FormatError(f"{where}: expected definitions of channels in hexadecimal digits: {err}") from err
+    for text in texts:
+        for opcode, offset, body in records(text, 0, where):
+            if opcode == Opcode.SCHEMA:
+                schema: Schema = parse_record(opcode, body, offset, where)
+                found.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel: Channel = parse_record(opcode, body, offset, where)
+                found.channels[channel.id] = channel
 
 
 def _table(found: Scan, memory: list[Rows]) -> np.ndarray[Any, Any]:

@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.chunks import MAX_CHUNK
+from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.compression import decompress
 from tupli_mcap.recording.container import COMPRESSIONS, MAGIC, PROFILE, Rows
 from tupli_mcap.recording.index import INDEX_NAME
@@ -115,7 +115,7 @@ def _attachment(body: memoryview, position: int) -> AttachmentIndex:
     except (struct.error, UnicodeDecodeError) as err:
         raise FormatError(f"damaged attachment at offset {position}") from err
     crc = int.from_bytes(body[-4:], "little")
-    if at + 8 + data_size + 4 != len(body) or (crc and zlib.crc32(body[:-4]) != crc):
+    if at + 8 + data_size + 4 != len(body) or zlib.crc32(body[:-4]) != crc:
         raise FormatError(f"damaged attachment at offset {position}")
     return AttachmentIndex(position, len(body) + 9, log_time, create_time, data_size, name, media_type)
 
@@ -163,7 +163,7 @@ def _definitions(source: Source, data: memoryview, found: Scan) -> int:
 def _other_definition(source: Source, opcode: int, body: memoryview, found: Scan) -> None:
     parsed = parse_record(opcode, body, 0, source.name)
     target: dict[int, object] = found.schemas if opcode == Opcode.SCHEMA else found.channels  # type: ignore[assignment]
-    target.setdefault(parsed.id, parsed)
+    target[parsed.id] = parsed  # under the chunk's CRC, which a definition outside of chunks has not
 
 
 def is_ours(found: Scan) -> bool:

@@ -85,7 +85,7 @@ def read_summary(source: Source) -> Summary:
     if not len(MAGIC) <= start <= end or end - start > _MAX_SUMMARY:
         raise FormatError(f"{source.name}: expected the summary before offset {end}, the footer says {start}")
     data = source.read(start, end - start)
-    if crc and zlib.crc32(footer[:-4], zlib.crc32(data)) != crc:
+    if zlib.crc32(footer[:-4], zlib.crc32(data)) != crc:
         raise FormatError(f"{source.name}: the summary at offset {start} is damaged (its CRC differs)")
     summary = Summary({}, {}, {}, {}, 0, start)
     chunks = 0
@@ -158,7 +158,7 @@ def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
     if record[:1] != bytes([Opcode.ATTACHMENT]) or fixed + index.data_size + 4 != len(record):
         raise FormatError(f"{source.name}: expected the attachment {index.name!r} at offset {index.offset}")
     crc = int.from_bytes(record[-4:], "little")
-    if crc and zlib.crc32(memoryview(record)[9:-4]) != crc:
+    if zlib.crc32(memoryview(record)[9:-4]) != crc:
         raise FormatError(
             f"{source.name}: the attachment {index.name!r} at offset {index.offset} is damaged (its CRC differs)"
         )

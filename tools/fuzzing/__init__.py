@@ -1,0 +1,1 @@
+"""Damaged and crafted recordings: made by `model`, `plain` and `crafted`, read and judged by `oracle` and `run`."""
