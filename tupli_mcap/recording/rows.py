@@ -171,6 +171,7 @@ class ImageRows:
     ) -> None:
         self._worker = worker
         self._jobs: dict[int, Future[None]] = {}  # chunks being written, by the half they are in
+        self._due: tuple[int, int, int, int] | None = None  # a full half: what `_emit` will be given
         self._leaf = leaf
         self._layout = layout
         self._channel = channel
@@ -206,7 +207,8 @@ class ImageRows:
         return exact_array(value, self._uint8, self._leaf.shape, self._leaf.path)
 
     def put(self, image: Array) -> None:
-        """Writes the image of the state that follows the running row's."""
+        """Writes the image of the state that follows the running row's; every step before must be committed."""
+        self._write_due(self._worker)
         self._advance()
         self.put_first(image)
 
@@ -232,10 +234,17 @@ class ImageRows:
         half, rows, flushed = self._half, self._area.rows, self._flushed
         self._wait(1 - half)  # a half is used again only when its chunk is in the file
         self._half, self._row, self._flushed = 1 - half, 0, 0
-        self._emit(half, flushed, rows, self._sequence - rows + flushed, self._worker)
+        # not now: the step of its last image is not committed yet, and the file must not have more images than steps
+        self._due = (half, flushed, rows, self._sequence - rows + flushed)
+
+    def _write_due(self, worker: ChunkWorker | None) -> None:
+        due, self._due = self._due, None
+        if due is not None:
+            self._emit(*due, worker)
 
     def flush(self) -> None:
-        """Writes the rows before the running one."""
+        """Writes the rows before the running one; every step before must be committed."""
+        self._write_due(None)
         self._wait(1 - self._half)
         flushed, self._flushed = self._flushed, self._row
         self._emit(self._half, flushed, self._row, self._sequence - self._row + flushed, None)
