@@ -21,7 +21,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.container import CHUNK_ROWS, Rows
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_version, step_channels
-from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
+from tupli_mcap.recording.events import INTERRUPTED, EpisodeEnd, EpisodeStart, record
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, journal_path, read_journal
 from tupli_mcap.recording.salvage import (
@@ -275,6 +275,8 @@ def _complete(
         if facts is None:
             continue  # a reset without a step is no episode
         length, total, how, end_time = facts
+        if how == INTERRUPTED:
+            episodes.finals.pop(number, None)  # of a step that was not finished
         if (
             number not in episodes.finals
             and start.env in tail.pending

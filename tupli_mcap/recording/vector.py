@@ -65,7 +65,7 @@ class VectorRecorder:
         self._texts = ["{}"] * num_envs
         self._was_reset = False
         self._refused = False
-        self._final_bytes: dict[int, bytes] = {}  # final states that are in no row
+        self._final_rows: dict[int, int] = {}  # of final states that are in no row of steps
 
     # ---- resets
 
@@ -295,12 +295,13 @@ class VectorRecorder:
     ) -> None:
         """Checks the whole batch, then starts episodes, then writes: a batch is recorded or refused as one."""
         store = self._writer.vector
-        self._final_bytes = {i: self._encode_final(state) for i, state in finals.items()}
+        ends = {i: self._encode_final(state) for i, state in finals.items()}
         if isinstance(store, VectorRows):
             images = self._check_images(states)
             batch = store.check(actions, states, rewards)
             if self._fresh:
                 self._start(active)
+            self._put_finals(ends)
             for sinks, column in images:
                 for i in range(self._n):
                     if active is None or active[i]:
@@ -319,10 +320,18 @@ class VectorRecorder:
                 steps[i] = logs[i].prepare(action, state, rewards[i], terminals[i], timeouts[i])
         if self._fresh:
             self._start(active)
+        self._put_finals(ends)
         for i, reset in resets.items():
             logs[i].commit_state(reset)
         for i, step in steps.items():
             logs[i].commit(step)
+
+    def _put_finals(self, finals: dict[int, bytes]) -> None:
+        """Ahead of the steps: the states that these bring are the next episodes' first ones."""
+        for i, final in finals.items():
+            episode = self._episodes[i]
+            if episode is not None:
+                self._final_rows[i] = self._writer.put_final_state(episode, final)
 
     def _check_images(self, states: Any) -> list[tuple[Any, Any]]:
         found = []
@@ -358,17 +367,19 @@ class VectorRecorder:
             return
         self._fresh = True
         self._waiting.add(i)
-        final = self._final_bytes.pop(i, None)
-        if final is None:
-            store: Any = self._writer.vector
-            final = store.pending_state(i) if isinstance(store, VectorRows) else store[i].pending_state()
-            final += b"".join(sinks[i].pending() for sinks in self._writer.images)
-        total = float(self._totals[i])
-        self._writer.end_episode(episode, end, int(self._lengths[i]), total, final, text)
+        length, total = int(self._lengths[i]), float(self._totals[i])
+        if i in self._final_rows:
+            self._writer.end_episode(episode, end, length, total, None, text, self._final_rows.pop(i))
+            return
+        store: Any = self._writer.vector
+        final = store.pending_state(i) if isinstance(store, VectorRows) else store[i].pending_state()
+        final += b"".join(sinks[i].pending() for sinks in self._writer.images)
+        self._writer.end_episode(episode, end, length, total, final, text)
 
     def refuse(self) -> None:
         """After a batch that could not be stored: running episodes end before it, and a reset must follow."""
         self._refused = True
+        self._final_rows.clear()
         if self._writer.failed is not None or self._writer.closed:
             return
         with self._writer.whole:

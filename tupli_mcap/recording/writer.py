@@ -254,16 +254,18 @@ class RecordingWriter:
         total: Any,
         final_state: bytes | None,
         metadata: str,
+        final_row: int = -1,
     ) -> None:
-        """Writes `/final_state` and `/episode_end`, and the episode's row of the index."""
+        """Writes `/final_state` (unless it is there already, as `final_row`) and `/episode_end`, and the episode's row
+        of the index."""
         channels, events = self.channels, self._events()
         sequences = events.sequences
         total = total if type(total) is float else float(np.sum(total))
         number, env, first_row = episode.number, episode.env, episode.first_row
         message = EpisodeEnd(
-            number, env, first_row, length, total, end, final_state is not None, metadata
+            number, env, first_row, length, total, end, final_state is not None or final_row >= 0, metadata
         ).encode()
-        end_row, final_row = sequences[channels.end], -1
+        end_row = sequences[channels.end]
         now = time.time_ns()
         if final_state is None:
             now = events.append(now, (channels.end, message))
@@ -277,6 +279,13 @@ class RecordingWriter:
         )  # fmt: skip
         self.index.add(EpisodeRow._make(row), metadata)
         self.flush_if_due()
+
+    def put_final_state(self, episode: StartedEpisode, final_state: bytes) -> int:
+        """Writes `/final_state` ahead of the step that ends the episode; returns its row."""
+        channel, events = self.channels.final_state, self._events()
+        row = events.sequences[channel]
+        events.append(time.time_ns(), (channel, _NUMBERS.pack(episode.number, episode.env) + final_state))
+        return row
 
     def flush_if_due(self) -> None:
         """Flushes if `flush_seconds` were asked for and have passed since the last flush."""
