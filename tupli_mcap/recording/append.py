@@ -24,8 +24,8 @@ __all__ = ["resume"]
 _CHUNK_HEAD = struct.Struct("<BQQQ")  # opcode, length, start time, end time
 
 
-def resume(writer: RecordingWriter) -> bool:
-    """Takes over the file of `writer` (already locked): a finished one (True), or one whose writer was killed.
+def resume(writer: RecordingWriter) -> None:
+    """Takes over the file of `writer` (already locked): a finished one, or one whose writer was killed.
 
     Everything that is cut is derivable from the chunks, so a crash in between loses nothing.
 
@@ -53,7 +53,6 @@ def resume(writer: RecordingWriter) -> bool:
     for name, (media_type, data) in (writer.options.attachments or {}).items():
         if name not in known:
             writer.container.add_attachment(name, media_type, data, time.time_ns())
-    return contents.complete
 
 
 def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:

@@ -73,7 +73,7 @@ class RecordingWriter:
         self.closed = False
         self.failed: RecordingError | None = None
         self._broken_off = False
-        self._old_journal: Path | None = None  # on append: of the writer that was killed
+        self._old_journal: Path | None = None  # on append: where a writer that was killed has left its own
         self.whole = _Whole(self)
         self.layout: StepLayout | None = None
         self.index = IndexBuilder()
@@ -111,8 +111,8 @@ class RecordingWriter:
         if self.options.mode == "a" and self.path.stat().st_size:
             from tupli_mcap.recording.append import resume
 
-            if not resume(self):
-                self._old_journal = self._journal_path()
+            resume(self)
+            self._old_journal = self._journal_path()
             return
         try:
             os.ftruncate(self.lock.fd, 0)
@@ -411,12 +411,20 @@ class RecordingWriter:
             if self.journal is not None:
                 self.journal.close(unlink=True)
             elif self._old_journal is not None:
-                with contextlib.suppress(OSError, FormatError):
-                    if read_journal(self._old_journal).info.get("uuid") == self.uuid:
-                        self._old_journal.unlink()
+                self._remove_old_journal(self._old_journal)
         finally:
             self.worker.close()
             self.lock.release()
+
+    def _remove_old_journal(self, place: Path) -> None:
+        """What a killed writer left of its journal, and of one that was not in its place yet."""
+        unnamed = place.with_name(f"{place.name}.tmp")
+        for path in (place, unnamed):
+            with contextlib.suppress(OSError, FormatError):
+                if read_journal(path).info.get("uuid") == self.uuid:
+                    path.unlink()
+        if self.options.journal_dir is None:  # the place is this recording's alone
+            unnamed.unlink(missing_ok=True)
 
     def _finish_broken_off(self) -> None:
         """What is in memory cannot be trusted; the file and the journal can, as after a killed process."""
