@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import os
-import pickle
-import random
 import shutil
 import subprocess
 import sys
-import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -16,99 +13,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import Sampler, roll, same
+from environments import Sampler, roll
 from gymnasium import spaces
-from killed_recorder import KINDS
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError, journal_path
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
-SCRIPT = Path(__file__).with_name("killed_recorder.py")
-
-
-def kill_while_recording(kind: str, path: Path, mode: str, chunk_size: int, seconds: float) -> list[Any]:
-    """What the child reported before it was killed."""
-    child = subprocess.Popen(
-        [sys.executable, str(SCRIPT), kind, str(path), mode, str(chunk_size)], stdout=subprocess.PIPE
-    )
-    assert child.stdout is not None
-    head = child.stdout.read(4)
-    child.stdout.read(int.from_bytes(head, "little"))
-    time.sleep(seconds)
-    child.kill()
-    data = child.stdout.read()
-    child.wait()
-    child.stdout.close()
-    reports, at = [], 0
-    while at + 4 <= len(data):
-        size = int.from_bytes(data[at : at + 4], "little")
-        if at + 4 + size > len(data):
-            break
-        reports.append(pickle.loads(data[at + 4 : at + 4 + size]))
-        at += 4 + size
-    return reports
-
-
-def check_single(recording: Recording, reports: list[Any], before: int) -> None:
-    steps = [step for episode in recording.episodes for step in episode][before:]
-    finals = {
-        len(e) + sum(len(x) for x in recording.episodes[:i]) - before: e.final_state
-        for i, e in enumerate(recording.episodes)
-    }
-    assert len(steps) in (len(reports), len(reports) + 1)  # one more: committed, but not reported
-    for i, (action, state, terminal, timeout) in enumerate(reports):
-        assert same(steps[i].action, action)
-        assert (steps[i].terminal, steps[i].timeout) == (terminal, timeout)
-        after = finals[i + 1] if i + 1 in finals else steps[i + 1].state
-        assert same(after, state)
-    last = recording.episodes[-1]
-    assert last.final_state is not None
-    assert last.end == "interrupted" or steps[-1].terminal or steps[-1].timeout
-
-
-def check_vector(recording: Recording, reports: list[Any]) -> None:
-    ended = np.zeros(3, dtype=bool)
-    taken: list[list[Any]] = [[], [], []]
-    for actions, states, terminals, timeouts in reports:
-        for i in range(3):
-            if not ended[i]:
-                taken[i].append((actions[i], states[i]))
-        ended = (terminals | timeouts) & ~ended
-    for i in range(3):
-        mine = [e for e in recording.episodes if e.env == i]
-        found = [(step.action, after) for e in mine for step, after in zip(e, e.next_states, strict=True)]
-        assert len(found) - len(taken[i]) in (0, 1)
-        assert all(same(a, b) for a, b in zip(found, taken[i], strict=False))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_killed_process_loses_no_finished_step(tmp_path: Path, kind: str) -> None:
-    rng = random.Random(kind)
-    for round_ in range(3):
-        path = tmp_path / f"{round_}.mcap"
-        before, mode = 0, "x"
-        if round_ == 2 and kind != "vector":
-            with RecordEpisodes(
-                Sampler(KINDS[kind], spaces.Discrete(9)), path, record_info=kind == "info"
-            ) as env:
-                roll(env, 10)
-            before, mode = 10, "a"
-        reports = kill_while_recording(
-            kind, path, mode, rng.choice([700, 4000, 500_000]), rng.random() * 0.15 + 0.01
-        )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # killed before its first step: no journal
-            recording = Recording(path)
-        assert not recording.complete
-        assert not reports or recording.num_steps
-        if not recording.num_steps:
-            continue
-        if kind == "vector":
-            check_vector(recording, reports)
-        else:
-            check_single(recording, reports, before)
-        again = Recording(path)
-        assert np.array_equal(again.index, recording.index)
+BOX = spaces.Box(-1, 1, (4,), np.float32)
 
 
 def abandon(path: Path, make: Any, steps: int) -> None:
@@ -294,7 +205,7 @@ def test_what_the_image_thread_cannot_write_is_raised(tmp_path: Path) -> None:
 
 def test_vector_recordings_are_finished_by_append(tmp_path: Path) -> None:
     def make(path: Path, **kwargs: Any) -> Any:
-        envs = gym.vector.SyncVectorEnv([lambda: Sampler(KINDS["box"], spaces.Discrete(9)) for _ in range(2)])
+        envs = gym.vector.SyncVectorEnv([lambda: Sampler(BOX, spaces.Discrete(9)) for _ in range(2)])
         return RecordVector(envs, path, chunk_size=1000, **kwargs)
 
     path = tmp_path / "r.mcap"

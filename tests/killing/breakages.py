@@ -1,0 +1,70 @@
+"""Defects for the recorder, each of which the check must find: a harness that cannot fail proves nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from tupli_mcap.messages.encoder import COMMIT, SEQUENCE_OFFSET
+from tupli_mcap.recording import logs, rows
+from tupli_mcap.recording.container import Container
+
+__all__ = ["BREAKAGES"]
+
+
+def _commit_before_the_data() -> None:
+    begin = rows.SingleRows.__init__
+
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        begin(self, *args, **kwargs)
+        put, cursor, buffer = self.put, self.cursor, self._buffer
+
+        def hasty(*step: Any) -> None:
+            COMMIT.pack_into(buffer, cursor.offset + SEQUENCE_OFFSET, cursor.sequence, time.time_ns())
+            put(*step)
+
+        self.put = hasty
+
+    rows.SingleRows.__init__ = init  # type: ignore[method-assign]
+
+
+def _forget_the_pending_state() -> None:
+    def switch(self: Any) -> None:
+        area, half = self._area, self._half
+        self._half = 1 - half
+        start = self._half * area.half
+        flushed, self._flushed = self._flushed, 0
+        self.cursor.offset, self.cursor.end = start, start + area.rows * area.row_size
+        self._emit(half * area.half, flushed, area.rows, self.cursor.sequence - area.rows + flushed)
+
+    rows.SingleRows._switch = switch  # type: ignore[method-assign]
+
+
+def _end_before_the_records() -> None:
+    def append(self: Any, time_ns: int, *messages: tuple[int, bytes]) -> int:
+        self._commit[0] = self._position + sum(logs._EVENT.size + len(body) for _, body in messages)
+        return appended(self, time_ns, *messages)
+
+    appended = logs.EventLog.append
+    logs.EventLog.append = append  # type: ignore[method-assign]
+
+
+def _chunks_late() -> None:
+    """Every chunk is written only when the next one is due: halves are used again before they are in the file."""
+    add, kept = Container.add_chunk, []
+
+    def late(self: Any, chunk: Any) -> None:
+        kept.append((self, chunk._replace(data=bytes(chunk.data))))
+        if len(kept) > 3:
+            add(*kept.pop(0))
+
+    Container.add_chunk = late  # type: ignore[method-assign]
+
+
+BREAKAGES: dict[str, Callable[[], None]] = {
+    "commit before the data": _commit_before_the_data,
+    "forget the pending state": _forget_the_pending_state,
+    "end before the records": _end_before_the_records,
+    "chunks late": _chunks_late,
+}

@@ -1,0 +1,168 @@
+"""What is recorded while processes are killed: environments of every layout, single and vector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+__all__ = ["KINDS", "Kind", "Tell", "open_recorder"]
+
+Tell = Callable[[str, Any], None]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A layout, an environment and the options it is recorded with."""
+
+    space: gym.Space[Any]
+    chunks: tuple[int, ...] = (700, 4000, 60_000)  # chunk_size, one of
+    vector: AutoresetMode | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    elsewhere: bool = False  # the journal has a directory of its own
+    storage: bool = False  # recorded by TupliEnvWrapper
+    variable: bool = False
+    threaded: bool = False
+    reuse: bool = False  # the environment returns the same array, with other values, again and again
+    reward: gym.Space[Any] | None = None
+    large: int = 0  # every episode's texts are longer than the last one's, up to here
+
+
+_BOX = spaces.Box(-1, 1, (4,), np.float32)
+_WIDE = spaces.Box(-1, 1, (250,), np.float64)
+_IMAGE = spaces.Dict({"camera": spaces.Box(0, 255, (8, 8, 3), np.uint8), "x": spaces.Box(-1, 1, (1,))})
+_TEXT = spaces.Dict({"note": spaces.Text(30), "x": spaces.Discrete(5)})
+_SEEN = spaces.Dict({"note": spaces.Text(20), "camera": spaces.Box(0, 255, (6, 5, 1), np.uint8)})
+_NESTED = spaces.Dict(
+    {
+        "zero": spaces.Box(-1, 1, (0,), np.float32),
+        "arm": spaces.Tuple((spaces.Box(-1, 1, (2, 3), np.float16), spaces.MultiBinary(3))),
+        "Scalar!": spaces.Box(-1, 1, (), np.float64),
+        "deep": spaces.Dict({"n": spaces.Discrete(7, start=-3), "m": spaces.MultiDiscrete([3, 4])}),
+    }
+)
+_NEXT, _SAME, _DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
+_SMALL = (200, 700, 4000)
+
+KINDS = {
+    "box": Kind(_BOX, reuse=True),
+    "discrete": Kind(spaces.Discrete(500), reward=spaces.Box(-9, 9, (2,), np.float32)),
+    "nested": Kind(_NESTED),
+    "large": Kind(spaces.Dict({"x": spaces.Discrete(5), "y": spaces.Box(-1, 1, (600,))}), reuse=True),
+    "text": Kind(_TEXT, _SMALL, variable=True),
+    "sequence": Kind(
+        spaces.Tuple((spaces.Sequence(_BOX), spaces.OneOf((spaces.Discrete(3), spaces.Text(9))))),
+        _SMALL,
+        variable=True,
+    ),
+    "growing": Kind(spaces.Dict({"note": spaces.Text(50_000)}), _SMALL, variable=True, large=50_000),
+    "image": Kind(_IMAGE, (700, 2000, 20_000)),
+    "image and text": Kind(_SEEN, (200, 2000), variable=True),
+    "frames": Kind(spaces.Box(0, 255, (80, 80, 3), np.uint8), (20_000, 60_000), threaded=True),
+    "frames and text": Kind(
+        spaces.Dict({"see": spaces.Box(0, 255, (80, 80, 3), np.uint8), "note": spaces.Text(20)}),
+        (300, 60_000),
+        variable=True,
+        threaded=True,
+    ),
+    "info": Kind(_BOX, options={"record_info": True}),
+    "info and text": Kind(_TEXT, _SMALL, options={"record_info": ["t"]}, variable=True),
+    "lz4": Kind(_BOX, options={"compression": "lz4"}),
+    "uncompressed": Kind(_IMAGE, (700, 2000), options={"compression": "none"}),
+    "elsewhere": Kind(_BOX, elsewhere=True),
+    "by time": Kind(_BOX, options={"flush_seconds": 0.002}),
+    "storage": Kind(_BOX, storage=True),
+    "vector": Kind(_WIDE, vector=_NEXT, reuse=True),
+    "vector same": Kind(_WIDE, vector=_SAME),
+    "vector disabled": Kind(_WIDE, vector=_DISABLED),
+    "vector nested": Kind(_NESTED, vector=_SAME, options={"record_info": True}),
+    "vector image": Kind(_IMAGE, (700, 2000), vector=_NEXT),
+    "vector image same": Kind(_IMAGE, (700, 2000), vector=_SAME),
+    "vector image disabled": Kind(_IMAGE, (700, 2000), vector=_DISABLED, options={"record_info": True}),
+    "vector frames": Kind(spaces.Box(0, 255, (80, 80, 3), np.uint8), vector=_NEXT, threaded=True),
+    "vector text": Kind(_TEXT, vector=_NEXT, variable=True, options={"record_info": True}),
+    "vector text same": Kind(_TEXT, vector=_SAME, variable=True),
+    "vector text disabled": Kind(_SEEN, vector=_DISABLED, variable=True),
+    "vector growing": Kind(
+        spaces.Dict({"note": spaces.Text(200_000)}), vector=_NEXT, variable=True, large=200_000
+    ),
+}
+SUB_ENVIRONMENTS = 3
+
+
+class Teller(gym.Env[Any, Any]):
+    """Tells what it gives before it returns it: ("reset", …) and ("step", …), with its number."""
+
+    def __init__(self, kind: Kind, number: int, seed: int, tell: Tell) -> None:
+        self.observation_space = kind.space
+        self.action_space = spaces.Discrete(9)
+        self._kind, self._number, self._tell = kind, number, tell
+        self._random = np.random.default_rng([seed, number])
+        kind.space.seed(seed)
+        self._kept: Any = None
+        self._episodes = self._steps = self._length = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._episodes += 1
+        self._steps, self._length = 0, int(self._random.integers(1, 12))
+        state, info = self._state(), {"r": self._episodes}
+        self._tell("reset", (self._number, state, seed, options, info))
+        return state, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        state, done = self._state(), self._steps >= self._length
+        how = int(self._random.integers(3)) if done else -1
+        reward: Any = float(self._random.normal())
+        if self._kind.reward is not None:
+            reward = self._random.normal(size=2).astype(np.float32)
+        info = {"t": self._steps * 0.1, "note": f"step {self._steps}"}
+        result = (state, reward, how in (0, 2), how in (1, 2), info)
+        self._tell("step", (self._number, action, *result))
+        return result
+
+    def _state(self) -> Any:
+        if self._kind.large:
+            n = int(self._random.integers(1, min(self._kind.large, 20 * 2**self._episodes)))
+            return {"note": "".join(chr(97 + (i * 7 + self._steps) % 26) for i in range(n % 26)) + "x" * n}
+        state = self.observation_space.sample()
+        if not self._kind.reuse:
+            return state
+        if self._kept is None:
+            self._kept = state
+        elif isinstance(state, np.ndarray):
+            self._kept[...] = state
+        else:
+            self._kept["x"] = state["x"]
+            self._kept["y"][...] = state["y"]
+        return self._kept
+
+
+def open_recorder(
+    kind: Kind, path: Path, mode: Any, chunk: int, seed: int, tell: Tell, benchmark_id: str = ""
+) -> Any:
+    """The environment of a kind, wrapped so that it is recorded; of a storage, `path` is its directory."""
+    if kind.storage:
+        storage = FileStorage(path)
+        return TupliEnvWrapper(Teller(kind, 0, seed, tell), storage, benchmark_id, chunk_size=chunk)
+    options: dict[str, Any] = {"mode": mode, "chunk_size": chunk, "attachments": {}, **kind.options}
+    if kind.elsewhere:
+        options["journal_dir"] = path.parent / "journals"
+    if kind.reward is not None:
+        options["reward_space"] = kind.reward
+    if kind.vector is None:
+        return RecordEpisodes(Teller(kind, 0, seed, tell), path, **options)
+    makers = [lambda i=i: Teller(kind, i, seed, tell) for i in range(SUB_ENVIRONMENTS)]
+    return RecordVector(SyncVectorEnv(makers, autoreset_mode=kind.vector), path, **options)

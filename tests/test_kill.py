@@ -1,0 +1,183 @@
+"""Processes killed at every kind of moment lose no finished step. `tools/kill.py` does this at length."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from environments import Scripted
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from killing.chain import lives, moments_of
+from killing.check import Found, problems_of
+from killing.kinds import KINDS
+from killing.moments import MOMENTS, die
+
+from tupli_mcap import RecordEpisodes, Recording
+from tupli_mcap.recording.journal import Journal
+from tupli_mcap.recording.vector import VectorRecorder
+from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+
+def _chains() -> list[tuple[str, list[str]]]:
+    """Each kind a few times, so that each moment comes up, in a recording that is new or goes on."""
+    left = [name for name in MOMENTS if name != "any time"]
+    chains = []
+    for i, kind in enumerate(KINDS):
+        wanted = [name for name in left if name in moments_of(kind, appends=True)][:1]
+        left = [name for name in left if name not in wanted]
+        chains.append((kind, [["any time", "any line", "stores"][i % 3], *wanted]))
+    for i, name in enumerate(left):
+        kind = [kind for kind in KINDS if name in moments_of(kind, appends=True)][i]
+        chains.append((kind, ["step", name]))
+    return chains
+
+
+@pytest.mark.parametrize(("kind", "moments"), _chains())
+def test_a_killed_process_loses_no_finished_step(tmp_path: Path, kind: str, moments: list[str]) -> None:
+    for death in lives(kind, moments, 7, tmp_path):
+        assert death.problems == [], death.moment
+
+
+@pytest.mark.parametrize(
+    ("breakage", "kind", "moment"),
+    [
+        ("commit before the data", "box", "stores"),
+        ("forget the pending state", "box", "any time"),
+        ("end before the records", "box", "episode log"),
+        ("chunks late", "large", "any time"),
+    ],
+)
+def test_a_broken_recorder_is_found_out(tmp_path: Path, breakage: str, kind: str, moment: str) -> None:
+    found: list[str] = []
+    for seed in range(20):
+        (tmp_path / str(seed)).mkdir()
+        for death in lives(kind, [moment, moment], seed, tmp_path / str(seed), breakage):
+            found += death.problems
+        if found:
+            return
+    pytest.fail(f"{breakage}: nothing was found in 40 kills")
+
+
+def _episode() -> tuple[Found, dict[str, Any]]:
+    states = [np.full(2, i, np.float32) for i in range(4)]
+    told = [(i, states[i + 1], 0.5, i == 2, False, {"t": 0.1 * i}) for i in range(3)]
+    steps = [(states[i], i, 0.5, i == 2, False, {"t": 0.1 * i}) for i in range(3)]
+    found = Found(0, 0, "terminal", 1.5, 3, None, {"r": 1}, steps, states[3], (1, 2))
+    wanted = {"reset": (states[0], 3, None, {"r": 1}), "steps": told, "certain": 3}
+    return found, {**wanted, "vector": False, "infos": True}
+
+
+def _changed_state(found: Found) -> None:
+    found.steps[1][0][0] = np.nextafter(found.steps[1][0][0], np.float32(9))
+
+
+def _reordered(found: Found) -> None:
+    found.steps[0], found.steps[1] = found.steps[1], found.steps[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda found: found.steps.pop(), "3 steps were finished, 2 are there"),
+        (lambda found: found.steps.append(found.steps[0]), "4 are there"),
+        (_changed_state, "state of step 1 differs"),
+        (_reordered, "action of step 0 differs"),
+        (lambda found: found.final.__setitem__(0, 0), "the final state differs"),
+        (lambda found: setattr(found, "end", "interrupted"), "it ended interrupted"),
+        (lambda found: setattr(found, "total", 1.25), "its return is 1.25"),
+        (lambda found: setattr(found, "seed", None), "its seed is None"),
+    ],
+)
+def test_the_check_sees_what_is_wrong(change: Callable[[Found], Any], problem: str) -> None:
+    found, told = _episode()
+    assert problems_of(found, **told) == []
+    found = copy.deepcopy(found)
+    change(found)
+    assert any(problem in text for text in problems_of(found, **told))
+
+
+def in_a_process_that_dies(record: Callable[[], Any]) -> None:
+    """Forks; the child must kill itself while it records."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            record()
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -9
+
+
+def test_an_end_under_same_step_autoreset_keeps_its_own_final_state(tmp_path: Path) -> None:
+    def record() -> None:
+        maker = lambda: Scripted(  # noqa: E731
+            lambda i: np.array([i], np.float32), spaces.Box(0, 9, (1,), np.float32), length=3
+        )
+        envs = SyncVectorEnv([maker], autoreset_mode=AutoresetMode.SAME_STEP)
+        VectorRecorder.finish = lambda self, *_: self._any_ended and die()  # type: ignore[method-assign]
+        env = RecordVector(envs, tmp_path / "r.mcap")
+        env.reset(seed=1)
+        for _ in range(3):
+            env.step(env.action_space.sample())
+
+    in_a_process_that_dies(record)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert (len(episode), episode.end) == (3, "terminal")
+    assert episode.final_state.tolist() == [3]
+
+
+def test_images_stay_with_their_steps_when_a_killed_recording_goes_on(tmp_path: Path) -> None:
+    path, space = tmp_path / "r.mcap", spaces.Box(0, 255, (4, 4, 3), np.uint8)
+
+    def make(mode: Any) -> RecordEpisodes:
+        env = Scripted(lambda i: np.full((4, 4, 3), i, np.uint8), space, length=100)
+        return RecordEpisodes(env, path, mode=mode, chunk_size=1000, compression="none")
+
+    def record() -> None:
+        add = RecordingWriter.add_chunk
+
+        def add_and_die(self: RecordingWriter, rows: Any) -> None:
+            add(self, rows)
+            if rows.channel == self.channels.images[0][0]:
+                die()
+
+        RecordingWriter.add_chunk = add_and_die  # type: ignore[method-assign]
+        env = make("x")
+        env.reset(seed=1)
+        while True:
+            env.step(0)
+
+    in_a_process_that_dies(record)
+    with make("a") as env:
+        env.reset(seed=1)
+        env.step(0)
+    for episode in Recording(path).episodes:
+        assert episode.states[:, 0, 0, 0].tolist() == list(range(len(episode)))
+        assert episode.final_state[0, 0, 0] == len(episode)
+
+
+def test_nothing_of_a_killed_writer_stays_behind(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+
+    def make(mode: Any) -> RecordEpisodes:
+        env = Scripted(lambda i: np.array([i], np.float32), spaces.Box(0, 9, (1,), np.float32))
+        return RecordEpisodes(env, path, mode=mode)
+
+    def record() -> None:
+        Journal.close = lambda *_, **__: die()  # type: ignore[method-assign]
+        env = make("x")
+        env.reset(seed=1)
+        env.step(0)
+        env.close()
+
+    in_a_process_that_dies(record)
+    assert Recording(path).complete
+    make("a").close()
+    assert [file.name for file in tmp_path.iterdir()] == ["r.mcap"]
+    assert Recording(path).num_steps == 1
