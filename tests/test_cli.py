@@ -741,13 +741,46 @@ class TestSharing:
         assert run("trust", path, "--remove", "--json").json["trusted"] is False
         assert not trust.is_trusted(shown["digest"])
         assert fails("trust", path, "--show", "--remove", code=2).startswith(
-            "Invalid value: --show and --remove exclude each other"
+            "Invalid value: --show, --remove and --list exclude each other"
         )
 
     def test_trust_is_not_needed_for_a_registered_environment(self, here: Path, cartpole: Path) -> None:
         out = ok("trust", cartpole, "--show")
         assert "the registered environment, by its spec" in out
+        assert re.search(
+            r"^environment +gymnasium\.\S+:CartPoleEnv \(as registered here\)$", out, re.MULTILINE
+        )
         assert out.splitlines()[-1] == "trusted      not needed"
+
+    def test_trust_shows_what_a_pickle_would_do(
+        self, lab: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (path,) = Path("lab/recordings", lab[2]).glob("*.mcap")
+        out = ok("trust", path, "--show")
+        assert re.search(r"^own code +class Wind$", out, re.MULTILINE), out
+        assert re.search(r"^imports, known +\S", out, re.MULTILINE)
+        shown = run("trust", path, "--show", "--json").json
+        assert shown["scan"]["imports"][0] == {
+            "module": "cloudpickle.cloudpickle",
+            "name": "_make_skeleton_class",
+            "verdict": "known",
+        }
+        assert shown["scan"]["suspicious"] is False
+
+    def test_untrust(self, lab: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+        (path,) = Path("lab/recordings", lab[2]).glob("*.mcap")
+        monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(Path("config").resolve()))
+        assert ok("trust", "--list") == "nothing is trusted\n"
+        digest = run("trust", path, "--json").json["digest"]
+        assert ok("trust", "--list") == f"{digest}\n"
+        for what in (path, digest, digest[:8]):
+            ok("trust", path)
+            assert run("untrust", what, "--json").json == {"digest": digest, "was_trusted": True}
+        assert ok("untrust", path) == f"{digest} was not trusted\n"
+        assert run("trust", "--list", "--json").json["digests"] == []
+        assert fails("untrust", digest[:8]).startswith("no trusted environments have a digest that starts")
+        assert fails("untrust", "no.mcap").startswith("no.mcap does not exist")
+        assert fails("trust", code=2).startswith("Invalid value: expected a FILE, or --list")
 
     def test_import_may_trust(self, lab: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch) -> None:
         ok("bundle", lab[2], "-o", "b.mcap", "--storage", "lab")
@@ -764,7 +797,7 @@ class TestSharing:
 
 COMMANDS = [
     *("record", "ls", "info", "episodes", "list-benchmarks", "list-artifacts", "list-episodes"),
-    *("compact", "reindex", "bundle", "import", "export", "trust"),
+    *("compact", "reindex", "bundle", "import", "export", "trust", "untrust"),
 ]
 
 

@@ -345,6 +345,66 @@ def test_a_foreign_spec_builds_nothing() -> None:
             build(EnvironmentRecord("CartPole-v1", spec=foreign))
 
 
+def test_arguments_that_may_name_files_or_code_need_trust() -> None:
+    """Some environments open files or make other environments by names that they are given."""
+    spec = dict(capture(gym.make("FrozenLake-v1", map_name="8x8")).spec or {})
+    assert spec["kwargs"] == {"map_name": "8x8"}
+    build(EnvironmentRecord("FrozenLake-v1", spec=spec))
+    build(
+        EnvironmentRecord(
+            "FrozenLake-v1", spec={**spec, "kwargs": {"desc": ["SF", "FG"], "is_slippery": False}}
+        )
+    )
+    for value in (
+        "evil_module:Env-v0",
+        "os.system",
+        "../x.xml",
+        "~",
+        "a\nb",
+        ["S", {"deep": ["http://x"]}],
+        {"a.b": 1},
+    ):
+        foreign = {**spec, "kwargs": {"map_name": value}}
+        with pytest.raises(
+            UntrustedError, match=r"the argument 'map_name', which holds .* may name a file or code"
+        ):
+            build(EnvironmentRecord("FrozenLake-v1", spec=foreign))
+    limit = {
+        "name": "T",
+        "entry_point": "gymnasium.wrappers:TimeLimit",
+        "kwargs": {"max_episode_steps": "a/b"},
+    }
+    with pytest.raises(
+        UntrustedError, match=r"the argument 'max_episode_steps' of the wrapper 'T', which holds 'a/b'"
+    ):
+        build(EnvironmentRecord("FrozenLake-v1", spec={**spec, "additional_wrappers": [limit]}))
+    record = EnvironmentRecord("FrozenLake-v1", spec={**spec, "kwargs": {"map_name": "a/b"}})
+    with pytest.raises(TupliError, match=r"cannot be rebuilt here .*KeyError"):
+        build(record, trust=True)
+
+
+def test_registered_arguments_are_known_here() -> None:
+    gym.register("TupliNamed-v0", entry_point=f"{__name__}:Counter", kwargs={"start": "a.b/c"})
+    try:
+        spec = {"id": "TupliNamed-v0", "entry_point": f"{__name__}:Counter", "kwargs": {"start": "a.b/c"}}
+        build(EnvironmentRecord("x", spec=spec))
+        with pytest.raises(UntrustedError, match="may name a file or code"):
+            build(EnvironmentRecord("x", spec={**spec, "kwargs": {"start": "a.b/d"}}))
+    finally:
+        del gym.registry["TupliNamed-v0"]
+
+
+def test_naming_a_wrapper_imports_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`gymnasium.wrappers` imports some of its wrappers (and PyTorch, JAX) when it is asked for their names."""
+    spec = dict(capture(gym.make("CartPole-v1")).spec or {})
+    before = set(sys.modules)
+    for name in ("JaxToNumpy", "JaxToTorch", "NumpyToTorch"):
+        wrapper = {"name": name, "entry_point": f"gymnasium.wrappers:{name}", "kwargs": {}}
+        with pytest.raises(UntrustedError, match=f"the wrapper 'gymnasium.wrappers:{name}'"):
+            build(EnvironmentRecord("CartPole-v1", spec={**spec, "additional_wrappers": [wrapper]}))
+    assert set(sys.modules) == before
+
+
 def test_the_vector_entry_point_is_this_machine_s() -> None:
     spec = dict(capture(gym.make("CartPole-v1")).spec or {})
     built = build(EnvironmentRecord("CartPole-v1", spec={**spec, "vector_entry_point": "os:system"}))

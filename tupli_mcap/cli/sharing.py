@@ -1,10 +1,10 @@
-"""Commands that hand recordings on and take them in: bundle, import, export, trust."""
+"""Commands that hand recordings on and take them in: bundle, import, export."""
 
 from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -19,9 +19,6 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import bytes_of, number, print_facts, print_json
 
-if TYPE_CHECKING:
-    from tupli_mcap.recording.carried import CarriedCode
-
 __all__ = ["register"]
 
 Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write (.mcap).")]
@@ -33,7 +30,6 @@ def register(app: typer.Typer) -> None:
     app.command("bundle")(_bundle)
     app.command("import")(_import)
     app.command("export")(_export)
-    app.command("trust")(_trust)
 
 
 def _bundle(
@@ -113,45 +109,6 @@ def _import(
         f"{number(preview.new_artifacts)} of {number(preview.artifacts)} artifacts"
     )
     print_facts([("benchmark", preview.benchmark_id), ("name", preview.name)])
-
-
-def _trust(
-    file: Source,
-    show: Annotated[bool, typer.Option("--show", help="Only show what would run.")] = False,
-    remove: Annotated[bool, typer.Option("--remove", help="Trust it no longer.")] = False,
-    as_json: Json = False,
-) -> None:
-    """Let the environment in a file be rebuilt.
-
-    Rebuilding it may run code that came with the file, as this user, on this machine.
-    Reading its episodes needs no trust. Only this user's processes trust it from then on.
-    """
-    from tupli_mcap.recording.carried import carried_code, set_trust
-
-    if show and remove:
-        raise typer.BadParameter("--show and --remove exclude each other")
-    code = carried_code(file) if show else set_trust(file, trusted=not remove)
-    if as_json:
-        print_json(code._asdict())
-    else:
-        print_facts(_facts_of_code(code))
-
-
-def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
-    runs = {
-        "spec": "the registered environment, by its spec",
-        "pickle": f"{bytes_of(code.size)} of pickled Python code",
-    }
-    return [
-        ("environment", code.name),
-        ("runs", runs[code.kind]),
-        *([("spec", code.spec)] if code.spec else []),
-        *([("classes", ", ".join(code.classes))] if code.classes else []),
-        ("made with", ", ".join(f"{name} {version}" for name, version in code.versions.items())),
-        ("digest", code.digest),
-        *([("foreign", "; ".join(code.foreign))] if code.foreign else []),
-        ("trusted", "yes" if code.trusted else "no" if code.needs_trust else "not needed"),
-    ]
 
 
 def _print_written(path: Path, as_json: bool) -> None:

@@ -1,6 +1,6 @@
 """An environment as data: captured from a live one, rebuilt from a record, executed only where trusted."""
 
-from tupli_mcap.environment._build import build
+from tupli_mcap.environment._build import build, reasons_for_distrust
 from tupli_mcap.environment._capture import Snapshot, capture, record_environment
 from tupli_mcap.environment._pickling import rebuild_ezpickled
 from tupli_mcap.environment._record import EnvironmentRecord, canonical_json, sha256
@@ -14,6 +14,7 @@ __all__ = [
     "build",
     "canonical_json",
     "capture",
+    "reasons_for_distrust",
     "rebuild_ezpickled",
     "record_environment",
     "scan_pickle",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import platform
+import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
 import gymnasium as gym
@@ -16,7 +17,10 @@ from tupli_mcap.environment._pickling import load
 from tupli_mcap.environment._record import EnvironmentRecord, sha256
 from tupli_mcap.errors import TupliError, UntrustedError
 
-__all__ = ["build", "foreign_code", "make_from_spec"]
+__all__ = ["build", "foreign_arguments", "foreign_code", "make_from_spec", "reasons_for_distrust"]
+
+# Such a text can name no file, URL, module or attribute.
+_PLAIN_WORD = re.compile(r"[A-Za-z0-9_ +=,;()\[\]<>#-]{0,256}\Z")
 
 
 def build(record: EnvironmentRecord, *, trust: bool = False) -> gym.Env[Any, Any]:
@@ -25,13 +29,14 @@ def build(record: EnvironmentRecord, *, trust: bool = False) -> gym.Env[Any, Any
     A spec is built when its id is registered on this machine (with the entry points the file names) and its
     wrappers are gymnasium's own or come from the environment's own package, already imported. Everything
     else, the pickled environment above all, is code from a file: it runs only if this user made or trusted
-    it (`tupli_mcap.trust`) or `trust=True` is given. Arguments in a spec are data for code installed here.
+    it (`tupli_mcap.trust`) or `trust=True` is given. Arguments in a spec are data for code installed here, unless
+    one of them may name a file or more code (`foreign_arguments`).
 
     Raises:
         UntrustedError: Code would run that nobody here has trusted; nothing has been executed.
         TupliError: The environment does not build: a package is missing, another Python version made it.
     """
-    reasons = _reasons_for_distrust(record)
+    reasons = reasons_for_distrust(record)
     if reasons and not trust and not _trust.is_trusted(record.digest):
         raise UntrustedError(
             f"rebuilding the environment {record.name[:200]!r} would run {'; '.join(reasons)}. If you trust "
@@ -95,6 +100,52 @@ def foreign_code(spec: Mapping[str, Any]) -> list[str]:
     return reasons
 
 
+def foreign_arguments(spec: Mapping[str, Any]) -> list[str]:
+    """Arguments in a spec that may name a file or code, such as `xml_file="../x.xml"`, unless they are registered so.
+
+    Some environments hand such names to `open` or `gymnasium.make`. Numbers, flags and plain words are data.
+    """
+    told = spec.get("kwargs", {})
+    known = gym.registry.get(str(spec.get("id")))
+    usual = {} if known is None else known.kwargs
+    wrappers = spec.get("additional_wrappers")
+    given = [("", told)]
+    given += [
+        (f" of the wrapper {str(wrapper.get('name'))[:60]!r}", wrapper.get("kwargs"))
+        for wrapper in (wrappers if isinstance(wrappers, list) else ())
+        if isinstance(wrapper, dict)
+    ]
+    found = []
+    for of, arguments in given:
+        items = arguments.items() if isinstance(arguments, dict) else [("kwargs", arguments)]
+        for name, value in items:
+            if not of and name in usual and _same_text(usual[name], value):
+                continue
+            text = next((text for text in _texts(value) if not _PLAIN_WORD.match(text)), None)
+            if text is not None:
+                found.append(
+                    f"the argument {name[:60]!r}{of}, which holds {text[:100]!r} and may name a file or code"
+                )
+    return found
+
+
+def _same_text(usual: object, value: object) -> bool:
+    return isinstance(usual, str) and usual == value
+
+
+def _texts(value: object) -> Iterator[str]:
+    """All texts in a JSON value, keys included."""
+    rest = [value]
+    while rest:
+        item = rest.pop()
+        if isinstance(item, str):
+            yield item
+        elif isinstance(item, list):
+            rest += item
+        elif isinstance(item, dict):
+            rest += [*item, *item.values()]
+
+
 def _is_known_wrapper(entry_point: object, package: str) -> bool:
     """Not every imported wrapper will do: some write to files that their arguments name."""
     if not isinstance(entry_point, str):
@@ -104,7 +155,8 @@ def _is_known_wrapper(entry_point: object, package: str) -> bool:
         not package or _top_level(entry_point) != package
     ):
         return False
-    found = getattr(sys.modules.get(module_name), class_name, None) if class_name.isidentifier() else None
+    # Not `getattr`: modules with a `__getattr__` import what they are asked for.
+    found = vars(sys.modules.get(module_name, object)).get(class_name)
     return (
         isinstance(found, type)
         and issubclass(found, gym.Wrapper)
@@ -116,9 +168,10 @@ def _top_level(entry_point: object) -> str:
     return entry_point.partition(":")[0].partition(".")[0] if isinstance(entry_point, str) else ""
 
 
-def _reasons_for_distrust(record: EnvironmentRecord) -> list[str]:
+def reasons_for_distrust(record: EnvironmentRecord) -> list[str]:
+    """What rebuilding an environment would run that this machine does not know; empty if it needs no trust."""
     if record.spec is not None:
-        return foreign_code(record.spec)
+        return [*foreign_code(record.spec), *foreign_arguments(record.spec)]
     size = len(record.pickle or b"")
     said = f" (it says: {', '.join(record.classes)[:300]})" if record.classes else ""
     return [f"{size} bytes of pickled Python code with SHA-256 {sha256(record.pickle or b'')}{said}"]

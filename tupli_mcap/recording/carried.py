@@ -4,27 +4,46 @@ from __future__ import annotations
 
 import json
 import os
+import re
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import gymnasium as gym
+
 from tupli_mcap import trust
-from tupli_mcap.environment._build import foreign_code
+from tupli_mcap.environment import PickleScan, reasons_for_distrust, scan_pickle
+from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording.reader import Recording
 
-__all__ = ["CarriedCode", "carried_code", "set_trust"]
+__all__ = ["CarriedCode", "EntryPoint", "carried_code", "set_trust", "untrust"]
+
+_DIGEST = re.compile(r"[0-9a-f]{64}\Z")
+
+
+class EntryPoint(NamedTuple):
+    """Code that a spec names: `name` is `module:attribute`. here: what this machine has registered under the
+    environment's id (None: nothing, or a wrapper, which is not registered)."""
+
+    of: Literal["environment", "wrapper"]
+    name: str
+    here: str | None
 
 
 class CarriedCode(NamedTuple):
     """An environment in a recording, as the file tells of it (`name`, `classes` and `versions` are claims).
 
-    kind: "spec" (its JSON text is `spec`) or "pickle" (of `size` bytes).
-    foreign: what of a spec this machine does not know; empty for a pickle, all of which is foreign.
-    needs_trust: False for a spec without anything foreign. trusted: whether this user trusts the digest.
+    kind: "spec" (its JSON text is `spec`, the code it names `entry_points`) or "pickle" (of `size` bytes, what
+        loading it would do is `scan`).
+    foreign: what would run that this machine does not know; empty if it needs no trust.
+    needs_trust: whether it is built only where somebody trusts it. trusted: whether this user trusts the digest.
     """
 
     name: str
     kind: Literal["spec", "pickle"]
     spec: str
+    entry_points: list[EntryPoint]
     size: int
+    scan: PickleScan | None
     classes: tuple[str, ...]
     versions: dict[str, str]
     digest: str
@@ -43,19 +62,32 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
     with Recording(path) as recording:
         record = recording.benchmark.record
     spec: dict[str, Any] | None = None if record.spec is None else dict(record.spec)
-    foreign = [] if spec is None else foreign_code(spec)
+    foreign = reasons_for_distrust(record)
     return CarriedCode(
-        record.name,
-        "pickle" if spec is None else "spec",
-        "" if spec is None else json.dumps(spec),
-        len(record.pickle or b""),
-        record.classes,
-        dict(record.versions),
-        record.digest,
-        foreign,
-        spec is None or bool(foreign),
-        trust.is_trusted(record.digest),
+        name=record.name,
+        kind="pickle" if spec is None else "spec",
+        spec="" if spec is None else json.dumps(spec),
+        entry_points=[] if spec is None else _entry_points(spec),
+        size=len(record.pickle or b""),
+        scan=None if record.pickle is None else scan_pickle(record.pickle),
+        classes=record.classes,
+        versions=dict(record.versions),
+        digest=record.digest,
+        foreign=foreign,
+        needs_trust=bool(foreign),
+        trusted=trust.is_trusted(record.digest),
     )
+
+
+def _entry_points(spec: dict[str, Any]) -> list[EntryPoint]:
+    known = gym.registry.get(str(spec.get("id")))
+    here = None if known is None else str(known.entry_point)
+    found = [EntryPoint("environment", str(spec.get("entry_point")), here)]
+    wrappers = spec.get("additional_wrappers")
+    for wrapper in wrappers if isinstance(wrappers, list) else ():
+        name = wrapper.get("entry_point") if isinstance(wrapper, dict) else wrapper
+        found.append(EntryPoint("wrapper", str(name), None))
+    return found
 
 
 def set_trust(path: str | os.PathLike[str], *, trusted: bool) -> CarriedCode:
@@ -71,3 +103,28 @@ def set_trust(path: str | os.PathLike[str], *, trusted: bool) -> CarriedCode:
     else:
         trust.untrust(code.digest)
     return code._replace(trusted=trusted)
+
+
+def untrust(what: str) -> tuple[str, bool]:
+    """Trusts an environment no longer, given as a recording or as a digest (its first 8 digits or more will do).
+
+    Returns:
+        The digest, and whether it was trusted.
+
+    Raises:
+        NotFoundError: no trusted environment, or several, have a digest that starts so.
+        RecordingError, FormatError: as `carried_code`.
+    """
+    if Path(what).exists() or not re.fullmatch(r"[0-9a-f]{8,64}", what):
+        digest = carried_code(what).digest
+    elif _DIGEST.match(what):
+        digest = what
+    else:
+        found = [digest for digest in trust.trusted_digests() if digest.startswith(what)]
+        if len(found) != 1:
+            raise NotFoundError(
+                f"{len(found) or 'no'} trusted environments have a digest that starts with {what!r}; "
+                "`tupli-mcap trust --list` shows them"
+            )
+        (digest,) = found
+    return digest, trust.untrust(digest)

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 from tupli_mcap import trust
-from tupli_mcap.environment import capture
+from tupli_mcap.environment import capture, reasons_for_distrust
 from tupli_mcap.errors import TupliError
 
 __all__ = ["benchmark_attachments", "vector_benchmark_attachments"]
@@ -19,7 +19,7 @@ _MAX_PICKLE = 16 << 20
 def benchmark_attachments(env: gym.Env[Any, Any]) -> dict[str, tuple[str, bytes]]:
     """The environment as attachments; empty if it cannot be captured, or only as a pickle of more than 16 MiB.
 
-    A pickle is signed as this user's own, so that it can be rebuilt here without being asked about.
+    What others would have to trust is signed as this user's own, so that it can be rebuilt here without a question.
     """
     try:
         record = capture(env)
@@ -30,6 +30,7 @@ def benchmark_attachments(env: gym.Env[Any, Any]) -> dict[str, tuple[str, bytes]
         if len(record.pickle) > _MAX_PICKLE:
             return {}
         attachments["env.cloudpickle"] = ("application/octet-stream", record.pickle)
+    if reasons_for_distrust(record):
         with contextlib.suppress(TupliError):  # recording goes on where no signature can be kept
             trust.trust(record.digest)
     return attachments
