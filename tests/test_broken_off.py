@@ -78,7 +78,9 @@ def broken_off(rollout: Rollout, line: int) -> bool:
 
 
 def transitions(path: Path) -> list[tuple[Any, Any]]:
-    found = []
+    found: list[tuple[Any, Any]] = []
+    if not path.exists():  # broken off before the first step
+        return found
     for episode in Recording(path).episodes:
         states = [step.state for step in episode] + [episode.final_state]
         found += list(itertools.pairwise(states))
@@ -106,7 +108,7 @@ def test_anywhere(tmp_path: Path, kind: str, go_on: bool) -> None:
         for before, after in found:
             size = [len(x) if isinstance(x, str) else int(x.flat[0]) for x in (before, after)]
             assert size[1] == size[0] + 1  # nothing is spliced
-        assert Recording(path).complete
+        assert not found or Recording(path).complete
         if not hit:
             return
     raise AssertionError("the rollout was never finished")

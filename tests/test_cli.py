@@ -22,7 +22,7 @@ import pytest
 from mcap.writer import Writer
 from typer.testing import CliRunner
 
-from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper, trust
+from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper, trust, write_recording
 from tupli_mcap.cli import app
 from tupli_mcap.cli.output import bytes_of, number, numbers
 from tupli_mcap.errors import RecordingError
@@ -403,7 +403,10 @@ class TestLook:
         assert steps["messages"] == 200
 
     def test_info_of_an_empty_recording(self, here: Path) -> None:
-        RecordEpisodes(gym.make("CartPole-v1"), "empty.mcap").close()
+        spaces = gym.make("CartPole-v1")
+        write_recording(
+            "empty.mcap", [], observation_space=spaces.observation_space, action_space=spaces.action_space
+        )
         assert "not known before the first step" in ok("info", "empty.mcap")
         assert run("info", "empty.mcap", "--json").json["returns"] is None
         assert ok("episodes", "empty.mcap") == "no episodes\n"

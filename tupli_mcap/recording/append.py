@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +16,10 @@ from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import COMPRESSIONS
 from tupli_mcap.recording.contents import Contents, read_contents
+from tupli_mcap.recording.journal import journal_info, journal_path
+from tupli_mcap.recording.recover import belongs, head, misplaced_journal
 from tupli_mcap.recording.source import PathSource, Source
+from tupli_mcap.recording.summary import check_magic, has_summary
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.writer import RecordingWriter
@@ -35,6 +40,9 @@ def resume(writer: RecordingWriter) -> None:
     """
     source = PathSource(writer.path)
     try:
+        check_magic(source)
+        if not has_summary(source):
+            _check_journal(writer.path, head(source))
         contents = read_contents(source)
         asked, found = writer.options.benchmark_id, contents.metadata.get("benchmark_id", "")
         if asked and asked != found:
@@ -44,15 +52,54 @@ def resume(writer: RecordingWriter) -> None:
         _restore(writer, contents, source)
     finally:
         source.close()
-    os.ftruncate(writer.lock.fd, contents.data_end)
     os.lseek(writer.lock.fd, contents.data_end, os.SEEK_SET)
     writer.container.position = contents.data_end
+    known = set(contents.attachments)
+    new = {name: a for name, a in (writer.options.attachments or {}).items() if name not in known}
+    if contents.complete and not new:
+        return
+    writer.cut()
     for rows in contents.tail:
         writer.container.add_chunk(rows)
-    known = set(contents.attachments)
-    for name, (media_type, data) in (writer.options.attachments or {}).items():
-        if name not in known:
-            writer.container.add_attachment(name, media_type, data, time.time_ns())
+    for name, (media_type, data) in new.items():
+        writer.container.add_attachment(name, media_type, data, time.time_ns())
+
+
+def _check_journal(path: Path, metadata: Mapping[str, str]) -> None:
+    """Refuses to finish a recording without the steps that only its journal holds, where that is to be found.
+
+    And to take the journal from another copy of the recording, which still needs it.
+    """
+    misplaced = misplaced_journal(path, metadata)
+    if misplaced is not None:
+        raise RecordingError(
+            f"{path} was renamed without its journal {misplaced}, whose steps would be lost; "
+            f"rename that to {journal_path(path).name} first"
+        )
+    if "journal" not in metadata:
+        return
+    with contextlib.suppress(OSError, FormatError):
+        info = journal_info(Path(metadata["journal"]))
+        owner = Path(str(info.get("recording", "")))
+        if belongs(info, metadata) and owner != Path(os.path.realpath(path)) and _is_same(owner, metadata):
+            raise RecordingError(
+                f"{path} is a copy of {owner}, which still needs the journal {metadata['journal']} that both name; "
+                "finish that one first (recover it, or append to it)"
+            )
+
+
+def _is_same(path: Path, metadata: Mapping[str, str]) -> bool:
+    """Whether the file at a path is a copy of the same recording."""
+    try:
+        source = PathSource(path)
+    except RecordingError:  # gone: this one was moved
+        return False
+    try:
+        return head(source).get("uuid") == metadata["uuid"]
+    except FormatError:
+        return False
+    finally:
+        source.close()
 
 
 def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:
@@ -65,12 +112,13 @@ def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:
             f"{given}; leave journal_dir out when appending"
         )
     if recorded is not None:
-        writer.options = writer.options._replace(journal_dir=Path(recorded).parent)
+        writer.journal_place = Path(recorded)
 
 
 def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> None:
     container = writer.container
     writer.uuid = contents.metadata["uuid"]
+    writer.rewritten = contents.metadata.get("rewritten", "")
     _keep_journal_place(writer, contents)
     container.schemas = dict(sorted(contents.schemas.items()))
     container.channels = dict(sorted(contents.channels.items()))
@@ -102,7 +150,7 @@ def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> Non
     writer.index.rows = bytearray(index_rows.tobytes())
     writer.index.metadata = bytearray(contents.index.metadata)
     writer.index.count = len(index_rows)
-    writer.next_episode = int(index_rows["episode"].max()) + 1 if len(index_rows) else 0
+    writer.next_episode = contents.next_episode
     steps = [c for c in container.channels.values() if c.topic.endswith("/step")]
     if steps:
         writer.layout = StepLayout.from_metadata(steps[0].metadata)

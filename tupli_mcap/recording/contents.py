@@ -51,6 +51,14 @@ class Contents:
     complete: bool = True
     data_end: int = 0
 
+    @property
+    def next_episode(self) -> int:
+        """The number of the next episode: no number is given twice, not even one that was left out in rewriting."""
+        told = self.metadata.get("next_episode", "0")
+        numbers = self.index.episodes["episode"]
+        free = int(numbers.max()) + 1 if len(numbers) else 0
+        return max(free, int(told)) if re.fullmatch("[0-9]{1,10}", told) else free
+
 
 def read_contents(source: Source) -> Contents:
     """Reads a finished file by its summary, another by recovery.

@@ -60,7 +60,7 @@ def write_recording(
         StepError: an episode without steps, of unequal columns, or with values that cannot be stored exactly.
     """
     spaces = StepLayout(observation_space, action_space, reward_space)
-    options = WriterOptions(compression, mode, benchmark_id, attachments)
+    options = WriterOptions(compression, mode, benchmark_id, attachments, keep_empty=True)
     writer = RecordingWriter(path, options)
     recorder = SingleRecorder(writer, spaces, InfoRecorder(True))
     try:

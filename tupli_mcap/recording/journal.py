@@ -19,13 +19,21 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError
 
-__all__ = ["Journal", "LogArea", "RowArea", "journal_path", "read_journal"]
+__all__ = [
+    "Journal",
+    "LogArea",
+    "RowArea",
+    "journal_in",
+    "journal_info",
+    "journal_path",
+    "read_journal",
+]
 
 MAGIC = b"TMCAPJ1\0"
 _HEAD = struct.Struct("<8sII")
@@ -34,10 +42,15 @@ _LOG_HEADER = 64
 _MAX_HEADER = 64 << 20
 
 
-def journal_path(path: str | os.PathLike[str], directory: str | os.PathLike[str] | None = None) -> Path:
-    """Where the journal of a recording lies: beside it (links followed), or in `directory`."""
+def journal_path(path: str | os.PathLike[str]) -> Path:
+    """Where the journal of a recording lies, links followed, unless it was given a `journal_dir`."""
     path = Path(os.path.realpath(path))
-    return (path.parent if directory is None else Path(directory)) / f"{path.name}.journal"
+    return path.parent / f"{path.name}.journal"
+
+
+def journal_in(directory: str | os.PathLike[str], path: Path, uuid: str) -> Path:
+    """A place for the journal of a recording in a directory that recordings of the same name may share."""
+    return Path(directory) / f"{path.name}.{uuid}.journal"
 
 
 class RowArea(NamedTuple):
@@ -195,19 +208,10 @@ def read_journal(path: Path) -> JournalContents:
         FormatError: the file is no journal, or describes areas it does not have.
         OSError: the file cannot be read.
     """
-    raw = np.fromfile(path, dtype=np.uint8)
-    if raw.size < _HEAD.size:
-        raise FormatError(f"{path}: expected a journal header of {_HEAD.size} bytes, found {raw.size} bytes")
-    magic, length, crc = _HEAD.unpack(raw[: _HEAD.size].tobytes())
-    text = raw[_HEAD.size : _HEAD.size + length].tobytes()
-    if magic != MAGIC or length > _MAX_HEADER or len(text) != length or zlib.crc32(text) != crc:
-        raise FormatError(f"{path}: expected a journal of this version, found {magic!r} or a damaged header")
-    try:
-        body = json.loads(text)
-        areas = [_area(entry) for entry in body["areas"]]
-        info = dict(body["info"])
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
-        raise FormatError(f"{path}: expected areas in the journal's header, found {text[:80]!r}") from err
+    with path.open("rb") as file:
+        info, areas, length = _read_header(path, file)
+        file.seek(0)
+        raw = np.fromfile(file, dtype=np.uint8)
     offsets, _ = _place(areas, _HEAD.size + length)
     data = {}
     for area in areas:
@@ -218,6 +222,28 @@ def read_journal(path: Path) -> JournalContents:
                 f"{path}: area {area.name!r} expected {area.size} bytes, found {data[area.name].size}"
             )
     return JournalContents(info, {area.name: area for area in areas}, data)
+
+
+def journal_info(path: Path) -> dict[str, Any]:
+    """What a journal says of itself; nothing else of it is read. Raises as `read_journal` does."""
+    with path.open("rb") as file:
+        return _read_header(path, file)[0]
+
+
+def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], list[Area], int]:
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise FormatError(f"{path}: expected a journal header of {_HEAD.size} bytes, found {len(head)} bytes")
+    magic, length, crc = _HEAD.unpack(head)
+    text = file.read(length) if magic == MAGIC and length <= _MAX_HEADER else b""
+    if magic != MAGIC or len(text) != length or zlib.crc32(text) != crc:
+        raise FormatError(f"{path}: expected a journal of this version, found {magic!r} or a damaged header")
+    try:
+        body = json.loads(text)
+        areas = [_area(entry) for entry in body["areas"]]
+        return dict(body["info"]), areas, length
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
+        raise FormatError(f"{path}: expected areas in the journal's header, found {text[:80]!r}") from err
 
 
 def _area(entry: Mapping[str, Any]) -> Area:

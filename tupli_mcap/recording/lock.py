@@ -1,22 +1,74 @@
-"""The lock that tells a live writer from a dead one: an advisory lock on the recording's own descriptor."""
+"""The lock that tells a live writer from a dead one: an advisory lock on the recording's own descriptor.
+
+A lock belongs to what a descriptor has opened, and a forked child has a copy of every descriptor: a child that outlives
+a killed writer would go on holding its lock. So the descriptors of locks are noted here, and a child closes its copies
+before it does anything else.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
+import secrets
+import stat
+import threading
 import time
 from pathlib import Path
 
 from tupli_mcap.errors import RecordingError
 
-__all__ = ["FileLock", "is_locked"]
+__all__ = ["FileLock", "close_private", "is_locked", "open_private"]
 
-_ATTEMPTS = 5
+_PATIENCE = 2.0  # seconds to wait for those who only ask whether the writer lives
+_guard = threading.RLock()  # no fork between opening a descriptor and noting it
+_private: set[int] = set()
+
+
+def open_private(path: str | os.PathLike[str], flags: int, mode: int = 0o666) -> int:
+    """A descriptor that children do not get, neither those that go on as a copy nor those that start a program."""
+    with _guard:
+        fd = os.open(path, flags | os.O_CLOEXEC, mode)
+        _private.add(fd)
+    return fd
+
+
+def close_private(fd: int) -> None:
+    """Unlocks and closes such a descriptor; in a child, where it is closed already, nothing happens."""
+    with _guard:
+        if fd not in _private:
+            return
+        _private.discard(fd)
+        try:
+            # a child that was forked by other means than Python's may have a copy
+            fcntl.flock(fd, fcntl.LOCK_UN)
+        finally:
+            os.close(fd)
+
+
+def _drop_in_child() -> None:
+    global _guard
+    _guard = threading.RLock()
+    for fd in _private:
+        with contextlib.suppress(OSError):
+            os.close(fd)
+    _private.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=lambda: _guard.acquire(),
+        after_in_parent=lambda: _guard.release(),
+        after_in_child=_drop_in_child,
+    )
 
 
 class FileLock:
-    """Opens (or creates) a recording for writing and locks it; `fd` is the descriptor to write with.
+    """A recording opened for writing and locked; `fd` is the descriptor to write with.
+
+    A new file is made under another name, and is at its path, locked, from `publish` on: nobody finds a file without
+    its first records. Readers of a file that is replaced keep the old one.
 
     Raises:
         RecordingError: the file exists (mode "x"), is missing (mode "a"), is being written, or cannot be opened.
@@ -25,57 +77,155 @@ class FileLock:
     def __init__(self, path: Path, mode: str) -> None:
         if mode not in ("x", "w", "a"):
             raise RecordingError(f'mode: expected "x" (new), "w" (replace) or "a" (append), found {mode!r}')
-        flags = os.O_RDWR | os.O_CLOEXEC | {"x": os.O_CREAT | os.O_EXCL, "w": os.O_CREAT, "a": 0}[mode]
+        self._shown, self._path = path, Path(os.path.realpath(path))
+        self._process = os.getpid()
+        self._temporary: Path | None = None
+        self._old = -1
+        if mode == "x" and os.path.lexists(path):
+            raise _exists(path)
+        if mode == "a" or (mode == "w" and path.exists()):
+            self._old = _open_locked(path, hint='use mode="x" to create it')
+        if mode == "a" or (self._old >= 0 and not stat.S_ISREG(os.fstat(self._old).st_mode)):
+            self.fd, self._old = self._old, -1
+        else:
+            self.fd = self._make()
+
+    def _make(self) -> int:
+        temporary = self._path.with_name(f".{secrets.token_hex(8)}.tmp")
         try:
-            self.fd = os.open(path, flags, 0o644)
+            fd = open_private(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+        except OSError as err:
+            if self._old >= 0 and isinstance(err, PermissionError):
+                fd, self._old = self._old, -1  # a file that may be written, in a directory that may not
+                return fd
+            hint = f"{err.strerror}; choose a writable place"
+            if isinstance(err, FileNotFoundError):
+                hint = "its directory does not exist"
+            raise RecordingError(f"{self._shown} cannot be recorded to: {hint}") from err
+        self._temporary = temporary
+        _lock(fd, temporary)
+        return fd
+
+    def publish(self) -> None:
+        """Puts a new file at its path.
+
+        Raises:
+            RecordingError: somebody else has made one there.
+        """
+        if self._temporary is None:
+            return
+        try:
+            if self._old >= 0:
+                self._temporary.replace(self._path)
+            else:
+                _link(self._temporary, self._path)
         except FileExistsError as err:
+            raise _exists(self._shown) from err
+        except OSError as err:
             raise RecordingError(
-                f'{path} exists and is not overwritten; choose another path, or mode="a" to append, "w" to replace'
+                f"{self._shown} cannot be recorded to: {err.strerror}; choose a writable place"
             ) from err
+        self._temporary = None
+        self._close_old()
+
+    def release(self) -> None:
+        """Unlocks and closes, and removes a file that was not published; in a forked child, where the descriptors are
+        closed already, nothing happens."""
+        if self._process != os.getpid():
+            return
+        temporary, self._temporary = self._temporary, None
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        fd, self.fd = self.fd, -1
+        close_private(fd)
+        self._close_old()
+
+    def _close_old(self) -> None:
+        fd, self._old = self._old, -1
+        close_private(fd)
+
+
+def _exists(path: Path) -> RecordingError:
+    return RecordingError(
+        f'{path} exists and is not overwritten; choose another path, or mode="a" to append, "w" to replace'
+    )
+
+
+def _link(temporary: Path, path: Path) -> None:
+    """Gives a file its name unless there is one of that name."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        if os.path.lexists(path):
+            raise FileExistsError(errno.EEXIST, "exists", str(path)) from None
+        temporary.rename(path)
+        return
+    temporary.unlink()
+
+
+def _open_locked(path: Path, *, hint: str) -> int:
+    while True:
+        try:
+            fd = open_private(path, os.O_RDWR)
         except FileNotFoundError as err:
-            hint = (
-                "its directory does not exist"
-                if mode != "a"
-                else 'it does not exist; use mode="x" to create it'
-            )
-            raise RecordingError(f"{path} cannot be recorded to: {hint}") from err
+            raise RecordingError(f"{path} cannot be recorded to: it does not exist; {hint}") from err
         except OSError as err:
             raise RecordingError(
                 f"{path} cannot be recorded to: {err.strerror}; choose a writable place"
             ) from err
-        for attempt in range(
-            _ATTEMPTS
-        ):  # a reader that asks whether the writer lives holds the lock for a moment
-            try:
-                fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except OSError as err:
-                if attempt + 1 < _ATTEMPTS:
-                    time.sleep(0.01)
-                    continue
-                os.close(self.fd)
+        try:
+            _lock(fd, path)
+        except BaseException:
+            close_private(fd)
+            raise
+        if _is_at(fd, path):
+            return fd
+        # it was deleted or replaced between opening and locking: what is written to it would be lost
+        close_private(fd)
+
+
+def _lock(fd: int, path: Path) -> None:
+    """Takes the writer's lock. Those who ask for it hold a shared one for a moment: they are waited for."""
+    deadline = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except OSError as err:
+            if time.monotonic() > deadline or not _try_shared(fd):
                 raise RecordingError(f"{path} is being recorded by another writer; close it first") from err
-        self._open = True
+        time.sleep(0.001)
 
-    def release(self) -> None:
-        """Unlocks and closes."""
-        if self._open:
-            self._open = False
-            os.close(self.fd)
 
-    def abandon(self) -> None:
-        """Closes a forked child's copy of the descriptor, which leaves the parent's lock alone."""
-        self.release()
+def _try_shared(fd: int) -> bool:
+    """True if no writer holds the lock."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    fcntl.flock(fd, fcntl.LOCK_UN)
+    return True
+
+
+def _is_at(fd: int, path: Path) -> bool:
+    """Whether the file of a descriptor is still the one at the path; devices and pipes pass."""
+    found = os.fstat(fd)
+    if not stat.S_ISREG(found.st_mode):
+        return True
+    try:
+        return os.path.samestat(found, path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def is_locked(path: Path) -> bool:
     """True if a live writer holds the recording."""
     with contextlib.suppress(OSError):
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        fd = open_private(path, os.O_RDONLY)
         try:
-            fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError:
-            return True
+            return not _try_shared(fd)
         finally:
-            os.close(fd)
+            close_private(fd)
     return False

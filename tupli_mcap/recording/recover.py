@@ -5,8 +5,10 @@ Nothing is written. Repeating it changes nothing.
 
 from __future__ import annotations
 
+import contextlib
+import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,14 @@ from tupli_mcap.recording.container import CHUNK_ROWS, Rows
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_version, step_channels
 from tupli_mcap.recording.events import INTERRUPTED, EpisodeEnd, EpisodeStart, record
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, journal_path, read_journal
+from tupli_mcap.recording.journal import (
+    JournalContents,
+    LogArea,
+    RowArea,
+    journal_info,
+    journal_path,
+    read_journal,
+)
 from tupli_mcap.recording.salvage import (
     Salvage,
     committed_rows,
@@ -36,7 +45,7 @@ from tupli_mcap.recording.scan import Scan, is_ours, scan
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import foreign, parse_record, records
 
-__all__ = ["find_journal", "recover_contents"]
+__all__ = ["belongs", "find_journal", "head", "misplaced_journal", "recover_contents"]
 
 
 @dataclass
@@ -47,15 +56,16 @@ class _Tail:
     pending: dict[int, bytes] = field(default_factory=dict)
 
 
-def _head(source: Source) -> dict[str, str]:
-    head = scan(source, only_metadata=True)
-    if RECORDING_METADATA not in head.metadata:
-        if is_ours(head) or head.profile == "":
+def head(source: Source) -> dict[str, str]:
+    """The metadata of a recording, from its first records. Raises FormatError if they are missing or not ours."""
+    found = scan(source, only_metadata=True)
+    if RECORDING_METADATA not in found.metadata:
+        if is_ours(found) or found.profile == "":
             raise FormatError(
                 f"{source.name}: the file is cut off or damaged before its first step; nothing can be read from it"
             )
-        raise foreign(source, f"its profile is {head.profile!r}")
-    return check_version(source, head.metadata[RECORDING_METADATA])
+        raise foreign(source, f"its profile is {found.profile!r}")
+    return check_version(source, found.metadata[RECORDING_METADATA])
 
 
 def recover_contents(source: Source, journal: JournalContents | Exception | None) -> Contents:
@@ -67,13 +77,15 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
     Raises:
         FormatError: it is no recording of ours, or its first records are damaged.
     """
-    metadata = _head(source)
+    metadata = head(source)
     found = scan(source)
     if isinstance(journal, Exception):
         if found.channels:  # defined when the journal is there: without them no step has been taken
-            warnings.warn(_missing(source, journal), UserWarning, stacklevel=6)
+            warnings.warn(_missing(source, metadata, journal), UserWarning, stacklevel=6)
         journal = None
-    elif journal is not None and journal.info.get("uuid") != metadata["uuid"]:
+    elif journal is not None and not belongs(journal.info, metadata):
+        if found.channels:
+            warnings.warn(_foreign_journal(source, metadata), UserWarning, stacklevel=6)
         journal = None  # a stale journal of another recording with this name is not ours to merge
     if journal is not None:
         _define(found, journal, source)
@@ -106,21 +118,61 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
     """The journal of an unfinished recording, or why it cannot be read; None where there can be none."""
     if source.path is None:
         return None
-    metadata = _head(source)
-    path = Path(metadata["journal"]) if "journal" in metadata else journal_path(source.path)
+    metadata = head(source)
     try:
-        return read_journal(path)
+        return read_journal(_journal_of(source.path, metadata))
     except (OSError, FormatError) as err:
         return err
 
 
-def _missing(source: Source, err: Exception) -> str:
-    if isinstance(err, FileNotFoundError):
-        return (
-            f"{source.name} was not finished and has no journal {Path(str(err.filename)).name} beside it: steps not "
-            "yet in a chunk cannot be recovered; keep the two files together"
-        )
-    return f"{source.name}: its journal cannot be read ({err})"
+def _journal_of(path: Path, metadata: Mapping[str, str]) -> Path:
+    return Path(metadata["journal"]) if "journal" in metadata else journal_path(path)
+
+
+def belongs(info: Mapping[str, Any], metadata: Mapping[str, str]) -> bool:
+    """Whether a journal, by what it says of itself, is that of a recording with these rows.
+
+    A rewritten recording keeps its UUID, but not its row numbers.
+    """
+    return all(info.get(key, "") == metadata.get(key, "") for key in ("uuid", "rewritten"))
+
+
+def misplaced_journal(path: Path, metadata: Mapping[str, str]) -> Path | None:
+    """The journal of a recording that lies beside it under another name: the recording was renamed without it.
+
+    None if it is in its place, or not to be found.
+    """
+    expected = _journal_of(path, metadata)
+    for candidate in (expected, *sorted(Path(os.path.realpath(path)).parent.glob("*.journal"))):
+        with contextlib.suppress(OSError, FormatError):
+            if belongs(journal_info(candidate), metadata):
+                return None if candidate == expected else candidate
+    return None
+
+
+def _missing(source: Source, metadata: Mapping[str, str], err: Exception) -> str:
+    if not isinstance(err, FileNotFoundError):
+        return f"{source.name}: its journal cannot be read ({err})"
+    expected = Path(str(err.filename))
+    elsewhere = None if source.path is None else misplaced_journal(source.path, metadata)
+    if elsewhere is not None:
+        what = f"{elsewhere} is its journal: rename that to {expected.name}"
+    elif "journal" in metadata:
+        what = f"its journal was {expected}: bring that back"
+    else:
+        what = "keep the two files together"
+    return (
+        f"{source.name} was not finished and has no journal {expected.name} beside it: steps not "
+        f"yet in a chunk cannot be recovered; {what}"
+    )
+
+
+def _foreign_journal(source: Source, metadata: Mapping[str, str]) -> str:
+    found = None if source.path is None else _journal_of(source.path, metadata)
+    return (
+        f"{source.name} was not finished, and {found} is the journal of another recording: it is left alone, and "
+        "steps not yet in a chunk cannot be recovered"
+    )
 
 
 def _define(found: Scan, journal: JournalContents, source: Source) -> None:

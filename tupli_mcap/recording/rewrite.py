@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -87,6 +88,8 @@ class _Rewriter:
         metadata = {key: value for key, value in source.metadata.items() if key != "journal"}
         if benchmark_id is not None:
             metadata["benchmark_id"] = benchmark_id
+        metadata["next_episode"] = str(self._contents.next_episode)
+        metadata["rewritten"] = uuid.uuid4().hex
         container.start(f"tupli-mcap {version('tupli-mcap')}")
         container.add_metadata(RECORDING_METADATA, metadata)
         now = time.time_ns()

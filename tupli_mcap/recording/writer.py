@@ -30,7 +30,7 @@ from tupli_mcap.recording.events import (
     EpisodeStart,
 )
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.journal import Area, Journal, journal_path, read_journal
+from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_info, journal_path
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog, StepLog
 from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
@@ -48,7 +48,10 @@ LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
 
 
 class WriterOptions(NamedTuple):
-    """How to write: `chunk_size` in bytes before compression, `flush_seconds` None flushes by size only."""
+    """How to write: `chunk_size` in bytes before compression, `flush_seconds` None flushes by size only.
+
+    A new recording that no step came into is removed when it is closed, unless `keep_empty`.
+    """
 
     compression: str = "zstd"
     mode: Mode = "x"
@@ -57,6 +60,7 @@ class WriterOptions(NamedTuple):
     journal_dir: str | os.PathLike[str] | None = None
     chunk_size: int = 256 * 1024
     flush_seconds: float | None = None
+    keep_empty: bool = False
 
 
 _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
@@ -94,15 +98,15 @@ class RecordingWriter:
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
         self.recorded_vector = False
         self.uuid = uuid.uuid4().hex
+        self.rewritten = ""
+        self.journal_place = self._choose_journal_place()
+        self._is_cut = True  # False on append, while the file still is as it was found
         self._flushed_at = time.monotonic()
         self.lock = FileLock(self.path, options.mode)
         try:
             self._open()
         except BaseException:
             self.lock.release()
-            if options.mode == "x":
-                with contextlib.suppress(OSError):
-                    self.path.unlink()
             raise
         _live.add(self)
 
@@ -111,8 +115,9 @@ class RecordingWriter:
         if self.options.mode == "a" and self.path.stat().st_size:
             from tupli_mcap.recording.append import resume
 
+            self._is_cut = False
             resume(self)
-            self._old_journal = self._journal_path()
+            self._old_journal = self.journal_place
             return
         try:
             os.ftruncate(self.lock.fd, 0)
@@ -129,11 +134,12 @@ class RecordingWriter:
             "benchmark_id": self.options.benchmark_id,
         }
         if self.options.journal_dir is not None:
-            values["journal"] = str(self._journal_path())
+            values["journal"] = str(self.journal_place)
         self.container.start(values["library"])
         self.container.add_metadata(RECORDING_METADATA, values)
         for name, (media_type, data) in (self.options.attachments or {}).items():
             self.container.add_attachment(name, media_type, data, now)
+        self.lock.publish()
 
     # ---- the first step
 
@@ -153,7 +159,15 @@ class RecordingWriter:
             self.container, str(self.path), layout, num_envs if vector else None, info_schema
         )
         self._make_stores(self._areas())
-        self.container.define_channels()  # after the journal: a file with channels has one
+        # after the journal: a file that has channels and no end has one
+        self.cut()
+        self.container.define_channels()
+
+    def cut(self) -> None:
+        """On append: takes index and summary off the file. Before, nothing in it has changed."""
+        if not self._is_cut:
+            os.ftruncate(self.lock.fd, self.container.position)
+            self._is_cut = True
 
     def _areas(self, step_capacity: int = 0) -> list[Area]:
         has_infos = self.channels.info is not None
@@ -380,14 +394,19 @@ class RecordingWriter:
         channels = self.channels
         description = {
             "uuid": self.uuid,
+            **({"rewritten": self.rewritten} if self.rewritten else {}),
+            **({} if self.journal_place.parent == self._place.parent else {"recording": str(self._place)}),
             "vector": self.is_vector,
             "channels": [channels.steps, channels.images, *channels[2:]],
             "definitions": {str(c): self.container.definitions(c).hex() for c in self.container.channels},
         }
-        return Journal(self._journal_path(), list(areas), description)
+        return Journal(self.journal_place, list(areas), description)
 
-    def _journal_path(self) -> Path:
-        return journal_path(self._place, self.options.journal_dir)
+    def _choose_journal_place(self) -> Path:
+        directory = self.options.journal_dir
+        return (
+            journal_path(self._place) if directory is None else journal_in(directory, self._place, self.uuid)
+        )
 
     def close(self) -> None:
         """Writes the rest, the episode index and the summary, and removes the journal."""
@@ -397,6 +416,9 @@ class RecordingWriter:
         _live.discard(self)
         if self._broken_off:
             self._finish_broken_off()
+            return
+        if self.journal is None and (not self._is_cut or self._is_new_and_empty()):
+            self._leave()
             return
         try:
             self.flush()
@@ -419,12 +441,22 @@ class RecordingWriter:
     def _remove_old_journal(self, place: Path) -> None:
         """What a killed writer left of its journal, and of one that was not in its place yet."""
         unnamed = place.with_name(f"{place.name}.tmp")
-        for path in (place, unnamed):
-            with contextlib.suppress(OSError, FormatError):
-                if read_journal(path).info.get("uuid") == self.uuid:
-                    path.unlink()
-        if self.options.journal_dir is None:  # the place is this recording's alone
-            unnamed.unlink(missing_ok=True)
+        with contextlib.suppress(OSError, FormatError):
+            if journal_info(place).get("uuid") == self.uuid:
+                place.unlink()
+        unnamed.unlink(missing_ok=True)
+
+    def _is_new_and_empty(self) -> bool:
+        return self.options.mode != "a" and not self.options.keep_empty
+
+    def _leave(self) -> None:
+        """No step was recorded: what was appended to stays as it was, and a new file would only be in the way."""
+        with contextlib.suppress(OSError):
+            if self._is_cut:
+                self._place.unlink()
+            if self._old_journal is not None:
+                self._remove_old_journal(self._old_journal)
+        self.lock.release()
 
     def _finish_broken_off(self) -> None:
         """What is in memory cannot be trusted; the file and the journal can, as after a killed process."""
@@ -432,7 +464,7 @@ class RecordingWriter:
         if self.journal is not None:
             self.journal.close(unlink=False)
         self.lock.release()
-        place = self._journal_path()
+        place = self.journal_place
         place.with_name(f"{place.name}.tmp").unlink(missing_ok=True)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
@@ -444,7 +476,7 @@ class RecordingWriter:
         self.failed = RecordingError(
             f"{self.path} is recorded by the process that opened it, not by a forked child; wrap the environment here"
         )
-        self.lock.abandon()
+        self.lock.release()
         self.on_abandon()
 
 

@@ -178,6 +178,9 @@ class RecordingFiles:
                 f"expected a recording below {str(self._root)!r}, found {str(path)!r}"
             ) from err
         with self._lock:
+            if not path.exists():  # without a step, or deleted since
+                self._catalog.remove_recording(relative)
+                return
             try:
                 held = self._put(relative, path, stamp_of(path))
             except CatalogUnusableError as err:
