@@ -32,6 +32,7 @@ from tupli_mcap.recording.writer import RecordingWriter, WriterOptions
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"
 NAMES = sorted(path.stem for path in GOLDEN.glob("*.mcap"))
+BEFORE_CRC = sorted(path.stem for path in (GOLDEN / "before_crc").glob("*.mcap"))
 UNFINISHED = [name for name in NAMES if name.startswith("unfinished")]
 UNCOMPRESSED = [name for name in NAMES if name not in ("constant_zstd", "constant_lz4")]
 COLUMNS = ("states", "actions", "rewards", "terminals", "timeouts")
@@ -47,16 +48,17 @@ def load_tool() -> Any:
     return module
 
 
-def expected(name: str) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = jsonvalue.loads((GOLDEN / f"{name}.json").read_text(encoding="utf-8"))
+def expected(name: str, directory: Path = GOLDEN) -> list[dict[str, Any]]:
+    text = (directory / f"{name}.json").read_text(encoding="utf-8")
+    found: list[dict[str, Any]] = jsonvalue.loads(text)
     return found
 
 
-def place(name: str, directory: Path) -> Path:
+def place(name: str, directory: Path, golden: Path = GOLDEN) -> Path:
     """A copy of a golden recording, its journal beside it."""
-    path = Path(shutil.copy(GOLDEN / f"{name}.mcap", directory))
+    path = Path(shutil.copy(golden / f"{name}.mcap", directory))
     if name in UNFINISHED:
-        (directory / f"{name}.mcap.journal").write_bytes(unpacked_journal(name, GOLDEN))
+        (directory / f"{name}.mcap.journal").write_bytes(unpacked_journal(name, golden))
     return path
 
 
@@ -114,6 +116,19 @@ def test_reads_what_the_environment_returned(name: str, tmp_path: Path) -> None:
         number = load_tool().FEATURES
         assert int(recording.uuid, 16) == 1 + list(number).index(name) or name == "rewritten"
         assert recording.num_steps == sum(len(episode["rewards"]) for episode in expected(name))
+
+
+@pytest.mark.parametrize("name", BEFORE_CRC)
+def test_reads_those_of_the_first_writer(name: str, tmp_path: Path) -> None:
+    """Their metadata has no checksum."""
+    directory = GOLDEN / "before_crc"
+    with Recording(place(name, tmp_path, directory)) as recording:
+        assert "crc" not in recording._contents.channels[1].metadata
+        assert_same(list(as_read(recording)), expected(name, directory))
+    RecordingWriter(tmp_path / f"{name}.mcap", WriterOptions(mode="a")).close()
+    with Recording(tmp_path / f"{name}.mcap") as recording:
+        assert recording.complete
+        assert_same(list(as_read(recording)), expected(name, directory))
 
 
 @pytest.mark.parametrize("name", NAMES)

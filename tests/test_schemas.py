@@ -296,7 +296,7 @@ class TestJsonSchemas:
             (found,) = [m.metadata for m in reader.iter_metadata() if m.name == RECORDING_METADATA]
         schema = validator("recording-metadata.schema.json")
         schema.validate(found)
-        assert set(found) - {"journal"} == set(schema.schema["required"])
+        assert set(found) - {"journal"} == {*schema.schema["required"], "crc"}
         for key in found:
             with pytest.raises(jsonschema.ValidationError, match=r"."):
                 schema.validate({**found, key: 1})

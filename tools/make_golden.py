@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import hashlib
 import itertools
 import shutil
 import sys
@@ -351,6 +352,21 @@ def handmade(path: Path) -> list[Log]:
     ]
 
 
+def bundle(path: Path) -> list[Log]:
+    """A recording that carries its environment, pickled, and an artifact."""
+    env = Played(POLE, pole, [(3, "terminal")])
+    artifact, code = b"time,price\n0,1.5\n", b"not a pickle; reading never finds out"
+    record = EnvironmentRecord("Pole-v0", pickle=code, versions={"gymnasium": "1.0"})
+    attachments = {
+        "benchmark.json": ("application/json", record.to_json()),
+        "env.cloudpickle": ("application/octet-stream", code),
+        f"artifacts/{hashlib.sha256(artifact).hexdigest()}": ("application/octet-stream", artifact),
+    }
+    with RecordEpisodes(env, path, compression="none", attachments=attachments) as recorder:
+        roll(recorder, env, [3, 1], action)
+    return expected(env)
+
+
 def unfinished(path: Path, env: Played) -> list[Log]:
     """What a killed process leaves: a file without a summary, and its journal."""
     with tempfile.TemporaryDirectory() as directory:
@@ -368,6 +384,11 @@ def words(episode: int, t: int) -> str:
     return "w" * t + str(episode)
 
 
+def picture(episode: int, t: int) -> Any:
+    return {"camera": np.full((2, 4, 3), 16 * t + episode, np.uint8), "pole": pole(episode, t)}
+
+
+CAMERA = spaces.Dict([("camera", spaces.Box(0, 255, (2, 4, 3), np.uint8)), ("pole", POLE)])
 ENDS = [(3, "terminal"), (4, "timeout"), (9, "terminal")]
 FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "constant_zstd": lambda path: constant(path, "zstd"),
@@ -388,6 +409,8 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "handmade": handmade,
     "unfinished": lambda path: unfinished(path, Played(POLE, pole, ENDS)),
     "unfinished_variable": lambda path: unfinished(path, Played(spaces.Text(20), words, ENDS)),
+    "bundle": bundle,
+    "unfinished_images": lambda path: unfinished(path, Played(CAMERA, picture, ENDS)),
 }
 
 
@@ -404,10 +427,11 @@ def main() -> None:
     directory = Path(sys.argv[1]) if len(sys.argv) > 1 else DIRECTORY
     directory.mkdir(parents=True, exist_ok=True)
     for old in directory.iterdir():
-        old.unlink()
+        if old.is_file():  # those below are of earlier writers, and stay
+            old.unlink()
     for name in FEATURES:
         make(name, directory)
-    size = sum(path.stat().st_size for path in directory.iterdir())
+    size = sum(path.stat().st_size for path in directory.iterdir() if path.is_file())
     print(f"{len(FEATURES)} recordings, {size / 1024:.0f} KiB in {directory}")
 
 

@@ -35,6 +35,7 @@ from mcap.records import (
 )
 
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.recording.checksums import with_crc
 
 __all__ = ["CHUNK_ROWS", "MAGIC", "Compression", "Container"]
 
@@ -117,7 +118,7 @@ class Container:
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         builder = RecordBuilder()
-        Metadata(name, dict(values)).write(builder)
+        Metadata(name, with_crc(values)).write(builder)
         data = _built(builder)
         self.metadata_indexes.append(MetadataIndex(self.position, len(data), name))
         self.write(data)
@@ -138,7 +139,8 @@ class Container:
         return schema.id
 
     def add_channel(self, topic: str, schema_id: int, metadata: Mapping[str, str]) -> int:
-        channel = Channel(len(self.channels) + 1, topic, "cdr", dict(metadata), schema_id)
+        described = with_crc(metadata) if metadata else {}
+        channel = Channel(len(self.channels) + 1, topic, "cdr", described, schema_id)
         self.channels[channel.id] = channel
         self.counts[channel.id] = 0
         return channel.id

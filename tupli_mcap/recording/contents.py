@@ -9,6 +9,7 @@ import numpy as np
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.checksums import check_crc
 from tupli_mcap.recording.claims import check_chunks
 from tupli_mcap.recording.container import CHUNK_ROWS, Rows
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME, EpisodeIndex
@@ -25,9 +26,16 @@ from tupli_mcap.recording.summary import (
 __all__ = ["Contents", "read_contents"]
 
 RECORDING_METADATA = "tupli_mcap.recording"
+_KEYS = (
+    "uuid", "format_version", "library", "created_ns", "benchmark_id", "journal", "rewritten", "next_episode",
+)  # fmt: skip
+_CHANNEL_KEYS = (
+    "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields",
+)  # fmt: skip
 _VALUES = (
     ("uuid", "32 hexadecimal digits", re.compile("[0-9a-f]{32}")),
     ("created_ns", "a time in decimal digits", re.compile("[0-9]{1,19}")),
+    ("next_episode", "a number of an episode", re.compile("[0-9]{1,10}|")),
 )
 
 
@@ -77,7 +85,7 @@ def read_contents(source: Source) -> Contents:
     summary = read_summary(source)
     if RECORDING_METADATA not in summary.metadata:
         raise foreign(source, f"it has no metadata {RECORDING_METADATA!r}")
-    metadata = check_version(source, read_metadata(source, summary.metadata[RECORDING_METADATA]))
+    metadata = check_metadata(source, read_metadata(source, summary.metadata[RECORDING_METADATA]))
     if INDEX_NAME not in summary.attachments:
         raise FormatError(
             f"{source.name}: the recording has no episode index {INDEX_NAME!r}; recover it into a new file"
@@ -105,8 +113,11 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
     """The step channels in the order of their sub-environments.
 
     Raises:
-        FormatError: they are not numbered from 0.
+        FormatError: they are not numbered from 0, or the metadata of a channel is damaged.
     """
+    for channel in channels.values():
+        if _is_ours(channel.topic):
+            check_crc(channel.metadata, _CHANNEL_KEYS, f"{name}: the metadata of channel {channel.topic}")
     found = [channel for channel in channels.values() if channel.topic.endswith("/step")]
     by_env = {channel.metadata.get("env", ""): channel for channel in found}
     numbers = [str(i) for i in range(len(found))]
@@ -117,11 +128,16 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
     return [by_env[number] for number in numbers]
 
 
-def check_version(source: Source, metadata: dict[str, str]) -> dict[str, str]:
-    """Raises FormatError unless the metadata is that of a format this version reads."""
-    version = metadata.get("format_version")
+def _is_ours(topic: str) -> bool:
+    return topic in ("/final_state", "/info") or topic.endswith("/step") or "/image/" in topic
+
+
+def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
+    """The metadata without its checksum; FormatError unless it is whole, and of a format this version reads."""
+    version = found.get("format_version")
     if version != "1":
         raise FormatError(f"{source.name}: expected format version '1', found {version!r}; update tupli-mcap")
+    metadata = check_crc(found, _KEYS, f"{source.name}: the metadata record {RECORDING_METADATA!r}")
     for key, what, pattern in _VALUES:
         if not pattern.fullmatch(metadata.get(key, "")):
             raise FormatError(f"{source.name}: expected {key!r} of {what}, found {metadata.get(key)!r:.60}")

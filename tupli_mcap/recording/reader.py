@@ -99,10 +99,10 @@ class Recording:
         check_episodes(self.index, [self._store.count(c) for c in self._step_channels], counts, self.name)
         if steps:
             self._layout = StepLayout.from_metadata(steps[0].metadata)
-            description = {key: value for key, value in steps[0].metadata.items() if key != "env"}
+            description = _spaces_of(steps[0])
             for channel in steps:
                 self._check_schema(channel, STEP_SCHEMA, self._layout.step_schema)
-                if {key: value for key, value in channel.metadata.items() if key != "env"} != description:
+                if _spaces_of(channel) != description:
                     raise FormatError(
                         f"{self.name}: {channel.topic} describes other spaces than {steps[0].topic}"
                     )
@@ -403,3 +403,7 @@ class Recording:
     def __repr__(self) -> str:
         state = "" if self.complete else ", recovered"
         return f"<Recording {self.name}: {len(self.index)} episodes, {self.num_steps} steps{state}>"
+
+
+def _spaces_of(channel: Channel) -> dict[str, str]:
+    return {key: value for key, value in channel.metadata.items() if key not in ("env", "crc")}

@@ -22,7 +22,7 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.container import CHUNK_ROWS, Rows
-from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_version, step_channels
+from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata, step_channels
 from tupli_mcap.recording.events import INTERRUPTED, EpisodeEnd, EpisodeStart, record
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.journal import (
@@ -65,7 +65,7 @@ def head(source: Source) -> dict[str, str]:
                 f"{source.name}: the file is cut off or damaged before its first step; nothing can be read from it"
             )
         raise foreign(source, f"its profile is {found.profile!r}")
-    return check_version(source, found.metadata[RECORDING_METADATA])
+    return check_metadata(source, found.metadata[RECORDING_METADATA])
 
 
 def recover_contents(source: Source, journal: JournalContents | Exception | None) -> Contents:
