@@ -23,8 +23,10 @@ if TYPE_CHECKING:
     from tupli_mcap.recording import (
         EpisodeData,
         Recording,
+        RecoveryReport,
         Step,
         journal_path,
+        recover_recording,
         rewrite_recording,
         write_recording,
     )
@@ -61,7 +63,16 @@ _HOMES = {
         "TupliError",
         "UntrustedError",
     ],
-    "recording": ["EpisodeData", "Recording", "Step", "journal_path", "rewrite_recording", "write_recording"],
+    "recording": [
+        "EpisodeData",
+        "Recording",
+        "RecoveryReport",
+        "Step",
+        "journal_path",
+        "recover_recording",
+        "rewrite_recording",
+        "write_recording",
+    ],
     "schema": [
         "EpisodeMetadataCallback",
         "F",
@@ -103,6 +114,7 @@ __all__ = [
     "RecordEpisodes",
     "Recording",
     "RecordingError",
+    "RecoveryReport",
     "SpaceError",
     "Step",
     "StepError",
@@ -113,6 +125,7 @@ __all__ = [
     "TupliStorage",
     "UntrustedError",
     "journal_path",
+    "recover_recording",
     "rewrite_recording",
     "write_recording",
 ]

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from tupli_mcap.cli import recordings, sharing, storages, trusting
+from tupli_mcap.cli import recordings, repair, sharing, storages, trusting
 from tupli_mcap.cli.output import warnings_in_one_line
 from tupli_mcap.errors import FilterError, TupliError
 
@@ -128,6 +128,7 @@ recordings.register(app)
 storages.register(app)
 sharing.register(app)
 trusting.register(app)
+repair.register(app)
 
 
 def main() -> None:

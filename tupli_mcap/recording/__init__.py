@@ -5,6 +5,7 @@ from tupli_mcap.recording.episode import Episode, Episodes, Step
 from tupli_mcap.recording.handmade import EpisodeData, write_recording
 from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.recording.reader import RecordedBenchmark, Recording
+from tupli_mcap.recording.repair import RecoveryReport, recover_recording
 from tupli_mcap.recording.rewrite import rewrite_recording
 
 __all__ = [
@@ -14,8 +15,10 @@ __all__ = [
     "Episodes",
     "RecordedBenchmark",
     "Recording",
+    "RecoveryReport",
     "Step",
     "journal_path",
+    "recover_recording",
     "rewrite_recording",
     "write_recording",
 ]

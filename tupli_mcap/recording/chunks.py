@@ -10,7 +10,7 @@ import struct
 import threading
 import zlib
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,7 +49,7 @@ class ChunkStore:
     """
 
     def __init__(
-        self, source: Source, table: np.ndarray[Any, Any], memory: list[bytes], cache_bytes: int
+        self, source: Source, table: np.ndarray[Any, Any], memory: Sequence[bytes], cache_bytes: int
     ) -> None:
         self._source = source
         self.table = table

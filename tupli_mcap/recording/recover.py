@@ -45,7 +45,7 @@ from tupli_mcap.recording.scan import Scan, is_ours, scan
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import foreign, parse_record, records
 
-__all__ = ["belongs", "find_journal", "head", "misplaced_journal", "recover_contents"]
+__all__ = ["belongs", "define", "find_journal", "head", "misplaced_journal", "recover_contents"]
 
 
 @dataclass
@@ -88,7 +88,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
             warnings.warn(_foreign_journal(source, metadata), UserWarning, stacklevel=6)
         journal = None  # a stale journal of another recording with this name is not ours to merge
     if journal is not None:
-        _define(found, journal, source)
+        define(found.schemas, found.channels, journal, source.name)
     tail = _Tail()
     end = found.end
     if found.unindexed is not None:
@@ -175,9 +175,14 @@ def _foreign_journal(source: Source, metadata: Mapping[str, str]) -> str:
     )
 
 
-def _define(found: Scan, journal: JournalContents, source: Source) -> None:
-    """What the journal defines is under its checksum, what the file defines outside of chunks is not."""
-    where = f"{source.name}: journal"
+def define(
+    schemas: dict[int, Schema], channels: dict[int, Channel], journal: JournalContents, name: str
+) -> None:
+    """Adds the schemas and channels that the journal defines to those known; `name` is the recording's.
+
+    What the journal defines is under its checksum, what the file defines outside of chunks is not.
+    """
+    where = f"{name}: journal"
     try:
         texts = [bytes.fromhex(text) for text in dict(journal.info.get("definitions", {})).values()]
     except (TypeError, ValueError) as err:
@@ -186,10 +191,10 @@ def _define(found: Scan, journal: JournalContents, source: Source) -> None:
         for opcode, offset, body in records(text, 0, where):
             if opcode == Opcode.SCHEMA:
                 schema: Schema = parse_record(opcode, body, offset, where)
-                found.schemas[schema.id] = schema
+                schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
                 channel: Channel = parse_record(opcode, body, offset, where)
-                found.channels[channel.id] = channel
+                channels[channel.id] = channel
 
 
 def _table(found: Scan, memory: list[Rows]) -> np.ndarray[Any, Any]:

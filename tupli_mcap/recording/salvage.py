@@ -54,6 +54,18 @@ class Salvage:
         chosen = order[start : start + good]
         return self.rows[self._halves[chosen], self._places[chosen]].copy()
 
+    def runs(self, first: int, stop: int) -> list[Array]:
+        """Copies of the committed rows with `first` <= sequence < `stop`, in runs of consecutive ones."""
+        wanted = np.flatnonzero((self._sequences >= first) & (self._sequences < stop))
+        sequences, places = np.unique(self._sequences[wanted], return_index=True)
+        chosen = wanted[places]
+        edges = np.flatnonzero(np.diff(sequences) != 1) + 1
+        return [
+            self.rows[self._halves[part], self._places[part]].copy()
+            for part in np.split(chosen, edges)
+            if len(part)
+        ]
+
     def following(self, sequence: int) -> Array | None:
         """The row that was running when the one with `sequence` was committed; None if that one is not here."""
         found = np.flatnonzero(self._sequences == sequence)
@@ -85,15 +97,20 @@ def image_rows(salvage: Salvage, first: int, steps: int, channel: int) -> Rows |
 
 
 def log_records(
-    contents: JournalContents, area: LogArea, counts: dict[int, int]
+    contents: JournalContents, area: LogArea, counts: dict[int, int] | None
 ) -> list[tuple[int, int, int, bytes]]:
-    """(channel, sequence, log_time, record) of the committed records that are not in the file, in order."""
+    """(channel, sequence, log_time, record) of the committed records that are not in the file, in order.
+
+    `counts` are the rows of each channel that are in the file; None: all committed records, each once.
+    """
     found: list[tuple[int, int, int, bytes]] = []
     for half in range(area.halves):
         data = _half(contents, area, half)
         for start, end, channel, sequence, log_time in iter_records(data):
             found.append((channel, sequence, log_time, bytes(data[start:end])))
     found.sort(key=lambda entry: (entry[0], entry[1]))
+    if counts is None:
+        return list({entry[:2]: entry for entry in found}.values())
     expected, kept = dict(counts), []
     for entry in found:
         if entry[1] == expected.get(entry[0], 0):

@@ -11,7 +11,16 @@ from typing import Any, NamedTuple
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Header,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.container import MAGIC, PROFILE
@@ -33,6 +42,7 @@ _RECORD = struct.Struct("<BQ")
 _MAX_SUMMARY = 1 << 31
 
 _PARSERS: dict[int, Any] = {
+    Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
     Opcode.CHUNK_INDEX: ChunkIndex,

@@ -1,0 +1,506 @@
+"""`recover_recording`: everything good is saved, nothing wrong gets in, and what was lost is said."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Sampler, roll
+from gymnasium import spaces
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, IndexType, Writer
+from test_golden import NAMES, as_read, assert_same, expected, place
+from typer.testing import CliRunner
+
+from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError, journal_path, recover_recording
+from tupli_mcap.cli.app import app
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.recording import RecoveryReport
+from tupli_mcap.recording.source import PathSource
+from tupli_mcap.recording.survey import Damage, Found, Survey
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+Steps = dict[tuple[int, int], str]
+BOX = spaces.Box(-1.0, 1.0, (6,), np.float64)
+
+
+def steps_of(recording: Recording, *, infos: bool = False) -> Steps:
+    """Every step by the episode and step number it had before a repair, exact."""
+    found: Steps = {}
+    for episode in recording.episodes:
+        origin = episode.metadata.get("recovered")
+        number, first = (episode.number, 0) if origin is None else (origin["episode"], origin["first_step"])
+        for i, step in enumerate(episode):
+            values = [step.state, step.action, step.reward, step.terminal, step.timeout]
+            found[number, first + i] = jsonvalue.dumps([*values, step.info] if infos else values)
+    return found
+
+
+def places(path: Path) -> list[Found]:
+    source = PathSource(path)
+    try:
+        found = [item for item in Survey(source) if not isinstance(item, Damage)]
+    finally:
+        source.close()
+    return found
+
+
+def chunks(path: Path, topic: str) -> list[Found]:
+    """The chunks of a topic, in their order."""
+    with Recording(path) as recording:
+        channel = recording._topics[topic]
+        table = recording._contents.table
+        offsets = set(table["offset"][table["channel"] == channel].tolist())
+    return [item for item in places(path) if item.offset in offsets]
+
+
+def flip(path: Path, *positions: int) -> None:
+    data = bytearray(path.read_bytes())
+    for position in positions:
+        data[position] ^= 0x10
+    path.write_bytes(data)
+
+
+def hit(path: Path, found: Found) -> None:
+    """Damages a record in its middle."""
+    flip(path, found.offset + found.length // 2)
+
+
+def record(path: Path, steps: int = 300, length: int = 40, **options: Any) -> Path:
+    with RecordEpisodes(
+        Sampler(BOX, spaces.Discrete(3), length=length), path, chunk_size=4096, **options
+    ) as env:
+        roll(env, steps)
+    return path
+
+
+def recovered(path: Path) -> tuple[RecoveryReport, Recording]:
+    report = recover_recording(path, overwrite=True)
+    assert report.target is not None
+    return report, Recording(report.target)
+
+
+def assert_true(found: Steps, wanted: Steps, report: RecoveryReport) -> None:
+    """All steps are true ones, and those that are not here are named."""
+    assert all(wanted[key] == value for key, value in found.items())
+    missing = set(wanted) - set(found)
+    named = {
+        (lost.episode, step)
+        for lost in report.lost
+        for step in range(lost.first, 10_000 if lost.stop is None else lost.stop)
+    }
+    assert missing <= named
+    assert named & set(found) == set()
+    assert len(missing) == report.steps_lost
+
+
+# ---- recordings of ours
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_good_recording_comes_back_whole(name: str, tmp_path: Path) -> None:
+    path = place(name, tmp_path)
+    before = path.read_bytes()
+    report, recording = recovered(path)
+    with recording:
+        assert_same(list(as_read(recording)), expected(name))
+        assert recording.complete
+    assert path.read_bytes() == before
+    assert report.intact == (not name.startswith("unfinished"))
+    assert (report.steps_lost, report.lost, report.damaged) == (0, [], [])
+    assert Path(report.target or "").name == f"{name}.recovered.mcap"
+
+
+def test_an_episode_with_a_hole_is_cut(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", length=200)
+    with Recording(path) as recording:
+        wanted, uuid = steps_of(recording), recording.uuid
+        table = recording._contents.table
+        seeds = {e.number: e.seed for e in recording.episodes}
+    middle = chunks(path, "/step")[2]
+    row = next(r for r in table if r["offset"] == middle.offset)
+    first, stop = int(row["first"]), int(row["first"] + row["rows"])
+    hit(path, middle)
+    report, recording = recovered(path)
+    with recording:
+        found = steps_of(recording)
+        assert_true(found, wanted, report)
+        assert report.steps_lost == stop - first
+        assert recording.uuid == uuid
+        assert [lost.episode for lost in report.lost] == [0]
+        head = next(e for e in recording.episodes if e.number == 0)
+        assert (len(head), head.end, head.final_state) == (first, "interrupted", None)
+        assert head.seed == seeds[head.number]
+        assert head.metadata["recovered"] == {"episode": head.number, "first_step": 0, "length": 200}
+        piece = recording.episodes[-1]
+        assert piece.number == 2
+        assert piece.metadata["recovered"] == {"episode": 0, "first_step": stop, "length": 200}
+        assert piece.start.continued
+        assert piece.seed is None
+        assert piece.final_state is not None
+        assert piece.return_ == sum(piece.rewards.tolist())
+        assert [(c.episode, c.first_step, c.steps, c.becomes) for c in report.cut] == [
+            (0, 0, first, 0),
+            (0, stop, 200 - stop, 2),
+        ]
+
+
+def test_recovering_again_changes_nothing(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    hit(path, chunks(path, "/step")[1])
+    first, recording = recovered(path)
+    with recording:
+        before = list(as_read(recording))
+    again, recording = recovered(Path(first.target or ""))
+    with recording:
+        assert again.intact
+        assert_same(list(as_read(recording)), before)
+
+
+@pytest.mark.parametrize("topic", ["/episode_start", "/episode_end", "/final_state"])
+@pytest.mark.parametrize("with_index", [True, False])
+def test_lost_messages_of_episodes(topic: str, with_index: bool, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    with Recording(path) as recording:
+        wanted = list(as_read(recording))
+        index = recording._contents.data_end
+    hit(path, chunks(path, topic)[0])
+    if not with_index:
+        flip(path, index + 100)
+    report, recording = recovered(path)
+    with recording:
+        found = list(as_read(recording))
+    for one, other in zip(found, wanted, strict=True):
+        same = set(one) - {"reset_info", "options", "seed", "final_state"}
+        assert jsonvalue.dumps({k: one[k] for k in same}) == jsonvalue.dumps({k: other[k] for k in same})
+        assert (one["final_state"] is None) == (topic == "/final_state")
+        if topic != "/episode_start" or with_index:
+            assert one["seed"] == other["seed"]
+    numbers = list(range(8))
+    assert report.starts_lost == (numbers if topic == "/episode_start" else [])
+    assert report.final_states_lost == (numbers if topic == "/final_state" else [])
+    assert (
+        report.ends_lost == (numbers[:-1] if topic == "/episode_end" and not with_index else [])
+        or report.ends_lost == numbers
+    )
+    assert report.steps_lost == 0
+
+
+def test_a_damaged_header_of_a_chunk_loses_nothing_with_the_index(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+    for offset in range(50):  # opcode, length, times, sizes, CRC, name of the compression
+        again = tmp_path / "b.mcap"
+        again.write_bytes(path.read_bytes())
+        flip(again, chunks(path, "/step")[1].offset + offset)
+        report, recording = recovered(again)
+        with recording:
+            assert steps_of(recording) == wanted, offset
+        assert report.steps_lost == 0
+
+
+def truncate(path: Path, size: int) -> None:
+    os.truncate(path, size)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8, 0.99])
+def test_a_truncated_recording_keeps_its_whole_chunks(share: float, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+    size = int(path.stat().st_size * share)
+    kept = sum(1 for item in chunks(path, "/step") if item.offset + item.length <= size)
+    truncate(path, size)
+    report, recording = recovered(path)
+    with recording:
+        found = steps_of(recording)
+        assert all(wanted[key] == value for key, value in found.items())
+        assert len(found) == min(300, kept * len(found) // max(kept, 1))
+        assert kept
+    assert not report.finished or share == 0.99
+
+
+def test_a_hole_in_a_killed_recording_is_filled_from_its_journal(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    pid = os.fork()
+    if pid == 0:
+        try:
+            env = RecordEpisodes(Sampler(BOX, spaces.Discrete(3), length=40), path, chunk_size=4096)
+            roll(env, 300)
+        finally:
+            os._exit(0)
+    os.waitpid(pid, 0)
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+        final = recording.episodes[-1].final_state
+    assert len(wanted) == 300
+    bad = [item for item in places(path) if item.chunk is not None]
+    hit(path, bad[2])
+    report, recording = recovered(path)
+    with recording:
+        assert_true(steps_of(recording), wanted, report)
+        assert 0 < report.steps_lost < 60
+        assert recording.episodes[-1].end == "interrupted" or recording.episodes[-1].number == 8
+        finals = [
+            e.final_state
+            for e in recording.episodes
+            if e.metadata.get("recovered", {}).get("episode", e.number) == 7
+        ]
+        assert finals[-1].tobytes() == final.tobytes()
+    assert report.journal == "used"
+    hit(path, bad[-1])  # its rows are in the other half of the journal still
+    again, recording = recovered(path)
+    with recording:
+        assert again.steps_lost == report.steps_lost
+    journal_path(path).unlink()
+    missing, recording = recovered(path)
+    recording.close()
+    assert missing.journal == "missing"
+
+
+def test_damage_in_one_sub_environment_leaves_the_others_alone(tmp_path: Path) -> None:
+    path = tmp_path / "v.mcap"
+    fns = [lambda: Sampler(BOX, spaces.Discrete(3), length=30)] * 3
+    with RecordVector(gym.vector.SyncVectorEnv(fns), path, chunk_size=4096) as env:
+        env.reset(seed=3)
+        for _ in range(1500):
+            env.step(env.action_space.sample())
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+        envs = {e.number: e.env for e in recording.episodes}
+    hit(path, chunks(path, "/env_1/step")[0])
+    report, recording = recovered(path)
+    with recording:
+        assert_true(steps_of(recording), wanted, report)
+        assert report.steps_lost
+        assert {envs[lost.episode] for lost in report.lost} == {1}
+        assert recording.num_envs == 3
+
+
+def test_a_step_without_its_image_is_lost(tmp_path: Path) -> None:
+    path = tmp_path / "i.mcap"
+    space = spaces.Dict({"x": BOX, "camera": spaces.Box(0, 255, (8, 8, 3), np.uint8)})
+    with RecordEpisodes(Sampler(space, spaces.Discrete(3), length=40), path, chunk_size=1024) as env:
+        roll(env, 100)
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+    found = chunks(path, "/image/state_camera")
+    assert len(found) > 2
+    hit(path, found[1])
+    report, recording = recovered(path)
+    with recording:
+        assert_true(steps_of(recording), wanted, report)
+    assert 0 < report.steps_lost < 20
+
+
+def test_what_else_is_damaged_is_said(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", attachments={"note": ("text/plain", b"x" * 5000)})
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+    everything = places(path)
+    attachment = next(i for i in everything if i.attachment is not None and i.attachment.name == "note")
+    metadata = next(item for item in everything if item.opcode == 12)
+    indexes = [item for item in everything if item.opcode == 7]
+    hit(path, attachment)
+    report = recover_recording(path, dry_run=True)
+    assert [place.why for place in report.damaged] == ["the attachment 'note' is damaged (its CRC differs)"]
+    hit(path, indexes[0])
+    flip(path, metadata.offset + 1, path.stat().st_size - 20)
+    report, recording = recovered(path)
+    with recording:
+        assert steps_of(recording) == wanted
+        assert recording.attachments == {} or "note" not in recording.attachments
+    said = [place.why for place in report.damaged]
+    assert report.attachments_lost == ["note"]
+    assert any("message index" in why for why in said)
+    assert any("new uuid" in note for note in report.notes)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["constant_none", "dict_with_images", "infos", "variable", "vector_same_step", "unfinished_variable"],
+)
+def test_one_flipped_byte_anywhere(name: str, tmp_path: Path) -> None:
+    """Whatever byte is flipped: what is saved is true, and what is missing is said."""
+    path = place(name, tmp_path)
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+    data = path.read_bytes()
+    rng = random.Random(name)
+    for _ in range(60):
+        position = rng.randrange(len(data))
+        bad = bytearray(data)
+        bad[position] ^= 1 << rng.randrange(8)
+        path.write_bytes(bad)
+        report = recover_recording(path, overwrite=True)
+        if not report.saved:
+            assert report.steps_lost == len(wanted), position
+            continue
+        with Recording(report.target or "") as recording:
+            if report.journal != "stale":
+                assert_true(steps_of(recording), wanted, report)
+
+
+# ---- other MCAP files
+
+
+def foreign(path: Path, messages: int = 600, **options: Any) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file, **{"chunk_size": 2000, **options})
+        writer.start("ros2", "somebody")
+        schema = writer.register_schema("A", "jsonschema", b"{}")
+        ids = [writer.register_channel(topic, "json", schema, {"k": topic}) for topic in ("/a", "/b")]
+        writer.add_attachment(1, 2, "att", "text/plain", b"hi" * 50)
+        for i in range(messages):
+            writer.add_message(ids[i % 3 == 0], i * 10, b'{"i": %d}' % i, i * 10 + 1, i)
+        writer.add_metadata("meta", {"a": "b"})
+        writer.finish()
+    return path
+
+
+def read_foreign(path: Path) -> dict[int, tuple[str, bytes, int, int]]:
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        return {
+            message.sequence: (channel.topic, message.data, message.log_time, message.publish_time)
+            for _, channel, message in reader.iter_messages()
+        }
+
+
+LAYOUTS: dict[str, dict[str, Any]] = {
+    "zstd": {"compression": CompressionType.ZSTD},
+    "lz4": {"compression": CompressionType.LZ4},
+    "none": {"compression": CompressionType.NONE},
+    "unchunked": {"use_chunking": False},
+    "no_crc": {"enable_crcs": False},
+    "no_index": {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False},
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_other_files_come_back_whole(layout: str, tmp_path: Path) -> None:
+    path = foreign(tmp_path / "f.mcap", **LAYOUTS[layout])
+    report = recover_recording(path)
+    assert report.kind == "mcap"
+    target = Path(report.target or "")
+    found = read_foreign(target)
+    assert len(found) == 600
+    assert found == read_foreign(path)
+    assert (report.damaged, report.messages, report.attachments) == ([], 600, 1)
+    with target.open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        assert [m.metadata for m in reader.iter_metadata()] == [{"a": "b"}]
+        assert [(a.name, a.data, a.log_time) for a in reader.iter_attachments()] == [("att", b"hi" * 50, 2)]
+        assert {c.topic: c.metadata for c in reader.get_summary().channels.values()} == {
+            "/a": {"k": "/a"},
+            "/b": {"k": "/b"},
+        }
+
+
+@pytest.mark.parametrize("layout", ["zstd", "lz4", "none", "unchunked"])
+@pytest.mark.parametrize("cut", [0.2, 0.5, 0.9])
+def test_a_truncated_other_file(layout: str, cut: float, tmp_path: Path) -> None:
+    path = foreign(tmp_path / "f.mcap", **LAYOUTS[layout])
+    wanted = read_foreign(path)
+    truncate(path, int(path.stat().st_size * cut))
+    report = recover_recording(path)
+    found = read_foreign(Path(report.target or ""))
+    assert found.items() <= wanted.items()
+    assert len(found) > 600 * (cut - 0.15)
+
+
+@pytest.mark.parametrize("layout", ["zstd", "lz4", "none"])
+def test_a_bad_chunk_of_another_file_is_passed(layout: str, tmp_path: Path) -> None:
+    path = foreign(tmp_path / "f.mcap", **LAYOUTS[layout])
+    wanted = read_foreign(path)
+    bad = [item for item in places(path) if item.chunk is not None]
+    for chunk in (bad[0], bad[3]):
+        hit(path, chunk)
+    report = recover_recording(path)
+    found = read_foreign(Path(report.target or ""))
+    assert found.items() <= wanted.items()
+    assert sum(report.messages_lost.values()) == 600 - len(found) > 0
+    assert set(report.messages_lost) == {"/a", "/b"}
+    with path.open("rb") as file, pytest.raises(Exception, match="."):
+        list(StreamReader(file, validate_crcs=True).records)
+
+
+# ---- targets, errors, the command
+
+
+def test_targets(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    other = tmp_path / "other.mcap"
+    assert recover_recording(path, dry_run=True).target is None
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap"]
+    recover_recording(path, other)
+    with pytest.raises(RecordingError, match=r"other\.mcap exists and is not overwritten"):
+        recover_recording(path, other)
+    recover_recording(path, other, overwrite=True)
+    with pytest.raises(RecordingError, match=r"a\.mcap is never overwritten"):
+        recover_recording(path, path, overwrite=True)
+    with pytest.raises(RecordingError, match="cannot be written"):
+        recover_recording(path, tmp_path / "none" / "x.mcap")
+    with pytest.raises(RecordingError, match="does not exist"):
+        recover_recording(tmp_path / "none.mcap")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "other.mcap"]
+
+
+def test_a_live_recording_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(Sampler(BOX, spaces.Discrete(3)), path) as env:
+        roll(env, 5)
+        with pytest.raises(RecordingError, match=r"is being recorded; close its writer first"):
+            recover_recording(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense" * 100, b"\x89MCAP0\r\n", bytes(5000)])
+def test_nothing_to_save(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    result = CliRunner().invoke(app, ["recover", str(path)])
+    assert result.exit_code == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+    if not content:
+        with pytest.raises(FormatError, match="is empty"):
+            recover_recording(path)
+
+
+def test_the_command(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    hit(path, chunks(path, "/step")[2])
+    dry = CliRunner().invoke(app, ["recover", str(path), "--dry-run"])
+    assert dry.exit_code == 0
+    assert "nothing was written" in dry.output
+    result = CliRunner().invoke(app, ["recover", str(path), "--json"])
+    assert result.exit_code == 0
+    report = json.loads(result.output)
+    assert report["target"] == str(tmp_path / "a.recovered.mcap")
+    assert report["steps"] + report["steps_lost"] == 300
+    shown = CliRunner().invoke(app, ["recover", str(path), "--force"])
+    assert "STEPS LOST" in shown.output
+    assert "the chunk" in shown.output
+
+
+def test_interrupted_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = record(tmp_path / "a.mcap")
+    steps: list[Callable[..., Any]] = [os.fsync]
+
+    def stop(fd: int) -> None:
+        steps[0](fd)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", stop)
+    with pytest.raises(KeyboardInterrupt):
+        recover_recording(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]

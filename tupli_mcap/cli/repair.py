@@ -1,0 +1,131 @@
+"""Commands on damaged files: recover."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tupli_mcap.cli.options import Json
+from tupli_mcap.cli.output import Column, bytes_of, number, print_json, print_table
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording.repair import RecoveryReport
+
+__all__ = ["register"]
+
+_SHOWN = 20  # damaged places, lost episodes: what is beyond is in --json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the application."""
+    app.command("recover")(_recover)
+
+
+def _recover(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file, a recording or any other.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="By default FILE.recovered.mcap, beside it."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what could be saved.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Save everything good in a damaged or unfinished file into a new one.
+
+    The file itself is only read. What was lost is said by episode and step; an episode that lost steps in the
+    middle becomes several. Exit code 1 only if nothing could be saved.
+    """
+    from tupli_mcap.recording.repair import recover_recording
+
+    report = recover_recording(file, output, overwrite=force, dry_run=dry_run)
+    if as_json:
+        print_json(report.to_json())
+    else:
+        _print_recovery(report)
+    if not report.saved:
+        raise typer.Exit(1)
+
+
+def _print_recovery(report: RecoveryReport) -> None:
+    print(_summary(report))
+    for line in [*_losses(report), *report.notes]:
+        print(f"  {line}")
+    if report.lost:
+        pieces: dict[int, list[str]] = {}
+        for cut in report.cut:
+            last = cut.first_step + cut.steps - 1
+            pieces.setdefault(cut.episode, []).append(f"{cut.becomes} (steps {cut.first_step}-{last})")
+        rows = []
+        for episode in sorted({lost.episode for lost in report.lost}):
+            steps = [
+                f"{lost.first}-{'?' if lost.stop is None else lost.stop - 1}"
+                for lost in report.lost
+                if lost.episode == episode
+            ]
+            rows.append((str(episode), ", ".join(steps), ", ".join(pieces.get(episode, [])) or "nothing"))
+        print()
+        columns = (
+            Column("EPISODE", "right"),
+            Column("STEPS LOST", shrink="end"),
+            Column("KEPT AS", shrink="end"),
+        )
+        print_table(columns, rows[:_SHOWN], empty="")
+        _print_rest(len(rows))
+    if report.damaged:
+        print()
+        columns = (Column("OFFSET", "right"), Column("SIZE", "right"), Column("DAMAGE", shrink="end"))
+        places = [(str(place.offset), bytes_of(place.size), place.why) for place in report.damaged]
+        print_table(columns, places[:_SHOWN], empty="")
+        _print_rest(len(places))
+
+
+def _print_rest(count: int) -> None:
+    if count > _SHOWN:
+        print(f"... and {number(count - _SHOWN)} more; see --json")
+
+
+def _summary(report: RecoveryReport) -> str:
+    if not report.saved:
+        return f"{report.source}: nothing could be saved"
+    where = "can be saved (nothing was written)" if report.target is None else f"saved to {report.target}"
+    if report.kind == "mcap":
+        what = f"{number(report.messages)} messages and {number(report.attachments)} attachments"
+    else:
+        what = f"{number(report.episodes)} episodes, {number(report.steps)} steps"
+    state = (
+        "nothing was wrong with it" if report.intact else "nothing was lost" if _lost_nothing(report) else ""
+    )
+    return f"{report.source}: {what} {where}" + (f"; {state}" if state else "")
+
+
+def _lost_nothing(report: RecoveryReport) -> bool:
+    return not _losses(report) and report.journal in ("none", "used") and not report.notes
+
+
+def _losses(report: RecoveryReport) -> list[str]:
+    """What is lost, a line each."""
+    found = []
+    if report.steps_lost or report.episodes_lost:
+        found.append(
+            f"lost: {number(report.steps_lost)} steps, {number(report.episodes_lost)} whole episodes"
+        )
+    for what, episodes in (
+        ("the start (seed, options, info) of episodes", report.starts_lost),
+        ("the end (metadata) of episodes", report.ends_lost),
+        ("the final state of episodes", report.final_states_lost),
+    ):
+        if episodes:
+            shown = ", ".join(str(n) for n in episodes[:_SHOWN])
+            found.append(f"lost: {what} {shown}{' ...' if len(episodes) > _SHOWN else ''}")
+    if report.infos_lost:
+        found.append(f"lost: {number(report.infos_lost)} infos of steps")
+    for topic, count in report.messages_lost.items():
+        found.append(f"lost: {number(count)} messages of {topic}")
+    if report.attachments_lost:
+        found.append(f"lost: the attachments {', '.join(report.attachments_lost[:_SHOWN])}")
+    if report.journal == "missing":
+        found.append("lost: steps not yet in a chunk, with the journal, which is not beside the file")
+    return found

@@ -1,0 +1,113 @@
+"""The Message records of a chunk as arrays: where each stands, and what its header says."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import BODY, HEADER_FIELDS
+from tupli_mcap.recording.logs import iter_records
+from tupli_mcap.recording.summary import parse_record
+
+__all__ = ["HEADERS", "ChunkRecords", "chunk_records", "message_headers"]
+
+_RECORD = struct.Struct("<BQ")
+HEADERS = np.dtype([(name, kind) for name, kind, _ in HEADER_FIELDS] + [("#offset", "<u8")])
+Array = np.ndarray[Any, Any]
+
+
+class ChunkRecords(NamedTuple):
+    """The definitions a chunk starts with (`skip` bytes), and the headers of its messages (`HEADERS`; offsets from
+    the first message)."""
+
+    skip: int
+    schemas: list[Schema]
+    channels: list[Channel]
+    headers: Array
+
+    @property
+    def channel(self) -> int:
+        """The channel of all messages."""
+        return int(self.headers["#channel"][0])
+
+    def index_entries(self) -> Array:
+        """What the MessageIndex of the chunk has to say: (log_time, offset) of each message."""
+        entries = np.empty((len(self.headers), 2), "<u8")
+        entries[:, 0] = self.headers["#log_time"]
+        entries[:, 1] = self.headers["#offset"] + np.uint64(self.skip)
+        return entries
+
+    @property
+    def first(self) -> int:
+        """The row number of the first message."""
+        return int(self.headers["#sequence"][0])
+
+
+def chunk_records(data: memoryview, where: str) -> ChunkRecords:
+    """The records of a chunk of ours.
+
+    Raises:
+        FormatError: it holds other than definitions and then messages, of one channel, in the order of their rows.
+    """
+    skip, schemas, channels = 0, [], []
+    while skip + 9 <= len(data) and data[skip] in (Opcode.SCHEMA, Opcode.CHANNEL):
+        opcode, length = _RECORD.unpack_from(data, skip)
+        if length > len(data) - skip - 9:
+            raise FormatError(f"{where}: a record in it claims {length} bytes")
+        record = parse_record(opcode, data[skip + 9 : skip + 9 + length], skip, where)
+        schemas.append(record) if opcode == Opcode.SCHEMA else channels.append(record)
+        skip += 9 + length
+    try:
+        headers = message_headers(data[skip:])
+    except FormatError as err:
+        raise FormatError(f"{where}: {err}") from err
+    if not len(headers):
+        raise FormatError(f"{where}: expected messages in it, found none")
+    if (headers["#channel"] != headers["#channel"][0]).any():
+        raise FormatError(f"{where}: expected messages of one channel in it")
+    if (headers["#sequence"] != int(headers["#sequence"][0]) + np.arange(len(headers))).any():
+        raise FormatError(f"{where}: expected consecutive rows in it")
+    return ChunkRecords(skip, schemas, channels, headers)
+
+
+def message_headers(data: memoryview) -> Array:
+    """The headers of consecutive Message records; FormatError for bytes that are none."""
+    even = _even(data)
+    if even is not None:
+        return even
+    offsets = np.array([start for start, *_ in iter_records(data)], dtype=np.int64)
+    found = np.empty(len(offsets), HEADERS)
+    raw = np.frombuffer(data, np.uint8)
+    for name, kind, at in HEADER_FIELDS:
+        size = np.dtype(kind).itemsize
+        found[name] = raw[offsets[:, None] + (at + np.arange(size))].view(kind)[:, 0]
+    found["#offset"] = offsets
+    return found
+
+
+def _even(data: memoryview) -> Array | None:
+    """The headers where all records have the same size, else None."""
+    if len(data) < BODY:
+        return None
+    size = 9 + int.from_bytes(data[1:9], "little")
+    if size < BODY or len(data) % size:
+        return None
+    spec: Any = {
+        "names": [name for name, _, _ in HEADER_FIELDS],
+        "formats": [kind for _, kind, _ in HEADER_FIELDS],
+        "offsets": [at for _, _, at in HEADER_FIELDS],
+        "itemsize": size,
+    }
+    rows = np.frombuffer(data, np.dtype(spec))
+    if (rows["#opcode"] != Opcode.MESSAGE).any() or (rows["#length"] != size - 9).any():
+        return None
+    found = np.empty(len(rows), HEADERS)
+    for name, _, _ in HEADER_FIELDS:
+        found[name] = rows[name]
+    found["#offset"] = np.arange(len(rows)) * size
+    return found

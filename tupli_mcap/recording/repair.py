@@ -1,0 +1,313 @@
+"""`recover_recording`: everything good in a damaged MCAP file, in a new one; what was lost, said exactly."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.contents import step_channels
+from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.lock import is_locked
+from tupli_mcap.recording.repair_foreign import copy_foreign
+from tupli_mcap.recording.repair_gather import Gathered, gather, is_recording, may_be_recording
+from tupli_mcap.recording.repair_journal import add_journal
+from tupli_mcap.recording.repair_plan import Channels, Plan, make_plan
+from tupli_mcap.recording.repair_write import RepairWriter
+from tupli_mcap.recording.source import PathSource, Source
+from tupli_mcap.recording.survey import Damage, attachment_name
+from tupli_mcap.recording.tail import read_tail
+
+__all__ = ["CutEpisode", "DamagedPlace", "LostSteps", "RecoveryReport", "recover_recording", "recovered_path"]
+
+
+class DamagedPlace(NamedTuple):
+    """`size` bytes from `offset` on that could not be read, and why."""
+
+    offset: int
+    size: int
+    why: str
+
+
+class LostSteps(NamedTuple):
+    """Steps `first:stop` of an episode, as numbered in the damaged file; `stop` None: to its end, wherever that was."""
+
+    episode: int
+    first: int
+    stop: int | None
+
+
+class CutEpisode(NamedTuple):
+    """What is left of an episode that lost steps: `steps` from `first_step` on are episode `becomes` now."""
+
+    episode: int
+    first_step: int
+    steps: int
+    becomes: int
+
+
+@dataclass
+class RecoveryReport:
+    """What was found in a file, what was saved of it, and what was lost.
+
+    kind: "recording" (ours) or "mcap" (any other). target: the new file, None if none was written.
+    finished: the file has its end; journal: "none", "used", "missing", "damaged" or "stale".
+    lost_steps counts rows that are known to have been there; lost names their episodes.
+    """
+
+    source: str
+    kind: str = "recording"
+    target: str | None = None
+    finished: bool = True
+    journal: str = "none"
+    episodes: int = 0
+    steps: int = 0
+    messages: int = 0
+    attachments: int = 0
+    episodes_lost: int = 0
+    steps_lost: int = 0
+    messages_lost: dict[str, int] = field(default_factory=dict)
+    attachments_lost: list[str] = field(default_factory=list)
+    lost: list[LostSteps] = field(default_factory=list)
+    cut: list[CutEpisode] = field(default_factory=list)
+    starts_lost: list[int] = field(default_factory=list)
+    ends_lost: list[int] = field(default_factory=list)
+    final_states_lost: list[int] = field(default_factory=list)
+    infos_lost: int = 0
+    damaged: list[DamagedPlace] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def bytes_skipped(self) -> int:
+        """Bytes of the file that nothing could be read from."""
+        return sum(place.size for place in self.damaged)
+
+    @property
+    def saved(self) -> bool:
+        """Whether anything could be saved."""
+        return bool(self.messages or self.attachments)
+
+    @property
+    def intact(self) -> bool:
+        """Whether nothing was wrong with the file."""
+        return self.finished and not (self.damaged or self.notes or self.lost or self.steps_lost)
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as JSON has it."""
+        plain = asdict(self)
+        for name in ("lost", "cut", "damaged"):
+            plain[name] = [item._asdict() for item in getattr(self, name)]
+        facts = {"bytes_skipped": self.bytes_skipped, "saved": self.saved, "intact": self.intact}
+        return {**plain, **facts}
+
+
+def recovered_path(source: Path) -> Path:
+    """Where a repaired file is written by default: `<name>.recovered.mcap` beside the damaged one."""
+    return source.with_name(f"{source.name.removesuffix('.mcap')}.recovered.mcap")
+
+
+def recover_recording(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str] | None = None,
+    *,
+    overwrite: bool = False,
+    dry_run: bool = False,
+    compression: str = "zstd",
+) -> RecoveryReport:
+    """Writes everything good in an MCAP file, ours or not, into a new one. The source is only read.
+
+    Of a recording of ours, alignment is kept by construction: an episode with a hole becomes several, of consecutive
+    steps each (`schemas/README.md`, Repair). Nothing in the file is executed.
+
+    Args:
+        target: `<name>.recovered.mcap` beside the source by default.
+        overwrite: whether an existing target may be replaced (in one rename).
+        dry_run: only reports.
+
+    Raises:
+        RecordingError: the source cannot be opened, a writer is at work on it, the target exists or cannot be
+            written. FormatError: the source is no MCAP file, or nothing at all can be read from it.
+    """
+    path = Path(source)
+    goal = recovered_path(path) if target is None else Path(target)
+    _check(path, goal, overwrite=overwrite, dry_run=dry_run)
+    opened = PathSource(path)
+    try:
+        if dry_run:
+            with _nowhere() as fd:
+                return _recover(opened, fd, compression)
+        with _replacing(goal) as fd:
+            report = _recover(opened, fd, compression)
+            if not report.saved:
+                raise _NothingSavedError(report)
+        report.target = str(goal)
+        return report
+    except _NothingSavedError as err:
+        return err.report
+    finally:
+        opened.close()
+
+
+class _NothingSavedError(Exception):
+    def __init__(self, report: RecoveryReport) -> None:
+        self.report = report
+
+
+def _check(path: Path, goal: Path, *, overwrite: bool, dry_run: bool) -> None:
+    if is_locked(path):
+        raise RecordingError(f"{path} is being recorded; close its writer first, then recover it")
+    if dry_run:
+        return
+    if goal.exists() and path.exists() and goal.samefile(path):
+        raise RecordingError(f"{path} is never overwritten; give another file to write to")
+    if goal.exists() and not overwrite:
+        raise RecordingError(
+            f"{goal} exists and is not overwritten; give another file, or allow it with --force"
+        )
+
+
+@contextlib.contextmanager
+def _replacing(goal: Path) -> Iterator[int]:
+    """A descriptor of a file that takes the place of `goal` once it is whole."""
+    temporary = goal.with_name(f".{goal.name}.{os.getpid()}.tmp")
+    try:
+        fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    except OSError as err:
+        raise RecordingError(f"{goal} cannot be written: {err.strerror}; choose a writable place") from err
+    try:
+        try:
+            yield fd
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+        temporary.replace(goal)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+@contextlib.contextmanager
+def _nowhere() -> Iterator[int]:
+    fd = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def _recover(source: Source, fd: int, compression: str) -> RecoveryReport:
+    if not source.size:
+        raise FormatError(f"{source.name} is empty: nothing can be saved from it; delete it")
+    tail = read_tail(source)
+    notes = []
+    if may_be_recording(source, tail):
+        gathered = gather(source, tail)
+        if is_recording(gathered):
+            add_journal(gathered)
+            try:
+                layout = _layout(gathered)
+                return _recover_ours(gathered, layout, Container(fd, source.name, compression))
+            except _UnknownLayoutError as err:
+                notes.append(f"{err}: its messages are copied as they are")
+    report = RecoveryReport(source.name, "mcap", notes=notes)
+    copied = copy_foreign(source, tail, fd, compression)
+    report.damaged = _places(copied.damages)
+    report.finished = tail.finished
+    report.messages, report.attachments = copied.messages, copied.attachments
+    report.messages_lost, report.attachments_lost = copied.lost, copied.attachments_lost
+    report.notes += copied.notes
+    return report
+
+
+class _UnknownLayoutError(Exception):
+    """Why the rows of a recording cannot be understood."""
+
+
+def _layout(gathered: Gathered) -> tuple[StepLayout, Channels] | None:
+    """The layout and the channels; None if the recording has no step channel and no rows."""
+    try:
+        steps = step_channels(gathered.channels, gathered.source.name)
+        if steps:
+            layout = StepLayout.from_metadata(steps[0].metadata)
+            return layout, Channels.of(gathered, layout)
+    except FormatError as err:
+        raise _UnknownLayoutError(f"the spaces of this recording are damaged ({err})") from err
+    if gathered.pieces:
+        raise _UnknownLayoutError("the spaces of this recording are lost")
+    return None
+
+
+def _recover_ours(
+    gathered: Gathered, known: tuple[StepLayout, Channels] | None, container: Container
+) -> RecoveryReport:
+    report = RecoveryReport(
+        gathered.source.name,
+        finished=gathered.tail.finished,
+        journal=gathered.journal,
+        notes=[*gathered.tail.why, *gathered.notes],
+    )
+    writer = RepairWriter(container, gathered)
+    writer.begin()
+    if known is not None:
+        layout, channels = known
+        store = gathered.store()
+        plan = make_plan(gathered, store, layout, channels)
+        writer.steps(layout, channels, plan, store)
+        _report_plan(report, plan)
+        report.infos_lost = _infos_lost(gathered, channels)
+    writer.finish()
+    if gathered.metadata is None:
+        report.notes.append("the recording's metadata are lost: it has a new uuid and names no benchmark")
+    elif writer.metadata_lost:
+        report.notes.append(f"of the recording's metadata, {', '.join(writer.metadata_lost)} are lost")
+    report.damaged = _places(gathered.damages)
+    report.messages = sum(container.counts.values())
+    report.attachments = len(container.attachment_indexes) - 1
+    report.attachments_lost = _attachments_lost(gathered)
+    return report
+
+
+def _report_plan(report: RecoveryReport, plan: Plan) -> None:
+    kept = {episode.segment.episode for episode in plan.episodes}
+    report.episodes, report.steps = len(plan.episodes), sum(e.segment.steps for e in plan.episodes)
+    report.steps_lost = plan.lost_rows
+    report.lost = [LostSteps(n, *steps) for n, ranges in sorted(plan.lost.items()) for steps in ranges]
+    report.episodes_lost = len(set(plan.lost) - kept)
+    report.cut = [
+        CutEpisode(e.segment.episode, e.segment.step, e.segment.steps, e.number)
+        for e in plan.episodes
+        if not e.whole
+    ]
+    report.starts_lost, report.ends_lost = plan.lost_starts, plan.lost_ends
+    report.final_states_lost = plan.lost_finals
+
+
+def _infos_lost(gathered: Gathered, channels: Channels) -> int:
+    """Rows missing in `/info`, as far as can be told."""
+    if channels.info is None:
+        return 0
+    ranges = gathered.ranges(channels.info)
+    stop = ranges[-1][1] if ranges else 0
+    if gathered.tail.index is not None:
+        table = gathered.tail.index.chunks
+        stop = max(stop, int(table["rows"][table["channel"] == channels.info].sum()))
+    return stop - sum(b - a for a, b in ranges)
+
+
+def _attachments_lost(gathered: Gathered) -> list[str]:
+    """Names of the attachments that are not here, as far as anything tells."""
+    summary = gathered.tail.summary
+    known = set() if summary is None else set(summary.attachments)
+    known |= {attachment_name(gathered.source, damage) or INDEX_NAME for damage in gathered.damages}
+    return sorted(known - set(gathered.attachments) - {INDEX_NAME})
+
+
+def _places(damages: list[Damage]) -> list[DamagedPlace]:
+    return [DamagedPlace(d.offset, d.end - d.offset, d.why) for d in damages]

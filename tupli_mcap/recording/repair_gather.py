@@ -1,0 +1,248 @@
+"""Everything good in a damaged recording: rows by channel and row number, wherever they lie, file or journal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, overload
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, Channel, Metadata, Schema
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
+from tupli_mcap.recording.container import CHUNK_ROWS, MAGIC, PROFILE
+from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.headers import ChunkRecords, chunk_records
+from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.source import Source
+from tupli_mcap.recording.summary import parse_record
+from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey, message_index
+from tupli_mcap.recording.tail import Tail
+
+__all__ = ["Gathered", "Piece", "Pieces", "gather", "is_recording", "may_be_recording"]
+
+_CACHE = 64 << 20
+_HEAD = 4096  # the recording's metadata record begins within so many bytes
+
+
+class Piece(NamedTuple):
+    """`rows` consecutive rows of a channel from `first` on; `size` bytes, in the place `number` of what is loaded."""
+
+    first: int
+    rows: int
+    size: int
+    number: int
+
+    @property
+    def stop(self) -> int:
+        return self.first + self.rows
+
+
+class _Place(NamedTuple):
+    """Where a chunk's messages are."""
+
+    offset: int
+    chunk: Chunk  # without its data
+    size: int
+    skip: int
+
+
+class Pieces(Sequence[bytes]):
+    """The rows of pieces, loaded when asked for."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._survey = Survey(source)
+        self._places: list[_Place | bytes] = []
+
+    def add(self, place: _Place | bytes) -> int:
+        self._places.append(place)
+        return len(self._places) - 1
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, i: int) -> bytes: ...
+    @overload
+    def __getitem__(self, i: slice) -> Sequence[bytes]: ...
+    def __getitem__(self, i: int | slice) -> Any:
+        if isinstance(i, slice):
+            return [self[k] for k in range(len(self))[i]]
+        place = self._places[i]
+        if isinstance(place, bytes):
+            return place
+        chunk = place.chunk
+        data = self._survey.unpack(place.offset, chunk.packed, chunk.compression, place.size, chunk.crc)
+        if isinstance(data, str):
+            raise FormatError(f"{self._source.name}: chunk at offset {place.offset}: {data}")
+        return memoryview(data)[place.skip :]
+
+
+@dataclass
+class Gathered:
+    """`pieces` of a channel are in order and do not overlap; `damages` are in the order of the file.
+
+    `metadata` is None where the recording's is lost. `states` are those of the running steps, by sub-environment.
+    `at_journal`: where each channel's rows from the journal begin.
+    """
+
+    source: Source
+    tail: Tail
+    loaded: Pieces
+    profile: str = ""
+    metadata: dict[str, str] | None = None
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    attachments: dict[str, AttachmentIndex] = field(default_factory=dict)
+    pieces: dict[int, list[Piece]] = field(default_factory=dict)
+    damages: list[Damage] = field(default_factory=list)
+    states: dict[int, bytes] = field(default_factory=dict)
+    journal: str = "none"
+    notes: list[str] = field(default_factory=list)
+    awaited: ChunkRecords | None = None  # the last chunk's, whose message index comes next
+
+    def add(self, channel: int, piece: Piece) -> bool:
+        """Takes rows that are not there yet; False if some of them are."""
+        pieces = self.pieces.setdefault(channel, [])
+        if any(piece.first < other.stop and other.first < piece.stop for other in pieces[-1:]):
+            return False
+        if pieces and pieces[-1].first > piece.first:
+            if any(piece.first < other.stop and other.first < piece.stop for other in pieces):
+                return False
+            pieces.append(piece)
+            pieces.sort()
+            return True
+        pieces.append(piece)
+        return True
+
+    def store(self) -> PackedStore:
+        """The rows, numbered without gaps."""
+        return PackedStore(self)
+
+    def ranges(self, channel: int) -> list[tuple[int, int]]:
+        """The rows of a channel that are here, as half-open ranges."""
+        found: list[tuple[int, int]] = []
+        for piece in self.pieces.get(channel, []):
+            if found and found[-1][1] == piece.first:
+                found[-1] = (found[-1][0], piece.stop)
+            else:
+                found.append((piece.first, piece.stop))
+        return found
+
+
+class PackedStore(ChunkStore):
+    """The rows that are here, as a store without gaps; `packed` says which of its rows a row is."""
+
+    def __init__(self, gathered: Gathered) -> None:
+        table: list[tuple[int, ...]] = []
+        self._firsts: dict[int, tuple[list[int], list[int]]] = {}
+        for channel, pieces in gathered.pieces.items():
+            counts = np.cumsum([0, *(piece.rows for piece in pieces)]).tolist()
+            self._firsts[channel] = ([piece.first for piece in pieces], counts[:-1])
+            table += [
+                (IN_MEMORY + piece.number, 0, piece.size, first, piece.rows, 0, 0, channel, 0, 0)
+                for piece, first in zip(pieces, counts[:-1], strict=True)
+            ]
+        rows = np.array(table, CHUNK_ROWS)
+        super().__init__(gathered.source, rows, gathered.loaded, _CACHE)
+
+    def packed(self, channel: int, row: int) -> int:
+        """The number here of a row that is here."""
+        firsts, counts = self._firsts[channel]
+        at = int(np.searchsorted(firsts, row, side="right")) - 1
+        return counts[at] + row - firsts[at]
+
+
+def gather(source: Source, tail: Tail) -> Gathered:
+    """Reads the whole file once, its journal not yet; raises nothing for what is damaged."""
+    gathered = Gathered(source, tail, Pieces(source))
+    if tail.summary is not None:
+        gathered.schemas |= tail.summary.schemas
+        gathered.channels |= tail.summary.channels
+    for found in Survey(source, known=tail.known_chunks(), end=_end(source, tail)):
+        if isinstance(found, Damage):
+            gathered.damages.append(found)
+        else:
+            _take(gathered, found)
+    return gathered
+
+
+def _end(source: Source, tail: Tail) -> int | None:
+    return source.size if tail.data_end is None else tail.data_end
+
+
+def _take(gathered: Gathered, found: Found) -> None:
+    name = gathered.source.name
+    awaited, gathered.awaited = gathered.awaited, None
+    if found.opcode == Opcode.MESSAGE_INDEX and awaited is not None:
+        number, entries = message_index(found.body)
+        if number != awaited.channel or not np.array_equal(entries, awaited.index_entries()):
+            end = found.offset + found.length
+            why = "the message index says other than its chunk holds"
+            gathered.damages.append(Damage(found.offset, end, why, Opcode.MESSAGE_INDEX))
+    if found.chunk is not None:
+        _take_chunk(gathered, found, found.chunk)
+    elif found.attachment is not None:
+        if found.attachment.name != INDEX_NAME:
+            gathered.attachments[found.attachment.name] = found.attachment
+    elif found.opcode == Opcode.HEADER:
+        gathered.profile = parse_record(found.opcode, found.body, found.offset, name).profile
+    elif found.opcode == Opcode.METADATA:
+        record: Metadata = parse_record(found.opcode, found.body, found.offset, name)
+        if record.name == RECORDING_METADATA and gathered.metadata is None:
+            gathered.metadata = record.metadata
+    elif found.opcode == Opcode.SCHEMA:
+        schema: Schema = parse_record(found.opcode, found.body, found.offset, name)
+        gathered.schemas.setdefault(schema.id, schema)
+    elif found.opcode == Opcode.CHANNEL:
+        channel: Channel = parse_record(found.opcode, found.body, found.offset, name)
+        gathered.channels.setdefault(channel.id, channel)
+
+
+def _take_chunk(gathered: Gathered, found: Found, chunk: Chunk) -> None:
+    try:
+        records = chunk_records(chunk.data, "the chunk")
+        if not chunk.crc:
+            raise FormatError("the chunk has no CRC")
+    except FormatError as err:
+        end = found.offset + found.length
+        gathered.damages.append(Damage(found.offset, end, str(err), Opcode.CHUNK))
+        return
+    if gathered.tail.summary is None:  # these have a CRC, those outside of chunks have none
+        gathered.schemas |= {schema.id: schema for schema in records.schemas}
+        gathered.channels |= {channel.id: channel for channel in records.channels}
+    gathered.awaited = records
+    size = len(chunk.data)
+    place = _Place(found.offset, chunk._replace(data=memoryview(b"")), size, records.skip)
+    piece = Piece(records.first, len(records.headers), size - records.skip, gathered.loaded.add(place))
+    if not gathered.add(records.channel, piece):
+        end = found.offset + found.length
+        gathered.damages.append(
+            Damage(found.offset, end, "the chunk holds rows that another one holds", Opcode.CHUNK)
+        )
+    elif found.repaired:
+        gathered.damages.append(Damage(found.offset, found.offset + 49, found.repaired, -1))
+
+
+def may_be_recording(source: Source, tail: Tail) -> bool:
+    """Whether the file is worth to be looked at as one of ours: False if it says that it is something else."""
+    if tail.index is not None or source.size < len(MAGIC) + 9:
+        return True
+    if tail.summary is not None and RECORDING_METADATA in tail.summary.metadata:
+        return True
+    if RECORDING_METADATA.encode() in source.read(0, min(source.size, _HEAD)):
+        return True
+    header = Survey(source).at(len(MAGIC))
+    if isinstance(header, str) or header.opcode != Opcode.HEADER:
+        return True
+    profile: str = parse_record(header.opcode, header.body, header.offset, source.name).profile
+    return profile == PROFILE
+
+
+def is_recording(gathered: Gathered) -> bool:
+    """Whether the file is one of ours, as far as it can be told."""
+    known = gathered.profile == PROFILE or gathered.metadata is not None or gathered.tail.index is not None
+    return known or any("observation_space" in channel.metadata for channel in gathered.channels.values())

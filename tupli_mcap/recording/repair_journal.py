@@ -1,0 +1,202 @@
+"""What the journal of an unfinished recording adds to what is good in the file: rows by number, wherever a hole is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.contents import step_channels
+from tupli_mcap.recording.events import EpisodeStart
+from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, journal_path, read_journal
+from tupli_mcap.recording.recover import belongs, define, misplaced_journal
+from tupli_mcap.recording.repair_gather import Gathered, Piece
+from tupli_mcap.recording.repair_plan import Channels, messages
+from tupli_mcap.recording.rows import RowDeriver
+from tupli_mcap.recording.salvage import Salvage, log_records, running_record
+
+__all__ = ["add_journal"]
+
+Array = np.ndarray[Any, Any]
+_END = 1 << 40  # beyond any row number
+
+
+def add_journal(gathered: Gathered) -> None:
+    """Reads the journal of an unfinished recording, and takes the rows that the file does not have."""
+    if gathered.tail.finished or gathered.source.path is None:
+        return
+    path = journal_path(gathered.source.path)
+    if gathered.metadata is not None and "journal" in gathered.metadata:
+        path = Path(gathered.metadata["journal"])
+    try:
+        journal = read_journal(path)
+    except FileNotFoundError:
+        gathered.journal = "missing"
+        elsewhere = misplaced_journal(gathered.source.path, gathered.metadata or {})
+        if elsewhere is not None:
+            gathered.notes.append(f"{elsewhere} is its journal: rename that to {path.name} and recover again")
+        return
+    except (OSError, FormatError) as err:
+        gathered.journal = "damaged"
+        gathered.notes.append(f"the journal cannot be read ({err})")
+        return
+    if not _belongs(gathered, journal):
+        gathered.journal = "stale"
+        gathered.notes.append(f"the journal {path.name} belongs to another recording")
+        return
+    gathered.journal = "used"
+    try:
+        _merge(gathered, journal)
+    except FormatError as err:
+        gathered.journal = "damaged"
+        gathered.notes.append(f"the journal is damaged ({err})")
+
+
+def _belongs(gathered: Gathered, journal: JournalContents) -> bool:
+    """Whether the journal has the recording's uuid, or, where that is lost, one that the damaged bytes hold."""
+    uuid = str(journal.info.get("uuid"))
+    if gathered.metadata is not None:
+        return belongs(journal.info, gathered.metadata)
+    for damage in gathered.damages:
+        data = gathered.source.read(damage.offset, min(damage.end - damage.offset, 1 << 16))
+        if len(uuid) == 32 and uuid.encode() in data:
+            gathered.metadata = {"uuid": uuid, "format_version": "1", "library": "", "created_ns": "0"}
+            gathered.metadata["benchmark_id"] = ""
+            gathered.notes.append("the recording's metadata are lost but for its uuid; it names no benchmark")
+            return True
+    return False
+
+
+def _merge(gathered: Gathered, journal: JournalContents) -> None:
+    define(gathered.schemas, gathered.channels, journal, gathered.source.name)
+    steps = step_channels(gathered.channels, gathered.source.name)
+    if not steps:
+        return
+    layout = StepLayout.from_metadata(steps[0].metadata)
+    channels = Channels.of(gathered, layout)
+    for name in ("events", "info"):
+        area = journal.areas.get(name)
+        if isinstance(area, LogArea):
+            _add_log(gathered, journal, area)
+    starts = _starts(gathered, channels)
+    for env, channel in enumerate(channels.steps):
+        if layout.constant:
+            state = _add_rows(gathered, journal, layout, env, channel, starts)
+        else:
+            log = journal.areas.get(f"steps/{env}")
+            if not isinstance(log, LogArea):
+                raise FormatError(f"the journal has no records 'steps/{env}'")
+            _add_log(gathered, journal, log)
+            state = running_record(journal, log, _stop(gathered, channel), layout)
+        stop = _stop(gathered, channel)
+        for leaf in layout.images:
+            image = channels.images[leaf.name][env]
+            pending = None
+            if image is not None:
+                dtype = layout.image_messages[leaf.name].dtype
+                area = journal.areas.get(f"{leaf.name}/{env}")
+                if not isinstance(area, RowArea):
+                    raise FormatError(f"the journal has no rows '{leaf.name}/{env}'")
+                pending = _add_images(gathered, Salvage(journal, area, 0, dtype, image), image, stop)
+            state = None if state is None or pending is None else state + pending
+        if state is not None:
+            gathered.states[env] = state
+
+
+def _stop(gathered: Gathered, channel: int) -> int:
+    """The row after the last one that is here."""
+    pieces = gathered.pieces.get(channel)
+    return pieces[-1].stop if pieces else 0
+
+
+def _missing(gathered: Gathered, channel: int) -> list[tuple[int, int]]:
+    """The rows of a channel that are not here, as ranges; the last one has no end."""
+    at, missing = 0, []
+    for first, stop in gathered.ranges(channel):
+        if first > at:
+            missing.append((at, first))
+        at = stop
+    return [*missing, (at, _END)]
+
+
+def _add(gathered: Gathered, channel: int, first: int, count: int, data: bytes) -> None:
+    if count:
+        gathered.add(channel, Piece(first, count, len(data), gathered.loaded.add(data)))
+
+
+def _add_log(gathered: Gathered, journal: JournalContents, area: LogArea) -> None:
+    everything = log_records(journal, area, None)
+    for channel in {entry[0] for entry in everything}:
+        mine = {entry[1]: entry[3] for entry in everything if entry[0] == channel}
+        for low, high in _missing(gathered, channel):
+            run: list[bytes] = []
+            numbers = sorted(n for n in mine if low <= n < high)
+            for i, number in enumerate(numbers):
+                run.append(mine[number])
+                if i + 1 == len(numbers) or numbers[i + 1] != number + 1:
+                    _add(gathered, channel, number + 1 - len(run), len(run), b"".join(run))
+                    run = []
+
+
+def _starts(gathered: Gathered, channels: Channels) -> dict[tuple[int, int], int]:
+    """First rows of episodes, by sub-environment and number."""
+    found = {}
+    if channels.start is not None and gathered.pieces.get(channels.start):
+        for _, _, body in messages(gathered.store(), channels.start):
+            try:
+                start = EpisodeStart.decode(body)
+            except FormatError:
+                continue
+            found[start.env, start.episode] = start.first_row
+    return found
+
+
+def _add_rows(
+    gathered: Gathered,
+    journal: JournalContents,
+    layout: StepLayout,
+    env: int,
+    channel: int,
+    starts: dict[tuple[int, int], int],
+) -> bytes | None:
+    """Takes the steps of a sub-environment; returns its running state."""
+    area = journal.areas.get("steps")
+    if not isinstance(area, RowArea):
+        raise FormatError("the journal has no rows 'steps'")
+    dtype = layout.step_message.dtype
+    salvage = Salvage(journal, area, env, dtype, channel)
+    for low, high in _missing(gathered, channel):
+        for rows in salvage.runs(low, high):
+            first = int(rows["#sequence"][0])
+            last = _row_before(gathered, channel, first, dtype)
+            RowDeriver(*last).fill(rows)
+            begun = starts.get((env, int(rows["episode"][0])))
+            if begun is not None and begun <= first:
+                same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
+                rows["step"][:same] = first - begun + np.arange(same)
+            _add(gathered, channel, first, len(rows), rows.view(np.uint8).tobytes())
+    following = salvage.following(_stop(gathered, channel) - 1)
+    return None if following is None else following.tobytes()[BODY + 8 : layout.state_end]
+
+
+def _row_before(gathered: Gathered, channel: int, first: int, dtype: np.dtype[Any]) -> tuple[int, int, int]:
+    """Episode, step and time (ns) of the row before one, where it is here."""
+    for piece in gathered.pieces.get(channel, []):
+        if piece.stop == first:
+            row = np.frombuffer(gathered.loaded[piece.number], dtype)[-1]
+            return int(row["episode"]), int(row["step"]), int(row["#log_time"])
+    return -1, -1, 0
+
+
+def _add_images(gathered: Gathered, salvage: Salvage, channel: int, stop: int) -> bytes | None:
+    """Takes the images of steps before `stop`; returns the running state's."""
+    for low, high in _missing(gathered, channel):
+        for rows in salvage.runs(low, min(high, stop)):
+            _add(gathered, channel, int(rows["#sequence"][0]), len(rows), rows.view(np.uint8).tobytes())
+    running = salvage.rows[salvage.rows["#sequence"] == stop]
+    data: bytes | None = running[-1]["data"].tobytes() if len(running) else None
+    return data

@@ -1,0 +1,406 @@
+"""Which episodes a repaired recording has: what is left of each, in pieces where rows are missing."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.contents import step_channels
+from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
+from tupli_mcap.recording.facts import StepFacts, step_facts
+from tupli_mcap.recording.headers import message_headers
+from tupli_mcap.recording.index import EpisodeIndex
+from tupli_mcap.recording.repair_gather import Gathered, PackedStore
+
+__all__ = [
+    "Channels",
+    "Plan",
+    "PlannedEpisode",
+    "Segment",
+    "Told",
+    "intersection",
+    "make_plan",
+    "message_at",
+    "messages",
+]
+
+Ranges = list[tuple[int, int]]
+
+
+class Channels(NamedTuple):
+    """Ids in the damaged file: by sub-environment, and by image leaf then sub-environment; None: not known."""
+
+    steps: list[int]
+    images: dict[str, list[int | None]]
+    start: int | None
+    end: int | None
+    final: int | None
+    info: int | None
+
+    @classmethod
+    def of(cls, gathered: Gathered, layout: StepLayout) -> Channels:
+        """The channels of a recording, by their topics."""
+        found = step_channels(gathered.channels, gathered.source.name)
+        topics = {channel.topic: channel.id for channel in gathered.channels.values()}
+        images = {
+            leaf.name: [
+                topics.get(f"{channel.topic.removesuffix('/step')}/image/{leaf.name}") for channel in found
+            ]
+            for leaf in layout.images
+        }
+        names = ("/episode_start", "/episode_end", "/final_state", "/info")
+        return cls([channel.id for channel in found], images, *(topics.get(name) for name in names))
+
+
+class Segment(NamedTuple):
+    """Consecutive rows that are here, of consecutive steps of one episode; times in ns.
+
+    `closed`: the row after it is here and another episode's, or there can be none.
+    """
+
+    env: int
+    row: int
+    steps: int
+    episode: int
+    step: int
+    total: float
+    terminal: bool
+    timeout: bool
+    first_time: int
+    last_time: int
+    closed: bool
+
+
+@dataclass
+class Told:
+    """What the messages of the episode channels say (time, message), and what the index says, by episode."""
+
+    starts: dict[int, tuple[int, EpisodeStart]] = field(default_factory=dict)
+    ends: dict[int, tuple[int, EpisodeEnd]] = field(default_factory=dict)
+    finals: dict[int, int] = field(default_factory=dict)
+    index: dict[int, int] = field(default_factory=dict)
+    bad: int = 0
+
+
+class PlannedEpisode(NamedTuple):
+    """An episode of the new recording. `whole`: it is one of the old, all of it.
+
+    `head`, `tail`: its first step was the old one's first, its last one the old one's last. `length`: of the old
+    episode, None if not known. `final`: its row in the old `/final_state` (as packed), -1 for the running state, None
+    if there is none. `orphan`: metadata of the old episode, whose end is not here.
+    """
+
+    number: int
+    segment: Segment
+    whole: bool
+    head: bool
+    tail: bool
+    length: int | None
+    start: tuple[int, EpisodeStart]
+    end: tuple[int, EpisodeEnd]
+    final: int | None
+    orphan: str = ""
+
+
+@dataclass
+class Plan:
+    """The episodes in the order of their rows; `lost` maps episodes to ranges of steps (None: to an unknown end)."""
+
+    episodes: list[PlannedEpisode] = field(default_factory=list)
+    lost: dict[int, list[tuple[int, int | None]]] = field(default_factory=dict)
+    lost_starts: list[int] = field(default_factory=list)
+    lost_ends: list[int] = field(default_factory=list)
+    lost_finals: list[int] = field(default_factory=list)
+    lost_rows: int = 0
+
+
+def intersection(a: Ranges, b: Ranges) -> Ranges:
+    """What two lists of ranges have in common."""
+    found: Ranges = []
+    i = j = 0
+    while i < len(a) and j < len(b):
+        low, high = max(a[i][0], b[j][0]), min(a[i][1], b[j][1])
+        if low < high:
+            found.append((low, high))
+        if a[i][1] < b[j][1]:
+            i += 1
+        else:
+            j += 1
+    return found
+
+
+# ---- what is here
+
+
+def segments(
+    gathered: Gathered, store: PackedStore, layout: StepLayout, channels: Channels
+) -> Iterator[Segment]:
+    """The segments of all sub-environments, in the order of their rows."""
+    for env, channel in enumerate(channels.steps):
+        here = gathered.ranges(channel)
+        for ids in channels.images.values():
+            image = ids[env]
+            here = intersection(here, [] if image is None else gathered.ranges(image))
+        for first, stop in here:
+            open_: Segment | None = None
+            row = first
+            for facts in step_facts(store, layout, channel, store.packed(channel, first), stop - first):
+                for found in _cut(facts, env, row):
+                    if open_ is not None and _continues(open_, found):
+                        open_ = _joined(open_, found)
+                        continue
+                    if open_ is not None:
+                        yield open_._replace(closed=open_.row + open_.steps == found.row)
+                    open_ = found
+                row += len(facts.episode)
+            if open_ is not None:
+                yield open_
+
+
+def _cut(facts: StepFacts, env: int, row: int) -> Iterator[Segment]:
+    """The segments of one batch of rows, which starts at `row`."""
+    episode, step = facts.episode.astype(np.int64), facts.step.astype(np.int64)
+    flagged = (facts.terminal != 0) | (facts.timeout != 0)
+    breaks = (episode[1:] != episode[:-1]) | (step[1:] != step[:-1] + 1) | flagged[:-1]
+    edges = {0, len(episode), *(np.flatnonzero(breaks) + 1).tolist()}
+    edges |= set(facts.bad) | {i + 1 for i in facts.bad}
+    order = sorted(edges)
+    for begin, end in itertools.pairwise(order):
+        if begin in facts.bad:
+            continue
+        with np.errstate(invalid="ignore", over="ignore"):
+            total = float(np.cumsum(facts.reward[begin:end])[-1])
+        yield Segment(
+            env, row + begin, end - begin, int(episode[begin]), int(step[begin]), total,
+            bool(facts.terminal[end - 1]), bool(facts.timeout[end - 1]),
+            int(facts.time[begin]), int(facts.time[end - 1]), False,
+        )  # fmt: skip
+
+
+def _continues(a: Segment, b: Segment) -> bool:
+    together = a.row + a.steps == b.row and a.episode == b.episode and a.step + a.steps == b.step
+    return together and not (a.terminal or a.timeout)
+
+
+def _joined(a: Segment, b: Segment) -> Segment:
+    return a._replace(
+        steps=a.steps + b.steps, total=a.total + b.total,
+        terminal=b.terminal, timeout=b.timeout, last_time=b.last_time,
+    )  # fmt: skip
+
+
+# ---- what is told of it
+
+
+def read_told(gathered: Gathered, store: PackedStore, channels: Channels) -> Told:
+    """Starts, ends and final states that are here; messages that cannot be decoded are counted and passed over."""
+    told = Told()
+    for _, time, body in messages(store, channels.start):
+        try:
+            start = EpisodeStart.decode(body)
+        except FormatError:
+            told.bad += 1
+            continue
+        told.starts[start.episode] = (time, start)
+    for _, time, body in messages(store, channels.end):
+        try:
+            end = EpisodeEnd.decode(body)
+        except FormatError:
+            told.bad += 1
+            continue
+        told.ends[end.episode] = (time, end)
+    for row, _, body in messages(store, channels.final):
+        told.finals[int.from_bytes(body[:4], "little")] = row
+    if gathered.tail.index is not None:
+        told.index = {int(n): i for i, n in enumerate(gathered.tail.index.episodes["episode"])}
+    return told
+
+
+def messages(store: PackedStore, channel: int | None) -> Iterator[tuple[int, int, memoryview]]:
+    """(row, log_time, body) of the messages of a channel that are here."""
+    row = 0
+    for chunk in [] if channel is None else store.chunks(channel):
+        data = memoryview(store.load(chunk, keep=False))
+        for header in message_headers(data):
+            start = int(header["#offset"])
+            yield row, int(header["#log_time"]), data[start + BODY : start + 9 + int(header["#length"])]
+            row += 1
+
+
+def message_at(store: PackedStore, channel: int, row: int) -> bytes:
+    """The body of one message."""
+    (span,) = store.spans(channel, row, 1)
+    data = memoryview(store.load(span.chunk))
+    header = message_headers(data)[span.begin]
+    start = int(header["#offset"])
+    return bytes(data[start + BODY : start + 9 + int(header["#length"])])
+
+
+def _index_end(index: EpisodeIndex, i: int) -> tuple[int, EpisodeEnd] | None:
+    """The end of an episode as the index has it: all of it is there."""
+    row = index.episodes[i]
+    try:
+        metadata = index.metadata_text(i)
+    except FormatError:
+        return None
+    end = EpisodeEnd(
+        int(row["episode"]), int(row["env"]), int(row["first_row"]), int(row["length"]), float(row["return"]),
+        int(row["end"]), int(row["final_row"]) >= 0, metadata,
+    )  # fmt: skip
+    return int(row["end_time"]), end
+
+
+# ---- the plan
+
+
+def make_plan(gathered: Gathered, store: PackedStore, layout: StepLayout, channels: Channels) -> Plan:
+    """Decides what becomes of every row that is here."""
+    told = read_told(gathered, store, channels)
+    if gathered.tail.index is not None:
+        for number, i in told.index.items():
+            made = None if number in told.ends else _index_end(gathered.tail.index, i)
+            if made is not None:
+                told.ends[number] = made
+    found = list(segments(gathered, store, layout, channels))
+    return _Planner(gathered, told, found).run(channels)
+
+
+class _Planner:
+    def __init__(self, gathered: Gathered, told: Told, found: list[Segment]) -> None:
+        self._gathered = gathered
+        self._told = told
+        self._found = found
+        self._plan = Plan()
+        known = [s.episode for s in found] + list(told.starts) + list(told.ends) + list(told.index)
+        self._next = max(known, default=-1) + 1
+        self._taken: set[int] = set()
+        self._here: dict[int, Ranges] = {}  # rows that are kept, by sub-environment
+        for segment in found:
+            self._here.setdefault(segment.env, []).append((segment.row, segment.row + segment.steps))
+
+    def run(self, channels: Channels) -> Plan:
+        of: dict[int, list[Segment]] = {}
+        for segment in self._found:
+            of.setdefault(segment.episode, []).append(segment)
+        for segment in self._found:
+            last = self._here[segment.env][-1][1] == self._total(segment.env, channels)
+            self._plan.episodes.append(self._episode(segment, last=last and self._knows_total))
+        for number in sorted(set(of) | set(self._told.ends) | set(self._told.starts)):
+            self._note_loss(number, of.get(number, []))
+        for env in range(len(channels.steps)):
+            self._plan.lost_rows += self._total(env, channels) - sum(
+                b - a for a, b in self._here.get(env, [])
+            )
+        return self._plan
+
+    def _total(self, env: int, channels: Channels) -> int:
+        """Rows that a sub-environment had, as far as anything tells."""
+        ids = [channels.steps[env], *(images[env] for images in channels.images.values())]
+        stops = [p.stop for i in ids[:1] if i is not None for p in self._gathered.pieces.get(i, [])[-1:]]
+        statistics = self._gathered.tail.statistics
+        if statistics is not None:
+            stops += [statistics.channel_message_counts.get(i, 0) for i in ids if i is not None]
+        stops += [end.first_row + end.length for _, end in self._told.ends.values() if end.env == env]
+        return max(stops, default=0)
+
+    def _length(self, segment: Segment) -> int | None:
+        """The steps of the old episode, if that is known."""
+        told = self._told.ends.get(segment.episode)
+        if told is None or told[1].env != segment.env:
+            return None
+        return told[1].length if told[1].first_row == segment.row - segment.step else None
+
+    @property
+    def _knows_total(self) -> bool:
+        """Whether there can be no row after the last one that is known."""
+        return not self._gathered.tail.finished or self._gathered.tail.statistics is not None
+
+    def _episode(self, segment: Segment, *, last: bool) -> PlannedEpisode:
+        length = self._length(segment)
+        stop = segment.step + segment.steps
+        ended = segment.terminal or segment.timeout
+        closing = last and segment.row + segment.steps == self._here[segment.env][-1][1]
+        tail = stop == length if length is not None else ended or segment.closed or closing
+        head = segment.step == 0
+        number = segment.episode
+        if number in self._taken:
+            number, self._next = self._next, self._next + 1
+        self._taken.add(number)
+        whole = head and tail and number == segment.episode
+        final = self._final(segment, closing) if tail else None
+        start = self._start(segment, number, head=head)
+        end = self._end(segment, number, length, final is not None, head=head, tail=tail)
+        told = self._told.ends.get(segment.episode)
+        orphan = "" if told is None or tail else told[1].metadata
+        return PlannedEpisode(number, segment, whole, head, tail, length, start, end, final, orphan)
+
+    def _final(self, segment: Segment, closing: bool) -> int | None:
+        told = self._told.ends.get(segment.episode)
+        if told is not None and not told[1].has_final_state:
+            return None
+        if segment.episode in self._told.finals:
+            return self._told.finals[segment.episode]
+        if closing and told is None and segment.env in self._gathered.states:
+            return -1
+        self._plan.lost_finals.append(segment.episode)
+        return None
+
+    def _start(self, segment: Segment, number: int, *, head: bool) -> tuple[int, EpisodeStart]:
+        if not head:
+            return segment.first_time, EpisodeStart(number, segment.env, 0, False, True, "", "", "{}")
+        if segment.episode in self._told.starts and number == segment.episode:
+            time, start = self._told.starts[segment.episode]
+            if start.env == segment.env:
+                return time, start
+        self._plan.lost_starts.append(segment.episode)
+        seed, time = "", segment.first_time
+        index = self._gathered.tail.index
+        if index is not None and number in self._told.index:
+            row = index.episodes[self._told.index[number]]
+            seed, time = str(int(row["seed"])) if row["has_seed"] else "", int(row["start_time"])
+        return time, EpisodeStart(number, segment.env, 0, False, False, seed, "", "{}")
+
+    def _end(
+        self, segment: Segment, number: int, length: int | None, has_final: bool, *, head: bool, tail: bool
+    ) -> tuple[int, EpisodeEnd]:
+        told = self._told.ends.get(segment.episode) if tail and length is not None else None
+        how = TERMINAL if segment.terminal else TIMEOUT if segment.timeout else INTERRUPTED
+        metadata, time, total = "{}", segment.last_time, segment.total
+        if told is not None:
+            time, metadata, how = told[0], told[1].metadata, told[1].end
+            if head:
+                total = told[1].episode_return
+        elif tail and self._gathered.tail.finished:
+            self._plan.lost_ends.append(segment.episode)
+        return time, EpisodeEnd(number, segment.env, 0, segment.steps, total, how, has_final, metadata)
+
+    def _note_loss(self, number: int, found: list[Segment]) -> None:
+        """The steps of an episode that are not here."""
+        told = self._told.ends.get(number)
+        at = 0
+        lost: list[tuple[int, int | None]] = []
+        for segment in sorted(found, key=lambda s: s.step):
+            if segment.step > at:
+                lost.append((at, segment.step))
+            at = max(at, segment.step + segment.steps)
+        if told is not None and told[1].length > at:
+            lost.append((at, told[1].length))
+        planned = [e for e in self._plan.episodes if e.segment.episode == number]
+        if told is None and not any(e.tail for e in planned) and (found or self._in_a_hole(number)):
+            lost.append((at, None))
+        if lost:
+            self._plan.lost[number] = lost
+
+    def _in_a_hole(self, number: int) -> bool:
+        """Whether an episode of which only the start is here had steps that are not."""
+        _, start = self._told.starts[number]
+        return any(start.first_row < first for first, _ in self._here.get(start.env, [])) and not any(
+            first <= start.first_row < stop for first, stop in self._here.get(start.env, [])
+        )

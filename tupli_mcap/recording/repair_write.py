@@ -1,0 +1,275 @@
+"""A repaired recording: what the plan keeps, renumbered so that rows and steps count without gaps again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import time
+import uuid
+from collections.abc import Iterable, Iterator
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.channels import register_channels
+from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.events import record
+from tupli_mcap.recording.headers import message_headers
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
+from tupli_mcap.recording.logs import group_records
+from tupli_mcap.recording.repair_gather import Gathered, PackedStore
+from tupli_mcap.recording.repair_plan import Channels, Plan, PlannedEpisode, message_at, messages
+from tupli_mcap.recording.rows import even_rows
+
+__all__ = ["RECOVERED", "RepairWriter"]
+
+RECOVERED = "recovered"  # key of the episode metadata that says where the steps of a piece were
+_METADATA = {
+    "uuid": re.compile("[0-9a-f]{32}"),
+    "format_version": re.compile("1"),
+    "library": re.compile(".*", re.DOTALL),
+    "created_ns": re.compile("[0-9]{1,20}", re.ASCII),
+    "benchmark_id": re.compile(".*", re.DOTALL),
+}
+_CHUNK = 256 * 1024
+_COPY = 1 << 20
+
+
+class RepairWriter:
+    """Writes one repaired recording; `infos_kept` counts the infos that belong to steps that are kept."""
+
+    def __init__(self, container: Container, gathered: Gathered) -> None:
+        self._container = container
+        self._gathered = gathered
+        self._now = time.time_ns()
+        self._index = IndexBuilder()
+        self.infos_kept = 0
+        self.metadata_lost: list[str] = []
+        self.finals_kept = 0
+
+    def begin(self) -> None:
+        """Magic, header, metadata and the attachments that are good."""
+        container, found = self._container, self._gathered
+        container.start(f"tupli-mcap {version('tupli-mcap')}")
+        container.add_metadata(RECORDING_METADATA, self._metadata_of_recording())
+        for attachment in found.attachments.values():
+            offset = container.position
+            for at in range(attachment.offset, attachment.offset + attachment.length, _COPY):
+                container.write(found.source.read(at, min(_COPY, attachment.offset + attachment.length - at)))
+            moved = type(attachment)(**{**attachment.__dict__, "offset": offset})
+            container.attachment_indexes.append(moved)
+
+    def _metadata_of_recording(self) -> dict[str, str]:
+        """The recording's metadata; what is lost or damaged of it is made anew."""
+        found = {k: v for k, v in (self._gathered.metadata or {}).items() if k != "journal"}
+        made = {
+            "uuid": uuid.uuid4().hex,
+            "format_version": "1",
+            "library": f"tupli-mcap {version('tupli-mcap')}",
+            "created_ns": str(self._now),
+            "benchmark_id": "",
+        }
+        kept = {key: found[key] for key in made if key in found and _METADATA[key].fullmatch(found[key])}
+        self.metadata_lost = [key for key in made if key not in kept]
+        others = {key: value for key, value in found.items() if key not in made}
+        # Rows have other numbers now: a journal of the damaged file must not merge into this one.
+        return {**others, **made, **kept, "rewritten": uuid.uuid4().hex}
+
+    def steps(self, layout: StepLayout, old: Channels, plan: Plan, store: PackedStore) -> None:
+        """Every message of the episodes that are kept."""
+        channels = self._gathered.channels
+        vector = channels[old.steps[0]].topic != "/step"
+        info = None
+        if old.info is not None:
+            schema = self._gathered.schemas.get(channels[old.info].schema_id)
+            info = None if schema is None else (schema.data.decode(), channels[old.info].metadata)
+        new = register_channels(
+            self._container, "the repaired recording", layout, len(old.steps) if vector else None, info
+        )
+        self._container.define_channels()
+        rows: dict[int, int] = {}  # first row of each episode in the new file
+        dtype = layout.step_message.dtype if layout.constant else None
+        for env, channel in enumerate(old.steps):
+            mine = [e for e in plan.episodes if e.segment.env == env]
+            at = 0
+            for episode in mine:
+                rows[episode.number] = at
+                at += episode.segment.steps
+            self._copy(store, channel, new.steps[env], mine, dtype, patch=True)
+            for leaf, ids in zip(layout.images, new.images, strict=True):
+                image = old.images[leaf.name][env]
+                if image is not None:
+                    image_type = layout.image_messages[leaf.name].dtype
+                    self._copy(store, image, ids[env], mine, image_type, patch=False)
+        self._events(store, layout, old, new, plan, rows)
+        if old.info is not None and new.info is not None:
+            self._put(new.info, self._infos(store, old.info, plan))
+
+    def finish(self) -> None:
+        """The index, the summary and the footer."""
+        data = self._index.encode(self._container.chunk_rows)
+        self._container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, self._now)
+        self._container.finish()
+
+    # ---- rows
+
+    def _copy(
+        self,
+        store: PackedStore,
+        old: int,
+        new: int,
+        episodes: list[PlannedEpisode],
+        dtype: np.dtype[Any] | None,
+        *,
+        patch: bool,
+    ) -> None:
+        """The rows of `episodes`; with `patch` they get the episodes' numbers, and steps from 0."""
+        if dtype is None:
+            self._put(new, self._variable(store, old, episodes))
+            return
+        batch: list[bytes] = []
+        size = written = 0
+        for episode in episodes:
+            segment = episode.segment
+            for span in store.spans(old, store.packed(old, segment.row), segment.steps):
+                part = store.rows(span.chunk, dtype, keep=True)[span.begin : span.end]
+                data = bytearray(part.tobytes())
+                rows = np.frombuffer(data, dtype)
+                if patch and not (episode.head and episode.number == segment.episode):
+                    rows["episode"] = episode.number
+                    rows["step"] -= segment.step
+                batch.append(bytes(data))
+                size += len(data)
+                if size >= _CHUNK:
+                    written += self._put_rows(new, b"".join(batch), dtype, written)
+                    batch, size = [], 0
+        self._put_rows(new, b"".join(batch), dtype, written)
+
+    def _put_rows(self, channel: int, data: bytes, dtype: np.dtype[Any], first: int) -> int:
+        if not data:
+            return 0
+        raw = bytearray(data)
+        rows = np.frombuffer(raw, dtype)
+        rows["#sequence"] = first + np.arange(len(rows))
+        rows["#channel"] = channel
+        self._container.add_chunk(even_rows(channel, first, raw, rows))
+        return len(rows)
+
+    def _variable(
+        self, store: PackedStore, channel: int, episodes: Iterable[PlannedEpisode]
+    ) -> Iterator[tuple[int, bytes]]:
+        for episode in episodes:
+            segment = episode.segment
+            step = 0
+            for span in store.spans(channel, store.packed(channel, segment.row), segment.steps):
+                data = memoryview(store.load(span.chunk))
+                for header in message_headers(data)[span.begin : span.end]:
+                    start = int(header["#offset"])
+                    body = bytes(data[start + BODY : start + 9 + int(header["#length"])])
+                    numbers = episode.number.to_bytes(4, "little") + step.to_bytes(4, "little")
+                    yield int(header["#log_time"]), numbers + body[8:]
+                    step += 1
+
+    def _put(self, channel: int, messages: Iterable[tuple[int, bytes]]) -> None:
+        """Messages (log_time, body) of a channel, in chunks of the usual size; times never decrease."""
+        batch = bytearray()
+        latest = 0
+        for sequence, (log_time, body) in enumerate(messages):
+            latest = max(latest, log_time)
+            batch += record(channel, sequence, latest, body)
+            if len(batch) >= _CHUNK:
+                self._emit(batch)
+        self._emit(batch)
+
+    def _emit(self, batch: bytearray) -> None:
+        for rows in group_records(memoryview(bytes(batch))):
+            self._container.add_chunk(rows)
+        batch.clear()
+
+    # ---- episodes
+
+    def _events(
+        self,
+        store: PackedStore,
+        layout: StepLayout,
+        old: Channels,
+        new: Any,
+        plan: Plan,
+        rows: dict[int, int],
+    ) -> None:
+        starts = sorted(plan.episodes, key=lambda e: (e.start[0], e.number))
+        ends = sorted(plan.episodes, key=lambda e: (e.end[0], e.number))
+        start_rows = {e.number: i for i, e in enumerate(starts)}
+        end_rows = {e.number: i for i, e in enumerate(ends)}
+        with_final = [e for e in ends if e.final is not None]
+        final_rows = {e.number: i for i, e in enumerate(with_final)}
+        self.finals_kept = len(with_final)
+        last = {e.segment.episode: e.number for e in plan.episodes}
+        moved = {}
+        for episode in plan.episodes:
+            first = rows[episode.number]
+            text = self._metadata(episode, last[episode.segment.episode] == episode.number)
+            end = episode.end[1]._replace(first_row=first, metadata=text)
+            start = episode.start[1]._replace(first_row=first)
+            moved[episode.number] = (start, end)
+            self._index.add(
+                EpisodeRow(
+                    first, end.length, end.episode_return, episode.start[0], episode.end[0], start.seed_number,
+                    start_rows[end.episode], end_rows[end.episode], final_rows.get(end.episode, -1),
+                    end.episode, end.env, end.end,
+                ),
+                text,
+            )  # fmt: skip
+        self._put(new.start, ((e.start[0], moved[e.number][0].encode()) for e in starts))
+        self._put(new.end, ((e.end[0], moved[e.number][1].encode()) for e in ends))
+        self._put(new.final_state, ((e.end[0], self._final(e, store, old)) for e in with_final))
+
+    def _metadata(self, episode: PlannedEpisode, last: bool) -> str:
+        """The metadata of the old episode where its end is here, and where the steps of a piece were."""
+        text = episode.end[1].metadata
+        if episode.whole:
+            return text
+        try:
+            found = json.loads(text)
+        except ValueError:
+            found = {}
+        values: dict[str, Any] = found if isinstance(found, dict) else {}
+        origin: dict[str, Any] = {
+            "episode": episode.segment.episode,
+            "first_step": episode.segment.step,
+            "length": episode.length,
+        }
+        if RECOVERED in values:
+            origin[RECOVERED] = values[RECOVERED]
+        if last and episode.orphan not in ("", "{}"):
+            with contextlib.suppress(ValueError):
+                origin["metadata"] = json.loads(episode.orphan)
+        return json.dumps({**values, RECOVERED: origin})
+
+    def _final(self, episode: PlannedEpisode, store: PackedStore, old: Channels) -> bytes:
+        env = episode.segment.env
+        if episode.final is None or episode.final < 0 or old.final is None:
+            rest = self._gathered.states[env]
+        else:
+            rest = message_at(store, old.final, episode.final)[8:]
+        return episode.number.to_bytes(4, "little") + env.to_bytes(4, "little") + rest
+
+    def _infos(self, store: PackedStore, channel: int, plan: Plan) -> Iterator[tuple[int, bytes]]:
+        """The infos of steps that are kept, with the numbers these have now."""
+        pieces: dict[int, list[PlannedEpisode]] = {}
+        for episode in plan.episodes:
+            pieces.setdefault(episode.segment.episode, []).append(episode)
+        for _, log_time, body in messages(store, channel):
+            number, step = int.from_bytes(body[:4], "little"), int.from_bytes(body[4:8], "little")
+            for episode in pieces.get(number, []):
+                at = step - episode.segment.step
+                if 0 <= at < episode.segment.steps:
+                    self.infos_kept += 1
+                    head = episode.number.to_bytes(4, "little") + at.to_bytes(4, "little")
+                    yield log_time, head + bytes(body[8:])
+                    break

@@ -1,0 +1,410 @@
+"""A walk over the records of any MCAP file, good or bad: what is whole, what is damaged, and where it goes on.
+
+Nothing is believed: a chunk counts if its CRC is right, an attachment too, any other record if it parses to its last
+byte. After a damaged record the walk goes on at the next place where a record stands; a chunk whose header is damaged
+is read by what the episode index says of it. One record is in memory at a time, attachments in pieces.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.claims import MAX_CHUNK
+from tupli_mcap.recording.compression import decompress
+from tupli_mcap.recording.container import MAGIC
+from tupli_mcap.recording.source import Source
+from tupli_mcap.recording.summary import parse_record
+
+__all__ = [
+    "Chunk",
+    "Damage",
+    "Found",
+    "KnownChunk",
+    "Survey",
+    "attachment_name",
+    "checked_attachment",
+    "message_index",
+]
+
+_RECORD = struct.Struct("<BQ")
+_CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
+_ATTACHMENT_HEAD = struct.Struct("<QQI")
+_PIECE = 1 << 20
+_MAX_RATIO = 1 << 16  # zstd cannot compress further
+_SUMMARY = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
+_END = (Opcode.DATA_END, Opcode.FOOTER, Opcode.SUMMARY_OFFSET, *_SUMMARY)
+_PARSED = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, *_SUMMARY)
+_SIZES: dict[int, int] = {
+    Opcode.DATA_END: 4,
+    Opcode.FOOTER: 20,
+    Opcode.SUMMARY_OFFSET: 17,
+}  # of bodies that have one
+_LEAST: dict[int, int] = {
+    Opcode.HEADER: 8, Opcode.SCHEMA: 14, Opcode.CHANNEL: 16, Opcode.MESSAGE: 22, Opcode.CHUNK: 40,
+    Opcode.MESSAGE_INDEX: 6, Opcode.CHUNK_INDEX: 64, Opcode.ATTACHMENT: 36, Opcode.STATISTICS: 46,
+    Opcode.ATTACHMENT_INDEX: 48, Opcode.METADATA: 8, Opcode.METADATA_INDEX: 20, **_SIZES,
+}  # fmt: skip
+# Where a record may stand: its opcode, and a length below 2^40 (looked ahead, so that matches may overlap).
+_CANDIDATE = re.compile(rb"(?=[\x01-\x0f].{5}\x00\x00\x00)", re.DOTALL)
+
+
+class KnownChunk(NamedTuple):
+    """What an index says of the chunk at an offset; `crc` None: not said."""
+
+    length: int
+    size: int
+    compression: str
+    crc: int | None
+
+
+class Chunk(NamedTuple):
+    """A chunk's header, and its records: `data` is decompressed, its CRC right, or 0 (`crc`)."""
+
+    start_time: int
+    end_time: int
+    crc: int
+    compression: str
+    packed: int
+    data: memoryview
+
+
+class Found(NamedTuple):
+    """A whole record: `length` with its 9 first bytes; `body` is empty for a chunk and an attachment.
+
+    `repaired` says what in a chunk's header is wrong where its records are good all the same.
+    """
+
+    opcode: int
+    offset: int
+    length: int
+    body: memoryview
+    chunk: Chunk | None = None
+    attachment: AttachmentIndex | None = None
+    repaired: str = ""
+
+
+class Damage(NamedTuple):
+    """Bytes `offset:end` that are no whole record; `opcode` is that of the record that seems to have been there."""
+
+    offset: int
+    end: int
+    why: str
+    opcode: int
+
+
+class Survey:
+    """Iterating gives every record of the data section, DataEnd included, and every damage, in the file's order.
+
+    Args:
+        known: what an index says of the chunks, by offset.
+        end: where the data section ends, where that is known.
+        messages: whether Message records outside chunks are records (they are none of ours).
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        known: Mapping[int, KnownChunk] | None = None,
+        end: int | None = None,
+        messages: bool = False,
+    ) -> None:
+        self._source = source
+        self._known = dict(known or {})
+        self._known_offsets = sorted(self._known)
+        self._end = source.size if end is None else min(end, source.size)
+        self._messages = messages
+        self._budget = 4 * source.size + (64 << 20)  # bytes to be checked in vain while looking for a record
+
+    def __iter__(self) -> Iterator[Found | Damage]:
+        position = len(MAGIC)
+        while position < self._end:
+            found = self.at(position)
+            if isinstance(found, Found):
+                if found.opcode in _END and found.opcode != Opcode.DATA_END:
+                    return
+                yield found
+                if found.opcode == Opcode.DATA_END:
+                    return
+                position = found.offset + found.length
+                continue
+            following = self._following(position)
+            opcode = self._source.read(position, 1)[0]
+            yield Damage(position, following, found, opcode)
+            position = following
+
+    # ---- one record
+
+    def at(self, position: int, *, searching: bool = False) -> Found | str:
+        """The record at an offset, or why there is none; `searching` asks for more evidence."""
+        left = self._end - position - _RECORD.size
+        if left < 0:
+            return f"expected a record, found {left + _RECORD.size} bytes"
+        opcode, length = _RECORD.unpack(self._source.read(position, _RECORD.size))
+        if opcode == Opcode.CHUNK or position in self._known:
+            return self._chunk(position)
+        if length > left:
+            why = f"the record with opcode {opcode} claims {length} bytes, but {left} are left"
+        elif opcode == Opcode.ATTACHMENT:
+            return self._attachment(position, length)
+        else:
+            checked = self._other(opcode, position, length)
+            if isinstance(checked, Found):
+                if searching and opcode != Opcode.FOOTER and not self._stands_at(position + 9 + length):
+                    return "no record follows it"
+                return checked
+            why = checked
+        hidden = self._chunk(position)  # its opcode or its length may be what is damaged
+        return hidden if isinstance(hidden, Found) else why
+
+    def _other(self, opcode: int, position: int, length: int) -> Found | str:
+        if opcode == Opcode.MESSAGE and not self._messages:
+            return "a message is outside of chunks"
+        if opcode in _LEAST:
+            if length < _LEAST[opcode] or length != _SIZES.get(opcode, length):
+                return f"the record with opcode {opcode} claims {length} bytes"
+        elif opcode < 0x80 or not self._stands_at(position + 9 + length):
+            return f"expected a record, found opcode {opcode}"
+        body = memoryview(self._source.read(position + 9, length))
+        try:
+            if opcode in _PARSED:
+                parse_record(opcode, body, position, self._source.name)
+            elif opcode == Opcode.MESSAGE_INDEX:
+                message_index(body)
+        except FormatError as err:
+            return str(err).removeprefix(f"{self._source.name}: ")
+        return Found(opcode, position, 9 + length, body)
+
+    def _attachment(self, position: int, length: int) -> Found | str:
+        try:
+            index = checked_attachment(self._source, position, length)
+        except FormatError as err:
+            self._budget -= length
+            return str(err)
+        return Found(Opcode.ATTACHMENT, position, 9 + length, memoryview(b""), attachment=index)
+
+    def _chunk(self, position: int) -> Found | str:
+        known = self._known.get(position)
+        fixed = 9 + _CHUNK_HEAD.size
+        if position + fixed + 8 > self._end:
+            return "a chunk is cut off"
+        opcode, claimed = _RECORD.unpack(self._source.read(position, 9))
+        start, end, size, crc, name_size = _CHUNK_HEAD.unpack(self._source.read(position + 9, fixed - 9))
+        why = "the chunk's header is damaged"
+        if known is not None:
+            packed = known.length - fixed - len(known.compression) - 8
+            data = self.unpack(position, packed, known.compression, known.size, known.crc or crc)
+            if not isinstance(data, str):
+                header = (opcode, claimed, size, crc, name_size)
+                right = (
+                    Opcode.CHUNK, known.length - 9, known.size, known.crc or crc, len(known.compression)
+                )  # fmt: skip
+                wrong = "" if header == right else "its header is damaged"
+                wrong = wrong or self._name_and_size(position, known.compression, packed)
+                return self._found(
+                    position,
+                    known.length,
+                    (start, end),
+                    known.crc or crc,
+                    known.compression,
+                    data,
+                    packed,
+                    wrong,
+                )
+            why = data
+        if name_size > 4:
+            return why
+        tail = self._source.read(position + fixed, min(name_size + 8, self._end - position - fixed))
+        name = bytes(tail[:name_size]).decode(errors="replace")
+        if len(tail) < name_size + 8 or name not in ("", "zstd", "lz4"):
+            return why
+        before = fixed + name_size + 8
+        told = int.from_bytes(tail[name_size:], "little")
+        for packed in dict.fromkeys((told, claimed + 9 - before)):
+            agreed = packed + before == claimed + 9 and told == packed and opcode == Opcode.CHUNK
+            if not 0 <= packed <= self._end - position - before:
+                why = f"the chunk claims {packed} bytes, but {self._end - position - before} are left"
+                continue
+            if not agreed and not self._stands_at(position + before + packed):
+                continue
+            data = self.unpack(position, packed, name, size, crc)
+            if not isinstance(data, str):
+                wrong = "" if agreed else "its opcode or length is damaged"
+                return self._found(position, before + packed, (start, end), crc, name, data, packed, wrong)
+            why = data
+        return why
+
+    def _name_and_size(self, position: int, name: str, packed: int) -> str:
+        at = position + 9 + _CHUNK_HEAD.size
+        expected = name.encode() + packed.to_bytes(8, "little")
+        return "" if self._source.read(at, len(expected)) == expected else "its header is damaged"
+
+    def _found(
+        self,
+        position: int,
+        length: int,
+        times: tuple[int, int],
+        crc: int,
+        name: str,
+        data: Any,
+        packed: int,
+        wrong: str,
+    ) -> Found:
+        chunk = Chunk(*times, crc, name, packed, memoryview(data))
+        return Found(Opcode.CHUNK, position, length, memoryview(b""), chunk, repaired=wrong)
+
+    def unpack(self, position: int, packed: int, name: str, size: int, crc: int) -> Any:
+        """The records of a chunk, or why they are damaged."""
+        if packed < 0 or size > MAX_CHUNK or size > _MAX_RATIO * (packed + 1) or self._budget < 0:
+            return f"the chunk claims {size} bytes in {packed}"
+        start = position + 9 + _CHUNK_HEAD.size + len(name) + 8
+        if start + packed > self._end:
+            return "the chunk is cut off"
+        try:
+            data = decompress(name, memoryview(self._source.read(start, packed)), size, "the chunk")
+        except FormatError as err:
+            self._budget -= packed
+            return str(err)
+        if crc and zlib.crc32(data) != crc:
+            self._budget -= packed + size
+            return "the chunk's CRC differs"
+        return data
+
+    def _adds_up(self, position: int) -> bool:
+        """Whether the sizes in the header of a chunk or an attachment make up its length."""
+        opcode, length = _RECORD.unpack(self._source.read(position, 9))
+        if opcode == Opcode.CHUNK:
+            at = _CHUNK_HEAD.size
+            *_, crc, size = _CHUNK_HEAD.unpack(self._source.read(position + 9, at))
+            if size > 4 or at + size + 8 > length or not (crc or self._messages):
+                return False
+            rest = self._source.read(position + 9 + at, size + 8)
+            known = rest[:size] in (b"", b"zstd", b"lz4")
+            return known and at + size + 8 + int.from_bytes(rest[size:], "little") == length
+        if opcode != Opcode.ATTACHMENT:
+            return False
+        try:
+            _attachment_index(self._source, position, length)
+        except FormatError:
+            return False
+        return True
+
+    # ---- going on after damage
+
+    def _stands_at(self, position: int) -> bool:
+        """Whether a record may begin at an offset, as its first bytes tell."""
+        if position >= self._end:
+            return position == self._end
+        if position + 9 > self._end:
+            return False
+        if position in self._known:
+            return True
+        opcode, length = _RECORD.unpack(self._source.read(position, 9))
+        least = _LEAST.get(opcode)
+        fits = least is not None and least <= length <= self._end - position - 9
+        return fits and length == _SIZES.get(opcode, length)
+
+    def _following(self, position: int) -> int:
+        """Where the walk goes on after a damaged record."""
+        if position + 9 <= self._end:
+            claimed = position + 9 + int.from_bytes(self._source.read(position + 1, 8), "little")
+            if position in self._known:
+                claimed = position + self._known[position].length
+            if claimed < self._end and self._stands_at(claimed):
+                return claimed
+        return self._search(position + 1)
+
+    def _search(self, position: int) -> int:
+        """The next offset where a record stands that can be checked."""
+        limit = next((offset for offset in self._known_offsets if offset >= position), self._end)
+        while position < limit:
+            size = min(_PIECE + 8, self._end - position)
+            window = self._source.read(position, size)
+            for match in _CANDIDATE.finditer(window, 0, max(size - 8, 0) + 8):
+                candidate = position + match.start()
+                if candidate >= min(limit, position + _PIECE) or self._budget < 0:
+                    break
+                if self._stands_at(candidate) and self._certain(candidate):
+                    return candidate
+            position += _PIECE
+        return limit
+
+    def _certain(self, position: int) -> bool:
+        if self._adds_up(position):  # a chunk or an attachment, whether good or damaged
+            return True
+        found = self.at(position, searching=True)
+        if isinstance(found, str):
+            return False
+        if found.opcode == Opcode.MESSAGE:
+            return self._stands_at(found.offset + found.length)
+        if found.opcode == Opcode.CHUNK:
+            return self._messages or (found.chunk is not None and found.chunk.crc != 0)
+        return True
+
+
+def message_index(body: memoryview) -> tuple[int, np.ndarray[Any, np.dtype[np.uint64]]]:
+    """The channel and the entries (log_time, offset) of a MessageIndex record.
+
+    Raises:
+        FormatError: its sizes do not add up.
+    """
+    channel, size = int.from_bytes(body[:2], "little"), int.from_bytes(body[2:6], "little")
+    if len(body) != 6 + size or size % 16:
+        raise FormatError(f"expected a message index of {len(body) - 6} bytes, it says {size}")
+    return channel, np.frombuffer(body[6:], "<u8").reshape(-1, 2)
+
+
+def checked_attachment(source: Source, offset: int, length: int) -> AttachmentIndex:
+    """The facts of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    found = _attachment_index(source, offset, length)
+    crc, position, end = 0, offset + 9, offset + 9 + length - 4
+    expected = int.from_bytes(source.read(end, 4), "little")
+    while expected and position < end:
+        piece = source.read(position, min(_PIECE, end - position))
+        crc = zlib.crc32(piece, crc)
+        position += len(piece)
+    if crc != expected:
+        raise FormatError(f"the attachment {found.name!r:.80} is damaged (its CRC differs)")
+    return found
+
+
+def attachment_name(source: Source, damage: Damage) -> str | None:
+    """The name of a damaged attachment, where its header can still be read."""
+    if damage.opcode != Opcode.ATTACHMENT:
+        return None
+    try:
+        return _attachment_index(source, damage.offset, damage.end - damage.offset - 9).name
+    except FormatError:
+        return None
+
+
+def _attachment_index(source: Source, offset: int, length: int) -> AttachmentIndex:
+    """What an attachment's header says; FormatError if it does not add up to its length."""
+    head = source.read(offset + 9, min(length, _ATTACHMENT_HEAD.size + (1 << 17)))
+    try:
+        log_time, create_time, size = _ATTACHMENT_HEAD.unpack_from(head)
+        at = _ATTACHMENT_HEAD.size
+        name = head[at : at + size].decode()
+        at += size
+        size = int.from_bytes(head[at : at + 4], "little")
+        media_type = head[at + 4 : at + 4 + size].decode()
+        at += 4 + size
+    except (struct.error, UnicodeDecodeError) as err:
+        raise FormatError("the attachment's header is damaged") from err
+    data_size = int.from_bytes(head[at : at + 8], "little")
+    if at + 8 > len(head) or at + 8 + data_size + 4 != length:
+        raise FormatError("the attachment's sizes do not add up")
+    return AttachmentIndex(offset, 9 + length, log_time, create_time, data_size, name, media_type)

@@ -1,0 +1,122 @@
+"""What the end of a file says of the rest: summary and episode index, each with a CRC; either may be missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, Statistics
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.container import COMPRESSIONS, MAGIC
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
+from tupli_mcap.recording.source import Source
+from tupli_mcap.recording.summary import (
+    FOOTER_SIZE,
+    Summary,
+    has_summary,
+    parse_record,
+    read_attachment,
+    read_summary,
+    records,
+)
+from tupli_mcap.recording.survey import KnownChunk, checked_attachment
+
+__all__ = ["Tail", "read_tail"]
+
+_NAME = len(INDEX_NAME).to_bytes(4, "little") + INDEX_NAME.encode()
+_BEFORE_NAME = 9 + 16  # opcode, length and two times
+_WINDOW = 1 << 20
+
+
+@dataclass
+class Tail:
+    """`summary` and `index` are None where they are missing or damaged: then `why` says so, one sentence each.
+
+    `finished`: a footer is there, or an index. `data_end` is the offset of DataEnd, where the summary says it.
+    """
+
+    finished: bool = False
+    summary: Summary | None = None
+    index: EpisodeIndex | None = None
+    index_place: AttachmentIndex | None = None
+    statistics: Statistics | None = None
+    why: list[str] = field(default_factory=list)
+
+    @property
+    def data_end(self) -> int | None:
+        return None if self.summary is None else self.summary.start
+
+    def known_chunks(self) -> dict[int, KnownChunk]:
+        """What the index says of the chunks, by offset."""
+        if self.index is None:
+            return {}
+        return {
+            int(row["offset"]): KnownChunk(
+                int(row["length"]),
+                int(row["uncompressed"]),
+                COMPRESSIONS[row["compression"]].replace("none", ""),
+                int(row["crc"]),
+            )
+            for row in self.index.chunks
+            if row["compression"] < len(COMPRESSIONS)
+        }
+
+
+def read_tail(source: Source) -> Tail:
+    """Reads what is there and good; raises nothing for what is not."""
+    tail = Tail(finished=has_summary(source))
+    if tail.finished:
+        try:
+            tail.summary = read_summary(source)
+            tail.statistics = _statistics(source, tail.summary)
+        except FormatError as err:
+            tail.why.append(str(err).removeprefix(f"{source.name}: "))
+    place = None if tail.summary is None else tail.summary.attachments.get(INDEX_NAME)
+    if place is None:
+        place = _find_index(source)
+    if place is None:
+        return tail
+    try:
+        tail.index = EpisodeIndex.decode(read_attachment(source, place), source.name)
+        tail.index_place = place
+        tail.finished = True
+    except FormatError as err:
+        tail.why.append(str(err).removeprefix(f"{source.name}: "))
+    return tail
+
+
+def _statistics(source: Source, summary: Summary) -> Statistics | None:
+    data = source.read(summary.start, source.size - len(MAGIC) - FOOTER_SIZE - summary.start)
+    for opcode, position, body in records(data, summary.start, source.name):
+        if opcode == Opcode.STATISTICS:
+            found: Statistics = parse_record(opcode, body, position, source.name)
+            return found
+    return None
+
+
+def _find_index(source: Source) -> AttachmentIndex | None:
+    """The last attachment with the index's name and a good CRC, looked for from the end."""
+    end = source.size
+    while end > 0:
+        start = max(0, end - _WINDOW)
+        window = source.read(start, min(_WINDOW + len(_NAME), source.size - start))
+        at = window.rfind(_NAME)
+        while at >= 0:
+            place = start + at - _BEFORE_NAME
+            if place >= 0 and (found := _index_at(source, place)) is not None:
+                return found
+            at = window.rfind(_NAME, 0, at)
+        end = start
+    return None
+
+
+def _index_at(source: Source, place: int) -> AttachmentIndex | None:
+    length = int.from_bytes(source.read(place + 1, 8), "little")
+    if source.read(place, 1) != b"\x09" or length > source.size - place - 9:
+        return None
+    try:
+        found = checked_attachment(source, place, length)
+    except FormatError:
+        return None
+    return found if (found.name, found.media_type) == (INDEX_NAME, INDEX_MEDIA_TYPE) else None
