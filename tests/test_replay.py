@@ -3,17 +3,43 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import jsonschema
 import numpy as np
 import pytest
 
-from tupli_mcap import EpisodeData, RecordEpisodes, Recording, RecordingError, UntrustedError, write_recording
-from tupli_mcap.replay import Certificate, certify
+from tupli_mcap import (
+    EpisodeData,
+    FileStorage,
+    FormatError,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    StepError,
+    TupliEnvWrapper,
+    UntrustedError,
+    rewrite_recording,
+    write_recording,
+)
+from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.replay import (
+    CERTIFICATE_NAME,
+    Certificate,
+    certify,
+    covers,
+    read_certificate,
+    write_certificate,
+)
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
+
+SCHEMA = jsonschema.Draft202012Validator(
+    json.loads(Path(__file__, "../../schemas/replay-certificate.schema.json").resolve().read_text())
+)
 
 
 def roll(env: gym.Env[Any, Any], steps: int, seed: int | None = 1) -> None:
@@ -160,7 +186,6 @@ def test_a_different_end_is_named(tmp_path: Path) -> None:
 
 
 def test_an_unseeded_episode_after_a_missing_one_is_skipped(tmp_path: Path) -> None:
-    from tupli_mcap import rewrite_recording
 
     path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 120)
     with Recording(path) as recording:
@@ -200,6 +225,7 @@ class HiddenRandomness(gym.Env[Any, Any]):
 def test_hidden_randomness_is_named(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", HiddenRandomness(), 20)
     certificate = certify(path)
+    SCHEMA.validate(json.loads(certificate.to_json()))
     first = certificate.first
     assert first is not None
     assert (first.episode, first.step, first.path) == (0, 1, "state[0]")
@@ -214,3 +240,160 @@ def test_code_from_a_stranger_is_not_run(tmp_path: Path, monkeypatch: pytest.Mon
         certify(path)
     assert certify(path, trust=True).chosen.episodes == 1
     assert certify(path, env=HiddenRandomness()).environment_digest == ""
+
+
+@pytest.mark.parametrize("seed", [7, None])
+def test_resets_without_a_step_are_repeated(tmp_path: Path, seed: int | None) -> None:
+    with RecordEpisodes(gym.make("Blackjack-v1"), tmp_path / "a.mcap") as env:
+        env.reset(seed=seed)
+        env.reset()  # the seed's own episode has no step, its random stream goes on
+        for _ in range(30):
+            _, _, terminal, timeout, _ = env.step(1)
+            if terminal or timeout:
+                env.reset()
+                env.reset()
+    check_complete(certify(tmp_path / "a.mcap"))
+
+
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_resets_of_a_vector_environment_in_mid_episode_are_repeated(
+    tmp_path: Path, mode: gym.vector.AutoresetMode
+) -> None:
+    made = gym.make_vec("Blackjack-v1", 2, "sync", vector_kwargs={"autoreset_mode": mode})
+    with RecordVectorEpisodes(made, tmp_path / "a.mcap") as env:
+        env.action_space.seed(0)
+        env.reset(seed=1)
+        for _ in range(15):
+            env.reset()
+            env.step(env.action_space.sample())  # some end here: same-step has reset them already
+    check_complete(certify(tmp_path / "a.mcap"))
+
+
+def test_sessions_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    record(path, gym.make("Blackjack-v1"), 20, seed=1)
+    record(path, gym.make("Blackjack-v1"), 20, seed=None, mode="a")  # which draws its own seed
+    record(path, gym.make("Blackjack-v1"), 20, seed=5, mode="a")
+    check_complete(certify(path))
+    used = gym.make("Blackjack-v1")
+    used.reset(seed=99)
+    record(path, used, 20, seed=None, mode="a")
+    certificate = certify(path)
+    assert certificate.agrees and not certificate.complete
+    (skipped,) = certificate.skipped
+    assert skipped.kind == "unseeded"
+    assert certificate.agreed.steps >= 60
+
+
+def test_an_unseeded_episode_after_a_refused_step_stands_alone(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("Pendulum-v1"), tmp_path / "a.mcap") as env:
+        env.reset(seed=1)
+        env.step(np.array([0.5], np.float32))
+        with pytest.raises(StepError, match="action: expected values that float32 holds exactly"):
+            env.step(np.array([0.1], np.float64))
+        env.reset()
+        env.step(np.array([0.5], np.float32))
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert [reset.continued for reset in recording.resets_before(1)] == [True]
+    check_complete(certify(tmp_path / "a.mcap"))  # Pendulum draws in resets only
+
+
+def test_rewriting_keeps_what_replaying_needs(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("Blackjack-v1"), tmp_path / "a.mcap") as env:
+        env.reset(seed=3)
+        roll(env, 20, seed=None)
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert [reset.seed for reset in recording.resets_before(0)] == ["3"]
+        rewrite_recording(recording, tmp_path / "b.mcap")
+    check_complete(certify(tmp_path / "b.mcap"))
+
+
+# --- the certificate in the file ---
+
+
+def test_a_certificate_is_added_and_nothing_else_changes(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path, compression="lz4") as env:
+        roll(env, 100)
+    path.chmod(0o640)
+    before = path.read_bytes()
+    certificate = certify(path)
+    write_certificate(path, certificate)
+    after = path.read_bytes()
+    with Recording(path) as recording:
+        assert read_certificate(recording) == certificate
+        assert covers(certificate, recording)
+        assert recording.complete
+        SCHEMA.validate(json.loads(recording.read_attachment(CERTIFICATE_NAME)))
+        end = recording._contents.attachments[CERTIFICATE_NAME].offset
+        assert after[:end] == before[:end]
+    assert path.stat().st_mode & 0o777 == 0o640
+    write_certificate(path, certificate)  # in place of the one before
+    assert len(path.read_bytes()) == len(after)
+    assert list(tmp_path.iterdir()) == [path]
+    check_complete(certify(path))
+
+
+def test_a_certificate_is_of_the_episodes_it_was_made_of(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 50)
+    certificate = certify(path)
+    write_certificate(path, certificate)
+    record(path, gym.make("CartPole-v1"), 50, seed=2, mode="a")
+    with Recording(path) as recording:
+        carried = read_certificate(recording)
+        assert carried == certificate
+        assert not covers(certificate, recording)
+        rewrite_recording(recording, tmp_path / "b.mcap")
+    with pytest.raises(RecordingError, match="expected a certificate of its .* replay it again"):
+        write_certificate(path, certificate)
+    again = certify(path)
+    write_certificate(path, again)
+    with Recording(path) as recording, Recording(tmp_path / "b.mcap") as copy:
+        assert read_certificate(recording) == again
+        assert covers(again, recording) and covers(again, copy)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"{}", "no replay certificate"),
+        (b"\xff", "no replay certificate"),
+        (b'{"format": "tupli_mcap.replay_certificate", "version": 2}', "version"),
+    ],
+)
+def test_a_forged_certificate_is_a_format_error(tmp_path: Path, text: bytes, message: str) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 20)
+    add_attachments(path, {CERTIFICATE_NAME: ("application/json", text)})
+    with Recording(path) as recording, pytest.raises(FormatError, match=message):
+        read_certificate(recording)
+
+
+def test_nothing_is_attached_to_an_unfinished_recording(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    env = RecordEpisodes(gym.make("CartPole-v1"), path)
+    roll(env, 20)
+    certificate = certify(path)  # a live recording can be replayed as far as it is
+    assert certificate.agrees
+    with pytest.raises(RecordingError, match="is being recorded by another writer"):
+        write_certificate(path, certificate)
+    env.close()
+
+
+def test_a_storage_sees_its_recording_with_the_certificate(tmp_path: Path) -> None:
+    storage = FileStorage(tmp_path / "lab")
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), storage)
+    env.reset(seed=5)
+    env.store(name="cartpole")
+    roll(env, 60, seed=None)
+    env.close()
+    path = env.recording_path
+    assert path is not None
+    before = storage.list_episodes()
+    certificate = certify(path)
+    check_complete(certificate)
+    assert certificate.benchmark_id == env.id
+    write_certificate(path, certificate)
+    assert storage.list_episodes() == before
+    bundle = storage.bundle(str(env.id), tmp_path / "bundle.mcap")
+    with Recording(bundle) as recording:
+        assert read_certificate(recording) == certificate

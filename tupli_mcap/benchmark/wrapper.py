@@ -95,7 +95,9 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         self._recording = True
         self._recorder: RecordEpisodes | None = None
         self._path: Path | None = None
-        self._pending: PendingReset | None = None
+        self._pending: list[
+            PendingReset
+        ] = []  # resets that no step followed, each going on from the one before
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
@@ -109,7 +111,11 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the environment; while recording, a running episode ends as interrupted."""
         if self._recorder is None and self._recording and self.id is not None:
-            self._recorder = self._open()
+            recorder = self._open()
+            if seed is None:
+                self._hand_over(recorder)
+            self._pending = []
+            self._recorder = recorder
         if self._recorder is not None:
             return self._recorder.reset(seed=seed, options=options)
         unseeded = seed is None and getattr(self.env.unwrapped, "_np_random", 0) is None
@@ -117,7 +123,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         if unseeded:
             drawn = getattr(self.env.unwrapped, "_np_random_seed", None)
             seed = drawn if isinstance(drawn, int) and drawn >= 0 else None
-        self._pending = PendingReset(result, seed, options)
+        before = self._pending if seed is None else []
+        self._pending = [*before, PendingReset(result, seed, options)]
         return result
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -131,7 +138,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             return self._recorder.step(action)
         if self._recording:
             return self._first_step(action)
-        self._pending = None
+        self._pending = []
         return self.env.step(action)
 
     def _first_step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -140,14 +147,19 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
                 "this environment is not stored yet, so its steps cannot be recorded: call store(name=...) "
                 "first, or deactivate_recording()"
             )
-        pending, self._pending = self._pending, None
-        if pending is None:  # in the middle of an episode that began unrecorded; the next one is recorded
+        if not self._pending:  # in the middle of an episode that began unrecorded; the next one is recorded
             return self.env.step(action)
         recorder = self._open()
-        self._tap.pending = pending
-        recorder.reset(seed=pending.seed, options=pending.options)
+        self._hand_over(recorder)
         self._recorder = recorder
         return recorder.step(action)
+
+    def _hand_over(self, recorder: RecordEpisodes) -> None:
+        """Tells a recorder of the resets that have already happened."""
+        pending, self._pending = self._pending, []
+        for reset in pending:
+            self._tap.pending = reset
+            recorder.reset(seed=reset.seed, options=reset.options)
 
     def activate_recording(self) -> None:
         """Record from the next reset on (from the running episode on, if it has no step yet)."""
@@ -156,7 +168,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     def deactivate_recording(self) -> None:
         """Stop recording: the running episode ends as interrupted, and the file is finished."""
         self._recording = False
-        self._pending = None
+        self._pending = []
         self._finish()
 
     @property

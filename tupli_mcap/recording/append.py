@@ -14,7 +14,7 @@ from mcap.records import ChunkIndex
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.container import COMPRESSIONS
+from tupli_mcap.recording.container import COMPRESSIONS, Container
 from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.journal import journal_info, journal_path
 from tupli_mcap.recording.recover import belongs, head, misplaced_journal
@@ -24,7 +24,7 @@ from tupli_mcap.recording.summary import check_magic, has_summary
 if TYPE_CHECKING:
     from tupli_mcap.recording.writer import RecordingWriter
 
-__all__ = ["resume"]
+__all__ = ["restore_container", "resume"]
 
 _CHUNK_HEAD = struct.Struct("<BQQQ")  # opcode, length, start time, end time
 
@@ -116,15 +116,33 @@ def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:
 
 
 def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> None:
-    container = writer.container
     writer.uuid = contents.metadata["uuid"]
     writer.rewritten = contents.metadata.get("rewritten", "")
     _keep_journal_place(writer, contents)
+    restore_container(writer.container, contents, source)
+    index_rows = contents.index.episodes
+    writer.index.rows = bytearray(index_rows.tobytes())
+    writer.index.metadata = bytearray(contents.index.metadata)
+    writer.index.count = len(index_rows)
+    writer.next_episode = contents.next_episode
+    steps = [c for c in writer.container.channels.values() if c.topic.endswith("/step")]
+    if steps:
+        writer.layout = StepLayout.from_metadata(steps[0].metadata)
+        writer.recorded_envs = len(steps)
+        writer.recorded_vector = steps[0].topic != "/step"
+
+
+def restore_container(container: Container, contents: Contents, source: Source) -> None:
+    """Lets a container go on behind what a file holds; its position is the caller's to set.
+
+    Raises:
+        FormatError: the file's channels are not numbered from 1.
+    """
     container.schemas = dict(sorted(contents.schemas.items()))
     container.channels = dict(sorted(contents.channels.items()))
     if list(container.channels) != list(range(1, len(container.channels) + 1)):
         raise FormatError(
-            f"{writer.path}: expected channels numbered from 1, found {list(container.channels)}"
+            f"{source.name}: expected channels numbered from 1, found {list(container.channels)}"
         )
     container.counts = dict.fromkeys(container.channels, 0)
     container.attachment_indexes = list(contents.attachments.values())
@@ -146,13 +164,3 @@ def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> Non
             uncompressed_size=int(row["uncompressed"]),
         )
         container.note_chunk(index, tuple(int(value) for value in row.tolist()))
-    index_rows = contents.index.episodes
-    writer.index.rows = bytearray(index_rows.tobytes())
-    writer.index.metadata = bytearray(contents.index.metadata)
-    writer.index.count = len(index_rows)
-    writer.next_episode = contents.next_episode
-    steps = [c for c in container.channels.values() if c.topic.endswith("/step")]
-    if steps:
-        writer.layout = StepLayout.from_metadata(steps[0].metadata)
-        writer.recorded_envs = len(steps)
-        writer.recorded_vector = steps[0].topic != "/step"

@@ -234,6 +234,22 @@ class Recording:
             )
         return start
 
+    def resets_before(self, i: int) -> list[EpisodeStart]:
+        """The resets just before that of episode `i` that no step followed, the earliest first.
+
+        They are known where the random stream goes on from them: the later resets had no seed. One that is `continued`
+        was none: from there on, the stream is not the one of the episode before.
+        """
+        row = self.index[i]
+        found: list[EpisodeStart] = []
+        for at in range(int(row["start_row"]) - 1, -1, -1):
+            (body,) = self._store.bodies(self._channel("/episode_start"), at, 1)
+            start = EpisodeStart.decode(body)
+            if start.episode != row["episode"] or start.env != row["env"]:
+                break
+            found.append(start)
+        return found[::-1]
+
     def final_state(self, i: int) -> Any:
         """The final state of episode `i`, nested as the observation space; None if it is not known."""
         (values,) = self._finals(self.index[i : i + 1])

@@ -182,11 +182,13 @@ class _Rewriter:
         starts: list[tuple[int, bytes]] = []
         ends: list[tuple[int, bytes]] = []
         finals: list[tuple[int, bytes]] = []
+        positions = {int(number): i for i, number in enumerate(self._source.index["episode"])}
         for row, first in zip(rows, firsts, strict=True):
-            ((start_time, body),) = self._messages(self._topics["/episode_start"], int(row["start_row"]), 1)
-            starts.append(
-                (start_time, EpisodeStart.decode(memoryview(body))._replace(first_row=int(first)).encode())
-            )
+            last = int(row["start_row"])
+            resets = len(self._source.resets_before(positions[int(row["episode"])]))
+            for start_time, body in self._messages(self._topics["/episode_start"], last - resets, resets + 1):
+                start = EpisodeStart.decode(memoryview(body))._replace(first_row=int(first))
+                starts.append((start_time, start.encode()))
             ((end_time, body),) = self._messages(self._topics["/episode_end"], int(row["end_row"]), 1)
             end = EpisodeEnd.decode(memoryview(body))._replace(first_row=int(first))
             final = -1
@@ -202,7 +204,7 @@ class _Rewriter:
                     int(row["start_time"]),
                     int(row["end_time"]),
                     seed,
-                    len(ends),
+                    len(starts) - 1,
                     len(ends),
                     final,
                     end.episode,

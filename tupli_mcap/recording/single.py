@@ -58,6 +58,7 @@ class SingleRecorder:
         self._spaces = spaces
         self._infos = infos
         self._reset: tuple[Any, ResetFacts] | None = None
+        self._earlier: list[ResetFacts] = []  # resets before it that no step followed
         self._episode: StartedEpisode | None = None
         self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset
@@ -75,6 +76,7 @@ class SingleRecorder:
         """
         if self._writer.closed or self._writer.failed is not None:
             self._closed()
+        self._keep_start_for(facts)
         self.end(INTERRUPTED, metadata)
         rows = self._writer.rows
         self.put = self._unreset
@@ -88,6 +90,14 @@ class SingleRecorder:
             rows.put_state(state)
             self._episode = self._writer.start_episode(0, rows.count, facts)
             self.put = rows.put
+
+    def _keep_start_for(self, facts: ResetFacts) -> None:
+        """A reset without a step is no episode, but one without a seed goes on with its random stream."""
+        if self._reset is not None:
+            self._earlier = [*self._earlier, self._reset[1]] if facts.goes_on else []
+        elif self._episode is not None and self.step_index == 0 and facts.goes_on:
+            self._writer.keep_start()
+            self._episode = None
 
     def end(self, end: int, metadata: str = "{}", *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
@@ -114,13 +124,15 @@ class SingleRecorder:
     def refuse(self, metadata: str = "{}") -> None:
         """After a step that could not be stored: the episode ends before it, and a reset must follow."""
         self.end(INTERRUPTED, metadata)
+        self._writer.lost_streams.add(0)
         if self._writer.failed is None and not self._writer.closed:
             self.put = self._refused
 
     def forget_reset(self, metadata: str = "{}") -> None:
         """After a reset that failed, wherever it left the environment: the episode ends, and a reset must follow."""
         self.end(INTERRUPTED, metadata)
-        self._reset = None
+        self._reset, self._earlier = None, []
+        self._writer.lost_streams.add(0)
         if self._writer.failed is None and not self._writer.closed:
             self.put = self._unreset
 
@@ -145,8 +157,19 @@ class SingleRecorder:
         schema = None if self._infos is None else self._infos.schema()
         self._writer.begin(layout, 1, vector=False, info_schema=schema)
         self._reset = None
+        self._start_earlier()
         self.reset(first, facts)
         self.put(action, state, reward, terminal, timeout)
+
+    def _start_earlier(self) -> None:
+        rows = self._writer.rows
+        if rows is None or not self._earlier:
+            return
+        with self._writer.whole:
+            for facts in self._earlier:
+                self._writer.start_episode(0, rows.count, facts)
+                self._writer.keep_start()
+            self._earlier = []
 
     def _continue(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """A step after an end, without a reset: another episode, which starts at the last one's final state."""

@@ -53,6 +53,7 @@ class VectorRecorder:
         self._actions = batch_space(spaces.action_space, num_envs)
         self._first: Any = None
         self._facts: list[ResetFacts | None] = [None] * num_envs
+        self._earlier: list[list[ResetFacts]] = [[] for _ in range(num_envs)]  # resets that no step followed
         self._fresh = False  # some sub-environments have no episode:
         self._waiting = set(range(num_envs))
         self._episodes: list[StartedEpisode | None] = [None] * num_envs
@@ -85,7 +86,7 @@ class VectorRecorder:
         ended = self._ended.copy()
         for i in chosen:
             self._end(int(i), INTERRUPTED)
-            self._facts[int(i)] = facts[int(i)]
+            self._replace_facts(int(i), facts[int(i)])
             ended[int(i)] = False
         self._ended, self._any_ended = ended, bool(ended.any())
         self._fresh = True
@@ -96,6 +97,11 @@ class VectorRecorder:
             self._first = copy.deepcopy(states)
             return
         self._put_states(states, chosen if mask is not None else None)
+
+    def _replace_facts(self, i: int, facts: ResetFacts) -> None:
+        """A reset without a step is no episode, but one without a seed goes on with its random stream."""
+        before, self._facts[i] = self._facts[i], facts
+        self._earlier[i] = [*self._earlier[i], *([before] if before else [])] if facts.goes_on else []
 
     def _put_states(self, states: Any, chosen: Iterable[Any] | None) -> None:
         store = self._writer.vector
@@ -268,6 +274,10 @@ class VectorRecorder:
             facts = self._facts[i]
             if facts is None:  # stepped on after an end, without a reset
                 facts = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
+            for earlier in self._earlier[i]:
+                self._writer.start_episode(i, self._count(i), earlier)
+                self._writer.keep_start()
+            self._earlier[i] = []
             episode = self._writer.start_episode(i, self._count(i), facts)
             self._episodes[i] = episode
             self._facts[i] = None
@@ -380,6 +390,7 @@ class VectorRecorder:
         """After a batch that could not be stored: running episodes end before it, and a reset must follow."""
         self._refused = True
         self._final_rows.clear()
+        self._writer.lost_streams.update(range(self._n))
         if self._writer.failed is not None or self._writer.closed:
             return
         with self._writer.whole:

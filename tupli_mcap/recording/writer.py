@@ -93,6 +93,8 @@ class RecordingWriter:
         # is the start of an episode without a step
         self.on_abandon: Callable[[], None] = lambda: None
         self.start_is_droppable: Callable[[], bool] = lambda: False
+        # sub-environments whose random stream does not come from their last recorded episode
+        self.lost_streams: set[int] = set()
         self.num_envs = 1
         self.is_vector = False
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
@@ -154,6 +156,8 @@ class RecordingWriter:
         """Fixes the layout: registers the channels, makes the journal and the row stores."""
         self.layout = layout
         self.num_envs = num_envs
+        if self.index.count:  # of an earlier session
+            self.lost_streams = set(range(num_envs))
         self.is_vector = vector
         self.channels = register_channels(
             self.container, str(self.path), layout, num_envs if vector else None, info_schema
@@ -239,6 +243,15 @@ class RecordingWriter:
 
     def start_episode(self, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
         """Writes `/episode_start`; it is taken back by `drop_start` if no step follows."""
+        if env in self.lost_streams:
+            self.lost_streams.discard(env)
+            if reset.goes_on:
+                self._append_start(env, first_row, ResetFacts(None, None, "", "{}", reset.time_ns, True))
+        message, start_time, row = self._append_start(env, first_row, reset)
+        self.next_episode += 1
+        return StartedEpisode(message.episode, env, first_row, start_time, message.seed_number, row)
+
+    def _append_start(self, env: int, first_row: int, reset: ResetFacts) -> tuple[EpisodeStart, int, int]:
         seed = reset.seed if reset.seed is not None else reset.drawn_seed
         message = EpisodeStart(
             self.next_episode,
@@ -252,12 +265,16 @@ class RecordingWriter:
         )
         row = self._events().sequences[self.channels.start]
         start_time = self._events().append(reset.time_ns, (self.channels.start, message.encode()))
-        self.next_episode += 1
-        return StartedEpisode(message.episode, env, first_row, start_time, seed, row)
+        return message, start_time, row
 
     def drop_start(self) -> None:
         """Takes back the last `/episode_start`, the last event: a reset without a step is no episode."""
         self._events().drop_last(self.channels.start)
+        self.next_episode -= 1
+
+    def keep_start(self) -> None:
+        """Leaves the last `/episode_start` where it is, though no step follows: the random stream of the next episode,
+        which takes its number, went through that reset."""
         self.next_episode -= 1
 
     def end_episode(
@@ -520,6 +537,11 @@ class ResetFacts(NamedTuple):
     info: str
     time_ns: int
     continued: bool = False
+
+    @property
+    def goes_on(self) -> bool:
+        """True if the reset had no seed, so that it went on with the random stream of what came before it."""
+        return self.seed is None and self.drawn_seed is None and not self.continued
 
 
 class StartedEpisode(NamedTuple):

@@ -1,6 +1,17 @@
 """Recordings replayed: the environment rebuilt, every episode taken again, and compared bit for bit."""
 
+from tupli_mcap.replay.carried import CERTIFICATE_NAME, covers, read_certificate, write_certificate
 from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, Skipped
 from tupli_mcap.replay.certify import certify
 
-__all__ = ["Certificate", "Counts", "Divergence", "Skipped", "certify"]
+__all__ = [
+    "CERTIFICATE_NAME",
+    "Certificate",
+    "Counts",
+    "Divergence",
+    "Skipped",
+    "certify",
+    "covers",
+    "read_certificate",
+    "write_certificate",
+]

@@ -87,7 +87,6 @@ class Certificate(_Model):
     diverged: Counts
     skipped: list[Skipped]
     divergences: list[Divergence] = Field(max_length=100)
-    notes: list[str] = []
     versions: dict[str, str]
     recorded_versions: dict[str, str]
     platform: dict[str, str]

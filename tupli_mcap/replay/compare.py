@@ -194,12 +194,11 @@ class Checker:
         dtype = self._layout.dtypes[leaf.name]
         expected = np.asarray(expected, dtype).reshape(leaf.shape)
         array = self._stored(leaf, dtype, found)
-        at = np.argwhere(_bits(expected) != _bits(array))
-        first = tuple(int(i) for i in at[0])
+        differs = np.asarray(_bits(expected) != _bits(array))
+        first = tuple(int(i) for i in np.argwhere(differs)[0])
         path = leaf.path + (f"[{', '.join(map(str, first))}]" if first else "")
         told, seen = _text(expected[first]), _text(array[first])
-        where = tuple(at.T)
-        return Difference(step, leaf.name, path, told, seen, _largest(expected[where], array[where]))
+        return Difference(step, leaf.name, path, told, seen, _largest(expected[differs], array[differs]))
 
 
 def _bits(array: Any) -> Any:

@@ -16,6 +16,13 @@ __all__ = ["EpisodePlan", "How", "plan_episodes"]
 How = Literal["seeded", "drawn", "captured", "follows", "continues", "unknown"]
 
 
+class ResetCall(NamedTuple):
+    """What `reset` is called with; `options` is exact JSON, empty for none."""
+
+    seed: int | None
+    options: str
+
+
 class EpisodePlan(NamedTuple):
     """How an episode starts.
 
@@ -25,6 +32,7 @@ class EpisodePlan(NamedTuple):
         recorded), "continues" (no reset at all), "unknown" (no seed, and what came before it is not recorded).
     after_end: the episode before it in its sub-environment came to an end, so that it was not cut short by this reset.
     gap: episodes that came before it are not in the recording any more.
+    resets: those to be made, the last one is the episode's; none if it continues without one.
     auto: it may have been started by `gymnasium.wrappers.Autoreset`, which resets in `step`.
     """
 
@@ -32,8 +40,7 @@ class EpisodePlan(NamedTuple):
     number: int
     env: int
     how: How
-    seed: int | None
-    options: str
+    resets: tuple[ResetCall, ...]
     after_end: bool
     gap: bool
     auto: bool
@@ -70,18 +77,27 @@ def _plan(recording: Recording, position: int, before: int | None, captured: boo
     # Numbers count over all sub-environments: whose episode is missing cannot be said.
     gap = number != position if before is None else number - position != _shift(recording, before)
     after_end = before is not None and recording.index[before]["end"] != INTERRUPTED
+    earlier = recording.resets_before(position)
+    lost = [i for i, reset in enumerate(earlier) if reset.continued]
+    starts = [*(earlier[lost[-1] + 1 :] if lost else earlier), start]
+    seeded = [i for i, reset in enumerate(starts) if reset.seed_number is not None]
     how: How
     if start.continued:
         how = "unknown" if before is None else "continues"
-    elif start.seed_number is not None:
-        how = "seeded" if start.seed_given else "drawn"
+        starts = []
+    elif seeded:
+        how = "seeded" if starts[seeded[-1]].seed_given else "drawn"
+        starts = starts[seeded[-1] :]
+    elif lost:
+        how = "unknown"
     elif before is not None:
         how = "follows"
     else:
         how = "captured" if captured and not gap else "unknown"
-    plain = not start.options and start.reset_info == "{}"
+    plain = not start.options and start.reset_info == "{}" and len(starts) == 1
+    resets = tuple(ResetCall(reset.seed_number, reset.options) for reset in starts)
     return EpisodePlan(
-        position, number, int(row["env"]), how, start.seed_number, start.options, after_end, gap,
+        position, number, int(row["env"]), how, resets, after_end, gap,
         auto=how == "follows" and plain and after_end,
     )  # fmt: skip
 

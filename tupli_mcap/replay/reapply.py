@@ -15,7 +15,7 @@ from tupli_mcap.errors import TupliError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.episode import item_getter
-from tupli_mcap.replay.plan import EpisodePlan
+from tupli_mcap.replay.plan import EpisodePlan, ResetCall
 
 __all__ = ["EnvironmentFailedError", "Moment", "Replayer", "recorded_actions"]
 
@@ -105,20 +105,19 @@ class Replayer:
                 raise EnvironmentFailedError(-1, err) from err
             self._last = Moment(state)
             return self._last
-        options = jsonvalue.loads(plan.options) if plan.options else None
-        if isinstance(options, dict):
-            options.pop("reset_mask", None)  # meant for the vector environment, which takes it out too
-        return self._reset(plan.seed, options)
-
-    def _reset(self, seed: int | None, options: Any) -> Moment:
-        env = self.env
-        self._used = True
-        try:
-            state, info = env.reset(seed=seed, options=options)
-        except Exception as err:
-            raise EnvironmentFailedError(-1, err) from err
-        self._last = Moment(state, info=info)
-        return self._last
+        moment = Moment(None)
+        for seed, text in plan.resets or (ResetCall(None, ""),):
+            options = jsonvalue.loads(text) if text else None
+            if isinstance(options, dict):
+                options.pop("reset_mask", None)  # meant for the vector environment, which takes it out too
+            self._used = True
+            try:
+                state, info = env.reset(seed=seed, options=options)
+            except Exception as err:
+                raise EnvironmentFailedError(-1, err) from err
+            moment = Moment(state, info=info)
+        self._last = moment
+        return moment
 
     def close(self) -> None:
         """Closes the environment; another one is made for the next episode."""

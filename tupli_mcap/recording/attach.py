@@ -1,0 +1,97 @@
+"""Attachments added to a finished recording; everything else in it stays as it is, byte for byte."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.recording.append import restore_container
+from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.contents import Contents, read_contents
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
+from tupli_mcap.recording.lock import FileLock
+from tupli_mcap.recording.source import PathSource, Source
+
+__all__ = ["add_attachments"]
+
+_COPY = 1 << 22
+
+
+def add_attachments(path: str | os.PathLike[str], attachments: Mapping[str, tuple[str, bytes]]) -> None:
+    """Adds attachments (name -> media type, bytes) behind the chunks of a recording, or replaces those of their name.
+
+    The file is replaced in one rename: it is the old one or the new one, whatever happens to this process.
+
+    Raises:
+        RecordingError: the recording is not finished, is being written, or cannot be written.
+        FormatError: it is damaged.
+    """
+    path = Path(os.path.realpath(path))  # not a symbolic link is replaced, but what it names
+    lock = FileLock(path, "a")
+    try:
+        source = PathSource(path)
+        try:
+            contents = read_contents(source)
+            if not contents.complete:
+                raise RecordingError(
+                    f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover` finishes it"
+                )
+            _replace(path, source, contents, attachments)
+        finally:
+            source.close()
+    finally:
+        lock.release()
+
+
+def _replace(
+    path: Path, source: Source, contents: Contents, attachments: Mapping[str, tuple[str, bytes]]
+) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+    except OSError as err:
+        raise RecordingError(f"{path} cannot be written: {err.strerror}; choose a writable place") from err
+    try:
+        try:
+            _write(fd, path, source, contents, attachments)
+            os.fchmod(fd, stat.S_IMODE(path.stat().st_mode))
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+        temporary.replace(path)
+    except BaseException as err:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        if isinstance(err, OSError):
+            raise RecordingError(f"{path} cannot be written: {err.strerror}") from err
+        raise
+
+
+def _write(
+    fd: int, path: Path, source: Source, contents: Contents, attachments: Mapping[str, tuple[str, bytes]]
+) -> None:
+    container = Container(fd, str(path), "zstd")
+    restore_container(container, contents, source)
+    kept = [index for index in container.attachment_indexes if index.name not in attachments]
+    # one that is replaced and lies last is left out; elsewhere its bytes stay, and nothing names them
+    last = max(container.attachment_indexes, key=lambda index: index.offset, default=None)
+    end = contents.data_end
+    if last is not None and last not in kept and last.offset + last.length == end:
+        end = last.offset
+    container.attachment_indexes = kept
+    for start in range(0, end, _COPY):
+        container.write(source.read(start, min(_COPY, end - start)))
+    now = time.time_ns()
+    for name, (media_type, data) in attachments.items():
+        container.add_attachment(name, media_type, data, now)
+    index = IndexBuilder()
+    index.rows = bytearray(contents.index.episodes.tobytes())
+    index.metadata = bytearray(contents.index.metadata)
+    index.count = len(contents.index.episodes)
+    container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, index.encode(container.chunk_rows), now)
+    container.finish()
