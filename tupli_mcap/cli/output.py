@@ -24,6 +24,7 @@ __all__ = [
     "step_progress",
     "terminal_width",
     "time_of",
+    "visible",
     "warnings_in_one_line",
     "when",
 ]
@@ -55,7 +56,7 @@ def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], *, emp
     """Print rows under titles, or the sentence `empty` if there are none."""
     from rich.cells import cell_len
 
-    cells = [[_visible(cell) for cell in row] for row in rows]
+    cells = [[visible(cell) for cell in row] for row in rows]
     if not cells:
         print(empty)
         return
@@ -77,7 +78,7 @@ def print_facts(facts: Iterable[tuple[str, str]]) -> None:
     """Print `label  value` lines; long values go on below themselves."""
     import textwrap
 
-    pairs = [(label, _visible(value)) for label, value in facts]
+    pairs = [(label, visible(value)) for label, value in facts]
     indent = max(len(label) for label, _ in pairs) + len(_GAP)
     width = terminal_width()
     for label, value in pairs:
@@ -189,7 +190,7 @@ def when(created_at: str) -> str:
         return created_at
 
 
-def _visible(text: str) -> str:
+def visible(text: str) -> str:
     """Without what would move the cursor or break the line: texts come from files."""
     return "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text)
 

@@ -1,0 +1,800 @@
+"""The doctor: each check on a recording that has the defect and on one that has not; healthy data stays quiet."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Sampler, Scripted, roll
+from gymnasium import spaces
+from typer.testing import CliRunner
+
+from tupli_mcap import (
+    EpisodeData,
+    F,
+    FileStorage,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    TupliDataset,
+    TupliEnvWrapper,
+    rewrite_recording,
+    write_recording,
+)
+from tupli_mcap.cli import app
+from tupli_mcap.doctor import CHECKS, Diagnosis, Finding, Place, Severity, examine
+from tupli_mcap.wrappers.rollout import record_rollouts
+
+ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
+UNIT = spaces.Box(-1, 1, (3,), np.float32)
+FRAME = np.full((2, 2, 3), 99, np.uint8)
+Observe = Callable[[int], Any]
+
+
+def still(n: int) -> Any:
+    return np.float32([np.sin(n), np.cos(n), np.sin(2 * n)])
+
+
+def record(path: Path, env: gym.Env[Any, Any], steps: int, seed: int = 1) -> Path:
+    with RecordEpisodes(env, path) as recorded:
+        roll(recorded, steps, seed)
+    return path
+
+
+def scripted(
+    path: Path,
+    observe: Observe = still,
+    space: gym.Space[Any] = UNIT,
+    *,
+    episodes: int = 3,
+    length: int = 10,
+    act: Callable[[int], Any] = lambda n: n % 3,
+    actions: gym.Space[Any] | None = None,
+    reward: Callable[[int], Any] = lambda n: float(n),
+) -> Path:
+    """Episodes of an environment whose observations, actions and rewards are functions of the step."""
+    env = Scripted(observe, space, actions, reward=reward, length=length)
+    with RecordEpisodes(env, path) as recorded:
+        for _ in range(episodes):
+            recorded.reset()
+            for n in range(length):
+                recorded.step(act(n))
+    return path
+
+
+def by_hand(path: Path, episodes: list[dict[str, Any]]) -> Path:
+    """Episodes of an environment with 3 actions; each is given by its length and by what differs."""
+    made = []
+    for i, facts in enumerate(episodes):
+        facts = dict(facts)
+        n = facts.pop("length", 4)
+        states = [still(100 * i + j) for j in range(n)]
+        made.append(
+            EpisodeData(
+                states,
+                facts.pop("actions", [j % 3 for j in range(n)]),
+                facts.pop("rewards", [float(j) for j in range(n)]),
+                facts.pop("terminals", [j == n - 1 for j in range(n)]),
+                facts.pop("timeouts", [False] * n),
+                final_state=facts.pop("final_state", still(0)),
+                **facts,
+            )
+        )
+    write_recording(path, made, observation_space=UNIT, action_space=spaces.Discrete(3))
+    return path
+
+
+def found(diagnosis: Diagnosis, check: str) -> Finding:
+    """The one finding of a check."""
+    (finding,) = diagnosis.of(check)
+    return finding
+
+
+def places(finding: Finding) -> list[tuple[int, int | None]]:
+    return [(place.episode, place.step) for place in finding.places]
+
+
+# --- healthy data ---
+
+
+@pytest.mark.parametrize(
+    ("env_id", "steps", "expected"),
+    [
+        ("CartPole-v1", 3000, {"constant-reward"}),
+        ("Pendulum-v1", 1000, {"missing-terminals"}),
+        ("MountainCar-v0", 1000, {"missing-terminals", "constant-reward"}),
+        ("MountainCarContinuous-v0", 1998, {"missing-terminals"}),
+        ("Acrobot-v1", 1200, {"missing-terminals", "constant-reward"}),
+        ("FrozenLake-v1", 3000, {"duplicate-episodes"}),
+        ("CliffWalking-v1", 2000, set()),
+        ("Taxi-v4", 2000, {"missing-terminals"}),
+        ("Blackjack-v1", 1000, {"duplicate-episodes", "one-step-episodes"}),
+    ],
+)
+def test_healthy_environments(tmp_path: Path, env_id: str, steps: int, expected: set[str]) -> None:
+    record_rollouts(env_id, tmp_path / "a.mcap", steps=steps, seed=1)
+    diagnosis = examine(tmp_path / "a.mcap")
+    assert diagnosis.at_least(WARNING) == ()
+    usual = {"interrupted", "clock-jump"}  # where the rollout happens to end, and how busy the machine is
+    assert {finding.check for finding in diagnosis.findings} - usual == expected
+    assert (diagnosis.files, diagnosis.steps) == (1, steps)
+    assert diagnosis.healthy
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(0, 255, (12, 10, 3), np.uint8),
+        spaces.Dict({"note": spaces.Text(8), "x": spaces.Box(-1, 1, (2,))}),
+        spaces.Dict({"a": spaces.MultiBinary(4), "b": spaces.Tuple((spaces.MultiDiscrete([3, 4]),))}),
+        spaces.Sequence(spaces.Box(-1, 1, (2,))),
+        spaces.Graph(spaces.Box(-1, 1, (2,)), spaces.Discrete(3)),
+        spaces.OneOf((spaces.Discrete(3), spaces.Box(-1, 1, (2,)))),
+        spaces.Box(-1, 1, (0,)),
+        spaces.Box(-1, 1, (3,), np.float16),
+        spaces.Box(-np.inf, np.inf, (), np.float64),
+    ],
+    ids=["image", "text", "bits", "sequence", "graph", "oneof", "empty", "half", "scalar"],
+)
+def test_healthy_spaces(tmp_path: Path, space: gym.Space[Any]) -> None:
+    diagnosis = examine(record(tmp_path / "a.mcap", Sampler(space, spaces.Discrete(3)), 210))
+    assert diagnosis.at_least(WARNING) == ()
+    assert diagnosis.episodes == 30
+
+
+def test_healthy_vector_recording(tmp_path: Path) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "a.mcap", steps=3000, seed=1, num_envs=4)
+    assert examine(tmp_path / "a.mcap").at_least(WARNING) == ()
+
+
+# --- values ---
+
+
+@pytest.mark.parametrize(
+    ("check", "value", "words"), [("nan", np.nan, "NaN"), ("infinity", -np.inf, "infinite")]
+)
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_not_finite(tmp_path: Path, check: str, value: float, words: str, dtype: Any) -> None:
+    def observe(n: int) -> Any:
+        state = np.zeros((2, 3), dtype) + dtype(n / 16)
+        if n in (4, 10):  # in mid-episode, and the final state
+            state[1, 2] = value
+        return {"arm": state}
+
+    space = spaces.Dict({"arm": spaces.Box(-np.inf, np.inf, (2, 3), dtype)})
+    diagnosis = examine(scripted(tmp_path / "a.mcap", observe, space))
+    finding = found(diagnosis, check)
+    assert (finding.severity, finding.leaf, finding.dimensions) == (ERROR, "state['arm']", ((1, 2),))
+    assert (finding.count, finding.total) == (6, 3 * 11 * 6)
+    assert places(finding) == [(0, 4), (1, 4), (2, 4), (0, 10), (1, 10)]
+    assert f"6 of 198 values are {words} in dimension (1, 2)" == finding.message
+    assert diagnosis.worst is ERROR and not diagnosis.healthy
+    assert {other.check for other in diagnosis.at_least(WARNING)} == {check, "duplicate-episodes"}
+
+
+def test_not_finite_rewards_and_actions(tmp_path: Path) -> None:
+    path = scripted(
+        tmp_path / "a.mcap",
+        actions=spaces.Box(-np.inf, np.inf, (2,), np.float64),
+        act=lambda n: np.array([n, np.inf if n == 3 else 0.5 * n]),
+        reward=lambda n: np.nan if n == 1 else float(n),
+        episodes=2,
+    )
+    diagnosis = examine(path)
+    reward, action = found(diagnosis, "nan"), found(diagnosis, "infinity")
+    assert (reward.leaf, reward.count, reward.total, places(reward)) == ("reward", 2, 20, [(0, 0), (1, 0)])
+    assert reward.dimensions == ()
+    assert (action.leaf, action.dimensions, places(action)) == ("action", ((1,),), [(0, 3), (1, 3)])
+
+
+def test_not_finite_in_values_of_variable_size(tmp_path: Path) -> None:
+    space = spaces.Dict({"points": spaces.Sequence(spaces.Box(-9, 9, (2,)))})
+
+    def observe(n: int) -> Any:
+        point = np.float32([n / 10, np.nan if n == 2 else 0])
+        return {"points": (point,) * (n % 3)}
+
+    finding = found(examine(scripted(tmp_path / "a.mcap", observe, space)), "nan")
+    assert (finding.leaf, finding.count, finding.total) == ("state['points']", 3, 33)
+    assert places(finding) == [(0, 2), (1, 2), (2, 2)]
+
+
+@pytest.mark.parametrize(
+    ("space", "bad", "good", "severity"),
+    [
+        (spaces.Box(-1, 1, (2,), np.float32), np.float32([0, 1.5]), np.float32([1, -1]), WARNING),
+        (spaces.Box(0, 9, (2,), np.int32), np.int32([3, -1]), np.int32([0, 9]), WARNING),
+        (spaces.Box(0, 99, (2, 2, 3), np.uint8), FRAME + 1, FRAME, WARNING),
+        (spaces.Discrete(4, start=-1), np.int64(3), np.int64(2), ERROR),
+        (spaces.MultiDiscrete([2, 3]), np.array([1, 3]), np.array([1, 2]), ERROR),
+        (spaces.MultiBinary(2), np.int8([2, 0]), np.int8([1, 0]), ERROR),
+        (spaces.Text(3, charset="ab"), "abc", "ab", ERROR),
+        (spaces.Text(3, charset="ab"), "aaaa", "aaa", ERROR),
+        (spaces.Sequence(spaces.Discrete(2)), (1, 2), (1, 1), ERROR),
+        (spaces.OneOf((spaces.Discrete(2), spaces.Discrete(3))), (0, 2), (1, 2), ERROR),
+    ],
+)  # fmt: skip
+def test_outside_of_the_space(
+    tmp_path: Path, space: gym.Space[Any], bad: Any, good: Any, severity: Severity
+) -> None:
+    path = scripted(tmp_path / "bad.mcap", lambda n: bad if n == 6 else good, space)
+    finding = found(examine(path), "outside-space")
+    assert (finding.severity, finding.leaf) == (severity, "state")
+    assert places(finding) == [(0, 6), (1, 6), (2, 6)]
+    size = 12 if space.shape == (2, 2, 3) else 1
+    assert finding.count == 3 * size
+    good_path = scripted(tmp_path / "good.mcap", lambda n: good, space)
+    assert examine(good_path).of("outside-space") == ()
+
+
+def test_rounding_errors_at_a_bound_are_no_warning(tmp_path: Path) -> None:
+    almost = np.nextafter(np.float32([1, 1, 1]), np.float32(2))
+    finding = found(examine(scripted(tmp_path / "a.mcap", lambda n: almost)), "outside-space")
+    assert (finding.severity, finding.count) == (INFO, 99)
+    over = np.float32([1, 1, 1.0001])
+    finding = found(examine(scripted(tmp_path / "b.mcap", lambda n: over)), "outside-space")
+    assert (finding.severity, finding.count, finding.dimensions) == (WARNING, 33, ((2,),))
+
+
+def test_actions_outside_of_their_box(tmp_path: Path) -> None:
+    path = scripted(
+        tmp_path / "a.mcap",
+        actions=spaces.Box(-1, 1, (1,), np.float32),
+        act=lambda n: np.float32([n / 4 - 1]),
+    )
+    finding = found(examine(path), "outside-space")
+    assert (finding.severity, finding.leaf, finding.count) == (WARNING, "action", 3)
+    assert "clip" in finding.suggestion and "reach from -1 to 1.25" in finding.message
+
+
+def test_wider_dtypes_than_declared(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="recorded as float64"):
+        path = scripted(tmp_path / "a.mcap", lambda n: np.array([0.1, 0.2, 0.3]) * np.cos(n))
+    finding = found(examine(path), "stored-dtype")
+    assert (finding.severity, finding.leaf) == (INFO, "state")
+    assert finding.message == "the environment returned float64, its space declares float32"
+    assert examine(scripted(tmp_path / "b.mcap")).of("stored-dtype") == ()
+
+
+# --- what varies ---
+
+
+def test_constant_dimensions(tmp_path: Path) -> None:
+    def observe(n: int) -> Any:
+        return np.float32([0.5, np.sin(n), np.cos(n)])
+
+    path = scripted(tmp_path / "a.mcap", observe, episodes=10)
+    finding = found(examine(path), "constant-dimension")
+    assert (finding.severity, finding.leaf, finding.dimensions) == (WARNING, "state", ((0,),))
+    assert finding.message == "dimension 0 is always 0.5 in 110 values"
+    assert examine(path, thresholds={"constant-dimension": {"min_steps": 101}}).of("constant-dimension") == ()
+    assert examine(scripted(tmp_path / "b.mcap", episodes=10)).of("constant-dimension") == ()
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "message"),
+    [
+        (spaces.Discrete(4), 2, "it is always 2 in 110 values"),
+        (
+            spaces.Box(0, 255, (4, 4, 3), np.uint8),
+            np.ones((4, 4, 3), np.uint8),
+            "all 110 frames are the same",
+        ),
+        (spaces.Box(-1, 1, (2,)), np.float32([0, 1]), "it never changes in 110 values"),
+        (spaces.Text(3), "abc", "all 110 values are the same"),
+    ],
+)
+def test_a_leaf_that_never_changes(tmp_path: Path, space: gym.Space[Any], value: Any, message: str) -> None:
+    diagnosis = examine(scripted(tmp_path / "a.mcap", lambda n: value, space, episodes=10))
+    finding = found(diagnosis, "constant-dimension")
+    assert (finding.severity, finding.message, finding.dimensions) == (WARNING, message, ())
+
+
+def test_constant_integers_among_others_are_no_warning(tmp_path: Path) -> None:
+    space = spaces.Box(0, 255, (8,), np.uint8)
+    path = scripted(tmp_path / "a.mcap", lambda n: np.uint8([n, 7, 7, 7, 7, 7, 7, n]), space, episodes=10)
+    finding = found(examine(path), "constant-dimension")
+    assert (finding.severity, finding.count, finding.total) == (INFO, 6, 8)
+    assert finding.message == "6 of 8 dimensions (1, 2, 3, 4, ...) never change in 110 values"
+
+
+def test_a_dimension_of_one_value_is_as_declared(tmp_path: Path) -> None:
+    space = spaces.Box(np.float32([0, -1]), np.float32([0, 1]))
+    path = scripted(tmp_path / "a.mcap", lambda n: np.float32([0, np.sin(n)]), space, episodes=10)
+    assert examine(path).of("constant-dimension") == ()
+
+
+@pytest.mark.parametrize("block_bytes", [1, 700, 8 << 20], ids=["single steps", "parts", "whole"])
+def test_frozen_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int) -> None:
+    space = spaces.Box(0, 255, (2, 2, 3), np.uint8)
+
+    def observe(n: int) -> Any:
+        return np.full((2, 2, 3), n if n < 15 or n > 44 else 15, np.uint8)  # 15 to 44: 30 frames
+
+    path = scripted(tmp_path / "a.mcap", observe, space, length=60)
+    monkeypatch.setattr("tupli_mcap.doctor.blocks.BLOCK_BYTES", block_bytes)
+    finding = found(examine(path), "frozen-frames")
+    assert (finding.severity, finding.leaf, finding.count) == (WARNING, "state", 3 * 29)
+    assert places(finding) == [(0, 16)]
+    assert finding.message == "30 frames in a row are equal; 48% of all frames repeat the one before"
+    assert examine(path, thresholds={"frozen-frames": {"frames": 31}}).of("frozen-frames") == ()
+
+
+def test_states_of_very_different_scale(tmp_path: Path) -> None:
+    space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+    path = scripted(tmp_path / "a.mcap", lambda n: np.array([n, 1e6 * n, 0.01 * n]), space)
+    finding = found(examine(path), "state-scale")
+    assert (finding.severity, finding.dimensions) == (INFO, ((1,), (2,)))
+    assert "varies 1e+08 times as much" in finding.message
+
+
+# --- episodes ---
+
+
+def test_one_step_episodes_stand_out(tmp_path: Path) -> None:
+    path = by_hand(tmp_path / "a.mcap", [{"length": 1 if i in (2, 5) else 12} for i in range(20)])
+    finding = found(examine(path), "one-step-episodes")
+    assert (finding.severity, finding.count, finding.total) == (WARNING, 2, 20)
+    assert places(finding) == [(2, None), (5, None)]
+    short = by_hand(tmp_path / "b.mcap", [{"length": 1 + i % 3} for i in range(20)])
+    assert found(examine(short), "one-step-episodes").severity is INFO
+
+
+def test_one_step_at_the_end_of_a_recording_is_no_episode_of_one_step(tmp_path: Path) -> None:
+    path = by_hand(tmp_path / "a.mcap", [{"length": 12}, {"length": 1, "terminals": [False]}])
+    assert examine(path).of("one-step-episodes") == ()
+    assert found(examine(path), "interrupted").severity is INFO
+
+
+def test_episodes_without_any_end(tmp_path: Path) -> None:
+    never = {"terminals": [False] * 4}
+    diagnosis = examine(by_hand(tmp_path / "a.mcap", [never] * 5))
+    finding = found(diagnosis, "missing-terminals")
+    assert (finding.severity, finding.count) == (WARNING, 5)
+    assert finding.message == "none of 5 episodes ends in a terminal state: all are interrupted"
+    cut = found(diagnosis, "interrupted")
+    assert (cut.severity, cut.count, places(cut)) == (
+        WARNING,
+        5,
+        [(0, None), (1, None), (2, None), (3, None)],
+    )
+    timeouts = {**never, "timeouts": [False, False, False, True]}
+    finding = found(examine(by_hand(tmp_path / "b.mcap", [timeouts] * 5)), "missing-terminals")
+    assert (finding.severity, finding.message[-12:]) == (INFO, "5 by timeout")
+    assert examine(by_hand(tmp_path / "c.mcap", [{}, timeouts])).of("missing-terminals") == ()
+
+
+def test_some_interrupted_episodes(tmp_path: Path) -> None:
+    cut = {"terminals": [False] * 4}
+    finding = found(examine(by_hand(tmp_path / "a.mcap", [{}, cut, cut, {}, {}, {}])), "interrupted")
+    assert (finding.severity, finding.count, places(finding)) == (WARNING, 2, [(1, None), (2, None)])
+    few = found(examine(by_hand(tmp_path / "b.mcap", [cut] + [{}] * 9)), "interrupted")
+    assert (few.severity, few.message) == (INFO, "1 of 10 episodes is interrupted")
+
+
+class Limited(gym.Wrapper[Any, Any, Any, Any]):
+    """Tells a time limit as a terminal state, as environments of the old API did."""
+
+    def step(self, action: Any) -> Any:
+        state, reward, terminal, timeout, info = self.env.step(action)
+        return state, reward, terminal or timeout, False, info
+
+
+def test_a_time_limit_recorded_as_terminal(tmp_path: Path) -> None:
+    gym.register("DoctorLimited-v0", "gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=30)
+    try:
+        with RecordEpisodes(gym.make("DoctorLimited-v0"), tmp_path / "good.mcap") as env:
+            roll(env, 150)
+        good = examine(tmp_path / "good.mcap")
+        # What the spec says, with steps that end otherwise.
+        attachments = {}
+        with Recording(tmp_path / "good.mcap") as recording:
+            attachments["benchmark.json"] = ("application/json", recording.read_attachment("benchmark.json"))
+    finally:
+        del gym.registry["DoctorLimited-v0"]
+    assert good.of("time-limit-as-terminal") == ()
+    with Recording(tmp_path / "good.mcap") as recording:
+        episodes = [
+            EpisodeData(e.states, e.actions, e.rewards, e.timeouts, e.terminals, final_state=e.final_state)
+            for e in recording.episodes
+        ]
+        write_recording(
+            tmp_path / "bad.mcap",
+            episodes,
+            observation_space=recording.observation_space,
+            action_space=recording.action_space,
+            attachments=attachments,
+        )
+    finding = found(examine(tmp_path / "bad.mcap"), "time-limit-as-terminal")
+    assert (finding.severity, finding.count, finding.total) == (WARNING, 5, 5)
+    assert "exactly 30 steps, the environment's time limit" in finding.message
+
+
+def test_a_fixed_length_without_a_known_limit_is_worth_knowing(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", Limited(Sampler(UNIT, spaces.Discrete(3), 60)), 360)
+    assert found(examine(path), "time-limit-as-terminal").severity is INFO
+    path = record(tmp_path / "b.mcap", Limited(Sampler(UNIT, spaces.Discrete(3), 10)), 60)
+    assert examine(path).of("time-limit-as-terminal") == ()
+
+
+def test_flags_before_the_last_step(tmp_path: Path) -> None:
+    flags = [False, True, False, True]
+    path = by_hand(tmp_path / "a.mcap", [{}, {"terminals": flags}, {"timeouts": [True, False, False, False]}])
+    finding = found(examine(path), "flags-inside")
+    assert (finding.severity, finding.count, places(finding)) == (ERROR, 2, [(1, 1), (2, 0)])
+    assert examine(by_hand(tmp_path / "b.mcap", [{}, {}])).of("flags-inside") == ()
+
+
+def test_missing_final_states(tmp_path: Path) -> None:
+    timeout = {"terminals": [False] * 4, "timeouts": [False, False, False, True]}
+    path = by_hand(tmp_path / "a.mcap", [{}, {"final_state": None}, {**timeout, "final_state": None}])
+    finding = found(examine(path), "missing-final-state")
+    assert (finding.severity, finding.count, places(finding)) == (WARNING, 2, [(2, None)])
+    path = by_hand(tmp_path / "b.mcap", [{"final_state": None}, timeout])
+    assert found(examine(path), "missing-final-state").severity is INFO
+
+
+def test_episodes_of_unusual_length(tmp_path: Path) -> None:
+    path = by_hand(tmp_path / "a.mcap", [{"length": 1500 if i == 4 else 12} for i in range(20)])
+    finding = found(examine(path), "episode-length")
+    assert (finding.severity, finding.count, places(finding)) == (INFO, 1, [(4, None)])
+    assert finding.message.endswith("longer than 100 times the median of 12 steps; the longest has 1,500")
+
+
+# --- copies ---
+
+
+def test_duplicate_episodes_across_recordings(tmp_path: Path) -> None:
+    first = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 200, seed=1)
+    second = record(tmp_path / "b.mcap", gym.make("CartPole-v1"), 60, seed=1)
+    third = record(tmp_path / "c.mcap", gym.make("CartPole-v1"), 60, seed=2)
+    with Recording(second) as recording:
+        whole = int((recording.index["end"] != 2).sum())
+    diagnosis = examine([first, second, third])
+    finding = found(diagnosis, "duplicate-episodes")
+    assert (finding.severity, finding.count, finding.total) == (WARNING, whole, diagnosis.episodes)
+    assert finding.places == (Place(str(first), 0), Place(str(second), 0))
+    assert f"{whole} of them across recordings" in finding.message
+    assert examine([first, third]).of("duplicate-episodes") == ()
+
+
+def test_duplicates_by_chance_are_no_warning(tmp_path: Path) -> None:
+    def observe(n: int) -> Any:
+        return n % 4
+
+    for length, severity in ((5, INFO), (60, WARNING)):
+        path = scripted(tmp_path / f"{length}.mcap", observe, spaces.Discrete(4), length=length)
+        finding = found(examine(path), "duplicate-episodes")
+        assert (finding.severity, finding.count, finding.total) == (severity, 2, 3)
+        assert places(finding) == [(0, None), (1, None), (2, None)]
+
+
+@pytest.mark.parametrize("block_bytes", [1, 500])
+def test_digests_do_not_depend_on_blocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
+) -> None:
+    space = spaces.Dict({"x": UNIT, "note": spaces.Text(4), "cam": spaces.Box(0, 255, (2, 2, 3), np.uint8)})
+
+    def observe(n: int) -> Any:
+        return {"x": still(n), "note": "ab"[n % 2], "cam": np.full((2, 2, 3), n, np.uint8)}
+
+    path = scripted(tmp_path / "a.mcap", observe, space, length=20)
+    whole = examine(path)
+    monkeypatch.setattr("tupli_mcap.doctor.blocks.BLOCK_BYTES", block_bytes)
+    assert examine(path) == whole
+    assert found(whole, "duplicate-episodes").count == 2
+
+
+def test_repeated_seeds(tmp_path: Path) -> None:
+    def seeded(path: Path, seeds: list[int | None]) -> Path:
+        return by_hand(path, [{"seed": seed} for seed in seeds])
+
+    finding = found(examine(seeded(tmp_path / "a.mcap", [7, 7, 1, 7])), "repeated-seed")
+    assert (finding.severity, finding.count, places(finding)) == (
+        WARNING,
+        3,
+        [(0, None), (1, None), (3, None)],
+    )
+    finding = found(examine(seeded(tmp_path / "b.mcap", [1, 2, 3, 1, 2, 3])), "repeated-seed")
+    assert (finding.severity, finding.count) == (INFO, 2)
+    assert examine(seeded(tmp_path / "c.mcap", [1, 2, None, None])).of("repeated-seed") == ()
+
+
+# --- rewards ---
+
+
+def test_constant_rewards(tmp_path: Path) -> None:
+    path = scripted(tmp_path / "a.mcap", reward=lambda n: 0.0, episodes=10)
+    finding = found(examine(path), "constant-reward")
+    assert (finding.severity, finding.message) == (INFO, "all 100 rewards are 0")
+    strict = examine(path, thresholds={"constant-reward": {"zero_steps": 100}})
+    assert found(strict, "constant-reward").severity is WARNING
+
+
+def test_reward_outliers(tmp_path: Path) -> None:
+    rewards = [[1.0] * 10 for _ in range(10)]
+    rewards[3][4], rewards[7][0] = 1e6, -1e5
+    path = by_hand(tmp_path / "a.mcap", [{"length": 10, "rewards": r} for r in rewards])
+    finding = found(examine(path), "reward-outliers")
+    assert (finding.severity, finding.count, places(finding)) == (WARNING, 2, [(3, 4), (7, 0)])
+    assert (finding.total, finding.leaf) == (90, "reward")
+    assert "the furthest is 1e+06" in finding.message
+
+
+@pytest.mark.parametrize("bonus", [1.0, 100.0, -1000.0])
+def test_a_bonus_at_the_end_is_no_outlier(tmp_path: Path, bonus: float) -> None:
+    rng = np.random.default_rng(0)
+    episodes = [{"length": 10, "rewards": [*rng.normal(size=9), bonus if i % 7 else 0.0]} for i in range(30)]
+    assert examine(by_hand(tmp_path / "a.mcap", episodes)).of("reward-outliers") == ()
+
+
+def test_return_outliers(tmp_path: Path) -> None:
+    totals = [*range(30), 10_000]
+    path = by_hand(tmp_path / "a.mcap", [{"rewards": [0.0, 0.0, 0.0, float(r)]} for r in totals])
+    finding = found(examine(path), "return-outliers")
+    assert (finding.severity, finding.count, places(finding)) == (INFO, 1, [(30, None)])
+
+
+# --- actions ---
+
+
+@pytest.mark.parametrize(
+    ("space", "act", "unused", "dimension"),
+    [
+        (spaces.Discrete(4, start=-1), lambda n: n % 3 - 1, "2", ()),
+        (spaces.MultiDiscrete([3, 4]), lambda n: np.array([n % 3, 1 + n % 3]), "0", ((1,),)),
+        (spaces.MultiBinary(2), lambda n: np.int8([1, n % 2]), "0", ((0,),)),
+    ],
+)
+def test_actions_that_never_occur(
+    tmp_path: Path, space: gym.Space[Any], act: Callable[[int], Any], unused: str, dimension: Any
+) -> None:
+    path = scripted(tmp_path / "a.mcap", actions=space, act=act, episodes=10)
+    finding = found(examine(path), "unused-action")
+    assert (finding.severity, finding.leaf, finding.count) == (WARNING, "action", 1)
+    assert finding.message.endswith(f"never occurs in 100 steps: {unused}")
+    assert finding.dimensions == dimension
+    few = scripted(tmp_path / "b.mcap", actions=space, act=act, episodes=3)
+    assert examine(few).of("unused-action") == ()
+
+
+def test_one_action_nearly_always(tmp_path: Path) -> None:
+    act = [1] * 999 + [0]
+    path = scripted(tmp_path / "a.mcap", act=lambda n: act[n], actions=spaces.Discrete(2), length=1000)
+    finding = found(examine(path), "action-imbalance")
+    assert (finding.severity, finding.count, finding.total) == (INFO, 2997, 3000)
+    assert finding.message == "the action is 1 in 99.9% of 3,000 steps"
+
+
+def test_continuous_actions_at_bounds_and_in_a_corner(tmp_path: Path) -> None:
+    def act(n: int) -> Any:
+        return np.float32([1 if n else 0, 1 if n % 2 else -1, 0.01 * np.sin(n), np.sin(n)])
+
+    space = spaces.Box(-1, 1, (4,), np.float32)
+    diagnosis = examine(scripted(tmp_path / "a.mcap", act=act, actions=space, length=100))
+    finding = found(diagnosis, "saturated-action")
+    assert (finding.severity, finding.dimensions) == (WARNING, ((0,), (1,)))
+    assert finding.count == 3 * 99 + 3 * 100
+    finding = found(diagnosis, "action-range")
+    assert (finding.severity, finding.dimensions) == (INFO, ((2,),))
+    assert "use 1% of their range" in finding.message
+
+
+# --- clocks ---
+
+
+class Clock:
+    """The wall clock, and what is added to it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        import time
+
+        self.now = 1_700_000_000 * 10**9
+        monkeypatch.setattr(time, "time_ns", lambda: self.now)
+
+
+@pytest.mark.parametrize(("seconds", "severity"), [(2, INFO), (3600, WARNING)])
+def test_clock_jumps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: int, severity: Severity
+) -> None:
+    clock = Clock(monkeypatch)
+
+    def observe(n: int) -> Any:
+        clock.now += seconds * 10**9 if n == 7 else 10**6
+        return still(n)
+
+    finding = found(examine(scripted(tmp_path / "a.mcap", observe)), "clock-jump")
+    assert (finding.severity, finding.count, finding.total) == (severity, 3, 27)
+    assert places(finding) == [(0, 6), (1, 6), (2, 6)]
+    assert "the median is 1.0 ms" in finding.message
+
+
+def test_a_clock_that_was_set_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch)
+    calls = iter(range(1000))
+
+    def observe(n: int) -> Any:
+        clock.now += 10**6 - (12 * 10**6 if next(calls) == 25 else 0)
+        return still(n)
+
+    diagnosis = examine(scripted(tmp_path / "a.mcap", observe, length=60))
+    finding = found(diagnosis, "clock-held")
+    assert (finding.severity, finding.count, places(finding)) == (WARNING, 12, [(0, 24)])
+    assert finding.message.startswith("13 steps in a row have the same time")
+    assert diagnosis.of("clock-jump") == ()
+
+
+def test_times_that_were_never_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch)
+    clock.now = 10**9
+    diagnosis = examine(scripted(tmp_path / "a.mcap", length=12))
+    assert found(diagnosis, "clock-held").severity is INFO
+    finding = found(diagnosis, "clock-unset")
+    assert (finding.severity, finding.count) == (WARNING, 3)
+
+
+# --- files ---
+
+
+def test_empty_unfinished_and_unreadable_files(tmp_path: Path) -> None:
+    (tmp_path / "text.mcap").write_text("no recording")
+    good = record(tmp_path / "good.mcap", gym.make("CartPole-v1"), 50)
+    with Recording(good) as recording:
+        rewrite_recording(recording, tmp_path / "empty.mcap", episodes=[])
+    data = good.read_bytes()
+    (tmp_path / "zdamaged.mcap").write_bytes(data[:3000] + bytes([data[3000] ^ 255]) + data[3001:])
+    diagnosis = examine(tmp_path)
+    assert diagnosis.files == 4
+    assert found(diagnosis, "no-episodes").path == str(tmp_path / "empty.mcap")
+    bad = diagnosis.of("unreadable")
+    assert [Path(finding.path).name for finding in bad] == ["text.mcap", "zdamaged.mcap"]
+    assert all(finding.severity is ERROR for finding in bad)
+    assert diagnosis.steps == 50
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "live.mcap") as env:
+        env.reset(seed=1)
+        env.step(0)
+        assert found(examine(tmp_path / "live.mcap"), "unfinished").message == "a writer is at work on it"
+    assert examine(tmp_path / "live.mcap").of("unfinished") == ()
+
+
+def test_nan_in_metadata(tmp_path: Path) -> None:
+    path = by_hand(tmp_path / "a.mcap", [{}, {"metadata": {"score": np.nan}}, {"metadata": {"score": 1.0}}])
+    finding = found(examine(path), "metadata-nan")
+    assert (finding.severity, finding.count, places(finding)) == (WARNING, 1, [(1, None)])
+
+
+# --- what can be examined ---
+
+
+def test_every_kind_of_source(tmp_path: Path) -> None:
+    storage = FileStorage(tmp_path / "lab")
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), storage=storage)
+    env.store(name="cartpole")
+    roll(env, 200)
+    env.close()
+    (path,) = (tmp_path / "lab").rglob("*.mcap")
+    headers = storage.list_episodes()
+    whole = examine(path)
+    assert (whole.episodes, whole.steps) == (len(headers), 200)
+    for source in (
+        str(path),
+        tmp_path / "lab",
+        [path],
+        storage,
+        TupliDataset(storage),
+        TupliDataset.from_files(path),
+    ):
+        assert examine(source).steps == 200
+    with Recording(path) as recording:
+        assert examine(recording) == whole
+        assert recording.episodes[0].rewards[0] == 1  # it stays open
+    long = F("n_tuples") > 20
+    wanted = [header.n_tuples for header in headers if header.n_tuples > 20]
+    assert 0 < len(wanted) < len(headers)
+    for source in (path, storage, TupliDataset(storage)):
+        part = examine(source, episode_filter=long)
+        assert (part.episodes, part.steps) == (len(wanted), sum(wanted))
+    chosen = TupliDataset(storage).with_episode_filter(long)
+    assert examine(chosen).steps == sum(wanted)
+    storage.delete_episode(headers[0].id)
+    assert examine(path).episodes == len(headers) - 1
+
+
+def test_what_cannot_be_examined(tmp_path: Path) -> None:
+    missing = examine(tmp_path / "missing.mcap")
+    assert found(missing, "unreadable").message.startswith(f"{tmp_path / 'missing.mcap'} does not exist")
+    assert "holds no recording" in found(examine(tmp_path), "unreadable").message
+    with pytest.raises(RecordingError, match="expected a path, Recording, TupliDataset or storage, found 3"):
+        examine(3)  # type: ignore[arg-type]
+    with pytest.raises(RecordingError, match="there is no check 'nam'; there are no-episodes, "):
+        examine(tmp_path, checks=["nam"])
+    with pytest.raises(RecordingError, match="'nan' has no threshold 'least'; it has none"):
+        examine(tmp_path, thresholds={"nan": {"least": 3}})
+    with pytest.raises(RecordingError, match="list of the ids of checks"):
+        examine(tmp_path, checks="nan")
+
+
+def test_checks_are_chosen_and_documented(tmp_path: Path) -> None:
+    path = scripted(tmp_path / "a.mcap", lambda n: np.float32([0, 0, np.nan]), episodes=10)
+    everything = {finding.check for finding in examine(path).findings}
+    assert {"nan", "constant-dimension", "duplicate-episodes"} <= everything
+    assert {f.check for f in examine(path, checks=["nan"]).findings} == {"nan"}
+    assert {f.check for f in examine(path, skip=["nan"]).findings} == everything - {"nan"}
+    for name, check in CHECKS.items():
+        assert check.id == name and len(check.summary) < 60
+        assert len(check.explanation) > 20
+
+
+# --- the command ---
+
+
+def run(*args: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["doctor", *map(str, args)])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout
+
+
+def test_command_exit_codes(tmp_path: Path) -> None:
+    good = record(tmp_path / "good.mcap", gym.make("CartPole-v1"), 50)
+    warned = scripted(tmp_path / "warned.mcap", lambda n: np.float32([9, 0, n / 10]))
+    bad = scripted(tmp_path / "bad.mcap", lambda n: np.float32([0, 0, np.nan]))
+    code, out = run(good)
+    assert code == 0 and out.splitlines()[-1].startswith("healthy")
+    for path, codes in ((good, (0, 0, 0)), (warned, (0, 1, 0)), (bad, (1, 1, 0))):
+        assert tuple(run(path, "--fail-on", level)[0] for level in ("error", "warning", "never")) == codes
+    assert run(bad, "--skip", "nan")[0] == 0
+    assert run(bad, "--check", "outside-space", "--fail-on", "warning")[0] == 0
+    assert run(tmp_path / "missing.mcap", "--fail-on", "never")[0] == 1
+    assert run(bad, "--check", "nam")[0] == 2
+    assert run(bad, "--filter", "nonsense = 1")[0] == 2
+    assert run(bad, "--filter", "n_tuples > 10")[0] == 0
+
+
+def test_command_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "data").mkdir()
+    monkeypatch.chdir(tmp_path / "data")
+    for name in ("a", "b"):
+        scripted(Path(f"{name}.mcap"), lambda n: np.float32([np.sin(n), 0.5, np.nan if n == 4 else 0]))
+    Path("c.mcap").write_text("no recording")
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out = run()
+    assert code == 1
+    assert out.startswith(
+        "error    nan · state\n"
+        "         a.mcap:\n"
+        "         3 of 99 values are NaN in dimension 2\n"
+        "         at episode:step 0:4, 1:4, 2:4\n"
+        "         also in b.mcap\n"
+        "         → drop these episodes, or find the division or sensor that made it\n\n"
+        "error    unreadable\n"
+        "         c.mcap: expected an MCAP file, found b'no recor"
+    )
+    assert max(map(len, out.splitlines())) <= 80
+    assert out.endswith(": 3 recordings, 6 episodes, 60 steps\n")
+    assert "duplicate" in out and "duplicate" not in run("--level", "error")[1]
+    code, text = run("--json")
+    document = json.loads(text)
+    assert code == 1 and document == examine(".").to_dict()
+    assert list(document) == ["version", "healthy", "worst", "files", "episodes", "steps", "findings"]
+    assert document["findings"][0] == {
+        "check": "nan",
+        "severity": "error",
+        "path": "a.mcap",
+        "message": "3 of 99 values are NaN in dimension 2",
+        "suggestion": "drop these episodes, or find the division or sensor that made it",
+        "leaf": "state",
+        "dimensions": [[2]],
+        "count": 3,
+        "total": 99,
+        "places": [{"path": "a.mcap", "episode": i, "step": 4} for i in range(3)],
+    }
+    assert run("--list")[1].count("\n") == len(CHECKS) + 1
+    listed = json.loads(run("--list", "--json")[1])
+    assert [check["id"] for check in listed] == list(CHECKS)
+    assert {"frames": 30} in [check["thresholds"] for check in listed]

@@ -1,0 +1,203 @@
+"""The command doctor: recorded data as someone sees it who is about to train on it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tupli_mcap.cli.options import FilterText, Json, filter_of
+from tupli_mcap.cli.output import Column, number, print_json, print_table, short_ids, terminal_width, visible
+
+if TYPE_CHECKING:
+    from tupli_mcap.doctor import Diagnosis, Finding, Severity
+
+__all__ = ["register"]
+
+_INDENT = 9  # columns: the longest severity and a gap
+_OTHERS = 3  # recordings with the same finding that are named
+_WIDEST = 100  # columns: longer lines are hard to read
+_STYLES = {"error": "bold red", "warning": "bold yellow", "info": "bold blue"}
+
+
+class _Level(StrEnum):
+    error = "error"
+    warning = "warning"
+    info = "info"
+
+
+class _FailOn(StrEnum):
+    error = "error"
+    warning = "warning"
+    never = "never"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command("doctor")(_doctor)
+
+
+def _doctor(
+    paths: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[PATH]...", help="Recordings, directories, storages, URLs; here by default."),
+    ] = None,
+    filter_text: FilterText = None,
+    fail_on: Annotated[
+        _FailOn, typer.Option(help="Exit with 1 if there is a finding as bad as this.")
+    ] = _FailOn.error,
+    level: Annotated[_Level, typer.Option(help="Print findings as bad as this, or worse.")] = _Level.info,
+    check: Annotated[
+        list[str] | None, typer.Option("--check", metavar="ID", help="Run only this check (repeatable).")
+    ] = None,
+    skip: Annotated[
+        list[str] | None, typer.Option("--skip", metavar="ID", help="Leave this check out (repeatable).")
+    ] = None,
+    list_checks: Annotated[bool, typer.Option("--list", help="List the checks instead.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Look at recorded data before training on it.
+
+    Finds NaN and infinities, values outside their space, dimensions that never change, odd episodes and
+    endings, duplicates, reward outliers, clock jumps, actions that never occur.
+
+    An error is wrong data, a warning is probably wrong, info is worth knowing. Exit code 1 if there is an
+    error (see --fail-on) or a file that cannot be read; the others are examined all the same.
+    """
+    from tupli_mcap.doctor import CHECKS, Severity, examine
+
+    if list_checks:
+        _print_checks(as_json)
+        return
+    for name in [*(check or ()), *(skip or ())]:
+        if name not in CHECKS:
+            raise typer.BadParameter(f"there is no check {name!r}; see tupli-mcap doctor --list")
+    with _status() as progress:
+        diagnosis = examine(
+            paths or ["."],
+            checks=check,
+            skip=skip or (),
+            episode_filter=filter_of(filter_text),
+            progress=progress,
+        )
+    if as_json:
+        print_json(diagnosis.to_dict())
+    else:
+        _print(diagnosis, Severity[level.name.upper()])
+    failing = diagnosis.of("unreadable")
+    if fail_on is not _FailOn.never:
+        failing += diagnosis.at_least(Severity[fail_on.name.upper()])
+    if failing:
+        raise typer.Exit(1)
+
+
+def _print_checks(as_json: bool) -> None:
+    from tupli_mcap.doctor import CHECKS
+
+    if as_json:
+        fields = ("id", "summary", "explanation", "thresholds")
+        print_json([{name: getattr(check, name) for name in fields} for check in CHECKS.values()])
+        return
+    rows = [(check.id, check.summary) for check in CHECKS.values()]
+    print_table((Column("CHECK"), Column("FINDS", shrink="end")), rows, empty="")
+
+
+@contextmanager
+def _status() -> Iterator[Callable[[str], None] | None]:
+    """Gives a function that shows the name of a recording; None where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    with Console(stderr=True).status("") as status:
+        yield lambda name: status.update(
+            Text(f"examining {visible(name)}", overflow="ellipsis", no_wrap=True)
+        )
+
+
+def _print(diagnosis: Diagnosis, level: Severity) -> None:
+    several = diagnosis.files > 1
+    groups: dict[tuple[object, ...], list[Finding]] = {}
+    for finding in diagnosis.at_least(level):
+        # What recordings have in common is told once; why a file cannot be read, of each.
+        own = finding.path if finding.check == "unreadable" else ""
+        groups.setdefault((finding.severity, finding.check, finding.leaf, own), []).append(finding)
+    for group in groups.values():
+        _print_group(group, several)
+        print()
+    counts = [
+        f"{number(count)} {name}{'s' if count != 1 and name != 'info' else ''}"
+        for name in ("error", "warning", "info")
+        if (count := sum(str(finding.severity) == name for finding in diagnosis.findings))
+    ]
+    files, episodes, steps = (
+        f"{number(count)} {noun}{'' if count == 1 else 's'}"
+        for count, noun in (
+            (diagnosis.files, "recording"),
+            (diagnosis.episodes, "episode"),
+            (diagnosis.steps, "step"),
+        )
+    )
+    verdict = "healthy" if diagnosis.healthy else ""
+    print(f"{', '.join([*([verdict] if verdict else []), *counts])}: {files}, {episodes}, {steps}")
+
+
+def _print_group(group: Sequence[Finding], several: bool) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
+    first = group[0]
+    severity = str(first.severity)
+    title = visible(" · ".join([first.check, *([] if first.leaf is None else [first.leaf])]))
+    line = Text(f"{severity:<{_INDENT}}", _STYLES[severity]).append(title, "bold")
+    Console(highlight=False, soft_wrap=True).print(line)
+    if several and first.check != "unreadable":  # which names the file itself
+        _print_wrapped(f"{short_ids(first.path)}:")
+    _print_wrapped(first.message)
+    if first.places:
+        _print_wrapped(_at(first))
+    others = list(dict.fromkeys(finding.path for finding in group if finding.path != first.path))
+    if others:
+        names = ", ".join(short_ids(path) for path in others[:_OTHERS])
+        more = f", and {len(others) - _OTHERS} more" if len(others) > _OTHERS else ""
+        _print_wrapped(f"also in {names}{more}")
+    _print_wrapped(f"→ {first.suggestion}", hang=2)
+
+
+def _at(finding: Finding) -> str:
+    """The places in short: `at episode:step 3:5, 4:0, ...`, `in episode 3, 4`; foreign recordings are named."""
+    steps = finding.places[0].step is not None
+    texts = []
+    for place in finding.places:
+        number = f"{place.episode}:{place.step}" if steps else f"{place.episode}"
+        texts.append(number if place.path == finding.path else f"{number} of {short_ids(place.path)}")
+    if finding.count > len(texts):
+        texts.append("...")
+    return f"{'at episode:step' if steps else 'episode'} {', '.join(texts)}"
+
+
+def _print_wrapped(text: str, hang: int = 0) -> None:
+    import textwrap
+
+    width = terminal_width()
+    indent = " " * _INDENT
+    if width is None:
+        print(indent + visible(text))
+        return
+    room = max(30, min(width, _WIDEST))
+    print(
+        textwrap.fill(
+            visible(text),
+            room,
+            initial_indent=indent,
+            subsequent_indent=indent + " " * hang,
+            break_on_hyphens=False,
+            break_long_words=False,
+        )
+    )

@@ -1,0 +1,116 @@
+"""A recording in blocks: whole episodes, or a part of a long one, so that memory stays bounded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Columns, Recording
+
+__all__ = ["Array", "Block", "blocks"]
+
+Array = np.ndarray[Any, Any]
+
+BLOCK_BYTES = 8 << 20
+_VARIABLE_STEP_BYTES = 2048  # a guess, for steps of variable size
+_FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "times")
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive steps of some episodes.
+
+    rows: the index rows of the episodes. lengths: how many steps of each are here (int64). first_step: where the
+    block begins in its first episode; other than 0 only if it is the one episode of the block. whole: the block
+    holds its episodes to their ends. finals: the final states, by leaf name, of the episodes `finals_of` (positions
+    in `rows`) that end in this block.
+    """
+
+    layout: StepLayout
+    rows: Array
+    lengths: Array
+    first_step: int
+    whole: bool
+    columns: Columns
+    finals: dict[str, Any]
+    finals_of: Array
+
+    def __len__(self) -> int:
+        return int(self.lengths.sum())
+
+    @cached_property
+    def leaves(self) -> dict[str, Any]:
+        """The columns by leaf name: an array (steps, *shape), or a list where a leaf is of variable size."""
+        groups = (
+            (self.layout.state, self.columns.states),
+            (self.layout.action, self.columns.actions),
+            (self.layout.reward, self.columns.rewards),
+        )
+        return {leaf.name: leaf.get(columns) for group, columns in groups for leaf in group}
+
+    @cached_property
+    def starts(self) -> Array:
+        """Where each episode begins in the columns (int64)."""
+        return np.cumsum(self.lengths) - self.lengths
+
+    @cached_property
+    def ends(self) -> Array:
+        """The last step of each episode in the columns (int64)."""
+        return np.cumsum(self.lengths) - 1
+
+    def place(self, step: int) -> tuple[int, int]:
+        """The episode's number and the step in it, of a step of the columns."""
+        at = int(np.searchsorted(self.starts, step, side="right")) - 1
+        return int(self.rows["episode"][at]), int(step - self.starts[at]) + self.first_step
+
+
+def blocks(recording: Recording, positions: Array, *, block_bytes: int = BLOCK_BYTES) -> Iterator[Block]:
+    """The steps of the episodes at some positions, in this order, about `block_bytes` at a time."""
+    if not len(positions):
+        return
+    layout = recording.layout
+    limit = max(1, block_bytes // _step_bytes(layout))
+    lengths = recording.index["length"][positions].astype(np.int64)
+    ends = np.cumsum(lengths)
+    start = 0
+    while start < len(positions):
+        before = int(ends[start - 1]) if start else 0
+        stop = int(np.searchsorted(ends, before + limit, side="right"))
+        if stop <= start:
+            yield from _parts(recording, positions[start : start + 1], int(lengths[start]), limit)
+            start += 1
+            continue
+        chosen = positions[start:stop]
+        columns = recording.read(chosen, fields=_FIELDS)
+        yield _block(recording, chosen, columns, lengths[start:stop], 0, True)
+        start = stop
+
+
+def _parts(recording: Recording, position: Array, length: int, limit: int) -> Iterator[Block]:
+    for first in range(0, length, limit):
+        stop = min(length, first + limit)
+        columns = recording.read_steps(int(position[0]), first, stop, _FIELDS)
+        yield _block(recording, position, columns, np.array([stop - first]), first, stop == length)
+
+
+def _block(
+    recording: Recording, positions: Array, columns: Columns, lengths: Array, first: int, whole: bool
+) -> Block:
+    rows = recording.index[positions]
+    known = np.flatnonzero(rows["final_row"] >= 0) if whole else np.empty(0, np.int64)
+    finals: dict[str, Any] = {}
+    if len(known):
+        nested = recording.final_states(positions[known])
+        finals = {leaf.name: leaf.get(nested) for leaf in recording.layout.state}
+    return Block(recording.layout, rows, lengths, first, whole, columns, finals, known)
+
+
+def _step_bytes(layout: StepLayout) -> int:
+    if not layout.constant:
+        return _VARIABLE_STEP_BYTES
+    return layout.step_message.record_size + sum(leaf.size for leaf in layout.images)

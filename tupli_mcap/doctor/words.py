@@ -1,0 +1,65 @@
+"""Numbers and dimensions as words of a message."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tupli_mcap.doctor.blocks import Array
+from tupli_mcap.messages.leaves import Leaf
+
+__all__ = ["dimension_text", "dimensions", "duration", "plural", "share", "unravel"]
+
+_NAMED = 4  # dimensions that a message names
+_LISTED = 100  # dimensions that a finding lists
+
+
+def share(count: int, total: int) -> str:
+    """A part in percent: `12%`, `0.3%`, `<0.1%`."""
+    percent = 100 * count / total if total else 0.0
+    if 0 < percent < 0.1:
+        return "<0.1%"
+    if percent < 10 or 99 < percent < 100:
+        return f"{math.floor(10 * percent) / 10:g}%"
+    return f"{percent:.0f}%"
+
+
+def plural(count: int, noun: str) -> str:
+    """`1 episode`, `1,200 episodes`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def duration(ns: float) -> str:
+    """A time in a unit that suits it: `850 ns`, `1.5 ms`, `2.0 h`."""
+    for unit, size in (("h", 3600e9), ("min", 60e9), ("s", 1e9), ("ms", 1e6), ("µs", 1e3)):
+        if ns >= size:
+            return f"{ns / size:.1f} {unit}"
+    return f"{ns:.0f} ns"
+
+
+def unravel(leaf: Leaf, chosen: Array) -> tuple[tuple[int, ...], ...]:
+    """The indexes of the chosen elements (bool, C order) of a leaf, at most 100; none for a scalar, or for all."""
+    if leaf.shape == () or chosen.all():
+        return ()
+    indexes = np.argwhere(chosen.reshape(leaf.shape))[:_LISTED]
+    return tuple(tuple(index) for index in indexes.tolist())
+
+
+def dimension_text(leaf: Leaf, chosen: Array) -> str:
+    """` in dimension 3`, ` in 3 of 17 dimensions (0, 4, 5)`; empty where it is all, or a scalar."""
+    text = dimensions(leaf, chosen)
+    return f" in {text}" if text else ""
+
+
+def dimensions(leaf: Leaf, chosen: Array) -> str:
+    """`dimension 3`, `3 of 17 dimensions (0, 4, 5)`; empty where it is all, or a scalar."""
+    indexes = unravel(leaf, chosen)
+    count = int(chosen.sum())
+    if not indexes:
+        return ""
+    texts = [",".join(map(str, index)) if len(index) == 1 else str(index) for index in indexes[:_NAMED]]
+    if count == 1:
+        return f"dimension {texts[0]}"
+    more = ", ..." if count > _NAMED else ""
+    return f"{count:,} of {leaf.size:,} dimensions ({', '.join(texts)}{more})"
