@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.errors import StepError
+from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value, shorten
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import DType, Leaf
@@ -170,6 +170,7 @@ def make_row_encoder(
         pack_state=Struct(head.format).pack_into,
         commit=COMMIT.pack_into,
         time_ns=time.time_ns,
+        refusals=(RecordingError, MemoryError),  # of the chunk of images that the step has filled
         diagnose=lambda action, state, reward, err: _diagnose(layout, action, state, reward, err),
         view=np.frombuffer(buffer, np.uint8),
     )
@@ -193,7 +194,9 @@ def _render(put_lines: Sequence[str], first_lines: Sequence[str], size: int, amo
     return (
         "def put(action, state, reward, terminal, timeout):\n"
         "    offset = cursor.offset\n"
-        "    try:\n" + block(put_lines) + "    except Exception as err:\n"
+        "    try:\n" + block(put_lines) + "    except refusals:\n"
+        "        raise\n"
+        "    except Exception as err:\n"
         "        raise diagnose(action, state, reward, err) from err\n"
         f"    commit(buffer, offset + {SEQUENCE_OFFSET}, cursor.sequence, time_ns())\n"
         "    cursor.sequence += 1\n"

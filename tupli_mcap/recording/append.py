@@ -52,7 +52,6 @@ def resume(writer: RecordingWriter) -> None:
         _restore(writer, contents, source)
     finally:
         source.close()
-    os.lseek(writer.lock.fd, contents.data_end, os.SEEK_SET)
     writer.container.position = contents.data_end
     known = set(contents.attachments)
     new = {name: a for name, a in (writer.options.attachments or {}).items() if name not in known}

@@ -36,6 +36,7 @@ from mcap.records import (
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording.checksums import with_crc
+from tupli_mcap.system import refused
 
 __all__ = ["CHUNK_ROWS", "MAGIC", "Compression", "Container"]
 
@@ -99,13 +100,12 @@ class Container:
         view = memoryview(data)
         try:
             while view:
-                view = view[os.write(self._fd, view) :]
+                view = view[os.pwrite(self._fd, view, start + len(data) - len(view)) :]
         except OSError as err:
             with contextlib.suppress(OSError):  # what stays behind is no whole record, and is not read
                 os.ftruncate(self._fd, start)
-                os.lseek(self._fd, start, os.SEEK_SET)
             raise RecordingError(
-                f"{self._name}: could not write {len(data)} bytes at offset {start}: {err.strerror}; "
+                f"{self._name}: could not write {len(data)} bytes at offset {start}: {refused(err)}; "
                 "what was recorded before stays readable"
             ) from err
         self.position += len(data)

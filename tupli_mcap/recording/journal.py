@@ -16,6 +16,7 @@ import json
 import mmap
 import os
 import struct
+import warnings
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.system import refused
 
 __all__ = [
     "Journal",
@@ -120,13 +122,17 @@ class Journal:
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise RecordingError(
-                f"{path}: expected {size} bytes for the journal, found {err.strerror}; "
-                "free some space or give journal_dir= another place"
+                f"{path}: could not make the journal of {size} bytes: {refused(err)} (journal_dir=)"
             ) from err
 
     def publish(self) -> None:
         """Puts the journal in its place, instead of one that may be there; until then it is not found."""
-        self._temporary.replace(self.path)
+        try:
+            self._temporary.replace(self.path)
+        except OSError as err:
+            with contextlib.suppress(OSError):
+                self._temporary.unlink()
+            raise RecordingError(f"{self.path}: could not put the journal in place: {refused(err)}") from err
 
     def buffer(self, name: str) -> memoryview:
         """The bytes of an area."""
@@ -152,10 +158,19 @@ class Journal:
         self._map.flush()
 
     def close(self, *, unlink: bool) -> None:
-        """Lets go of the map (freed with its last view) and, with `unlink`, removes the file."""
+        """Lets go of the map (freed with its last view) and, with `unlink`, removes the file.
+
+        Warns if it cannot be removed: the recording is finished, and the file of no use.
+        """
         if unlink:
-            with contextlib.suppress(FileNotFoundError):
-                self.path.unlink()
+            try:
+                self.path.unlink(missing_ok=True)
+            except OSError as err:
+                warnings.warn(
+                    f"{self.path}: the recording is finished, but its journal cannot be removed "
+                    f"({err.strerror}); delete it",
+                    stacklevel=2,
+                )
 
 
 def _plan(areas: list[Area], info: Mapping[str, Any]) -> tuple[bytes, dict[str, int], int]:

@@ -18,9 +18,11 @@ import time
 from pathlib import Path
 
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.system import refused
 
 __all__ = ["FileLock", "close_private", "is_locked", "open_private"]
 
+_BUSY = (errno.EAGAIN, errno.EACCES)
 _PATIENCE = 2.0  # seconds to wait for those who only ask whether the writer lives
 _guard = threading.RLock()  # no fork between opening a descriptor and noting it
 _private: set[int] = set()
@@ -98,12 +100,21 @@ class FileLock:
             if self._old >= 0 and isinstance(err, PermissionError):
                 fd, self._old = self._old, -1  # a file that may be written, in a directory that may not
                 return fd
-            hint = f"{err.strerror}; choose a writable place"
+            self._close_old()
+            reason = refused(err)
             if isinstance(err, FileNotFoundError):
-                hint = "its directory does not exist"
-            raise RecordingError(f"{self._shown} cannot be recorded to: {hint}") from err
+                reason = "its directory does not exist; make it"
+            raise RecordingError(f"{self._shown} cannot be recorded to: {reason}") from err
+        try:
+            _lock(fd, self._shown)
+        except BaseException:
+            self._close_old()
+            with contextlib.suppress(OSError):
+                close_private(fd)
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise
         self._temporary = temporary
-        _lock(fd, temporary)
         return fd
 
     def publish(self) -> None:
@@ -122,27 +133,34 @@ class FileLock:
         except FileExistsError as err:
             raise _exists(self._shown) from err
         except OSError as err:
-            raise RecordingError(
-                f"{self._shown} cannot be recorded to: {err.strerror}; choose a writable place"
-            ) from err
+            raise RecordingError(f"{self._shown} cannot be recorded to: {refused(err)}") from err
         self._temporary = None
         self._close_old()
 
     def release(self) -> None:
         """Unlocks and closes, and removes a file that was not published; in a forked child, where the descriptors are
-        closed already, nothing happens."""
+        closed already, nothing happens.
+
+        Raises:
+            RecordingError: a file system that writes late (NFS) has lost something.
+        """
         if self._process != os.getpid():
             return
         temporary, self._temporary = self._temporary, None
         if temporary is not None:
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                temporary.unlink()
         fd, self.fd = self.fd, -1
-        close_private(fd)
         self._close_old()
+        try:
+            close_private(fd)
+        except OSError as err:
+            raise RecordingError(f"{self._shown} could not be closed: {refused(err)}") from err
 
     def _close_old(self) -> None:
         fd, self._old = self._old, -1
-        close_private(fd)
+        with contextlib.suppress(OSError):  # nothing was written to it
+            close_private(fd)
 
 
 def _exists(path: Path) -> RecordingError:
@@ -162,7 +180,8 @@ def _link(temporary: Path, path: Path) -> None:
             raise FileExistsError(errno.EEXIST, "exists", str(path)) from None
         temporary.rename(path)
         return
-    temporary.unlink()
+    with contextlib.suppress(OSError):
+        temporary.unlink()
 
 
 def _open_locked(path: Path, *, hint: str) -> int:
@@ -172,18 +191,20 @@ def _open_locked(path: Path, *, hint: str) -> int:
         except FileNotFoundError as err:
             raise RecordingError(f"{path} cannot be recorded to: it does not exist; {hint}") from err
         except OSError as err:
-            raise RecordingError(
-                f"{path} cannot be recorded to: {err.strerror}; choose a writable place"
-            ) from err
+            raise RecordingError(f"{path} cannot be recorded to: {refused(err)}") from err
         try:
             _lock(fd, path)
-        except BaseException:
-            close_private(fd)
+            if _is_at(fd, path):
+                return fd
+        except BaseException as err:
+            with contextlib.suppress(OSError):
+                close_private(fd)
+            if isinstance(err, OSError):
+                raise RecordingError(f"{path} cannot be recorded to: {refused(err)}") from err
             raise
-        if _is_at(fd, path):
-            return fd
         # it was deleted or replaced between opening and locking: what is written to it would be lost
-        close_private(fd)
+        with contextlib.suppress(OSError):
+            close_private(fd)
 
 
 def _lock(fd: int, path: Path) -> None:
@@ -194,6 +215,8 @@ def _lock(fd: int, path: Path) -> None:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             return
         except OSError as err:
+            if err.errno not in _BUSY:
+                raise RecordingError(f"{path} cannot be locked: {refused(err)}") from err
             if time.monotonic() > deadline or not _try_shared(fd):
                 raise RecordingError(f"{path} is being recorded by another writer; close it first") from err
         time.sleep(0.001)
@@ -203,7 +226,9 @@ def _try_shared(fd: int) -> bool:
     """True if no writer holds the lock."""
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
+    except OSError as err:
+        if err.errno not in _BUSY:
+            raise
         return False
     fcntl.flock(fd, fcntl.LOCK_UN)
     return True
@@ -221,11 +246,18 @@ def _is_at(fd: int, path: Path) -> bool:
 
 
 def is_locked(path: Path) -> bool:
-    """True if a live writer holds the recording."""
-    with contextlib.suppress(OSError):
+    """True if a live writer holds the recording.
+
+    Raises:
+        RecordingError: the system does not say (too many open files, say): there may be one.
+    """
+    try:
         fd = open_private(path, os.O_RDONLY)
         try:
             return not _try_shared(fd)
         finally:
             close_private(fd)
-    return False
+    except (FileNotFoundError, PermissionError):
+        return False
+    except OSError as err:
+        raise RecordingError(f"{path}: cannot tell whether it is being recorded: {refused(err)}") from err

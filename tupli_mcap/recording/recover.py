@@ -17,7 +17,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
@@ -44,6 +44,7 @@ from tupli_mcap.recording.salvage import (
 from tupli_mcap.recording.scan import Scan, is_ours, scan
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import foreign, parse_record, records
+from tupli_mcap.system import refused
 
 __all__ = ["belongs", "define", "find_journal", "head", "misplaced_journal", "recover_contents"]
 
@@ -115,14 +116,23 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
 
 
 def find_journal(source: Source) -> JournalContents | Exception | None:
-    """The journal of an unfinished recording, or why it cannot be read; None where there can be none."""
+    """The journal of an unfinished recording, or why it is of no use; None where there can be none.
+
+    Raises:
+        RecordingError: it is there and the system refuses to give it: without it steps would be missing.
+    """
     if source.path is None:
         return None
     metadata = head(source)
+    path = _journal_of(source.path, metadata)
     try:
-        return read_journal(_journal_of(source.path, metadata))
-    except (OSError, FormatError) as err:
+        return read_journal(path)
+    except (FileNotFoundError, FormatError) as err:
         return err
+    except OSError as err:
+        raise RecordingError(
+            f"{source.name} was not finished, and its journal {path.name} cannot be read: {refused(err)}"
+        ) from err
 
 
 def _journal_of(path: Path, metadata: Mapping[str, str]) -> Path:

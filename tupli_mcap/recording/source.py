@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
+from tupli_mcap.system import refused
 
 __all__ = ["Source", "open_source"]
 
@@ -42,31 +45,50 @@ class PathSource:
         except FileNotFoundError as err:
             raise RecordingError(f"{path} does not exist; give the path of a recording (.mcap)") from err
         except OSError as err:
-            raise RecordingError(f"{path} cannot be opened: {err.strerror}") from err
-        self.size = os.fstat(self._fd).st_size
-        if path.is_dir():
+            raise RecordingError(f"{path} cannot be opened: {refused(err)}") from err
+        try:
+            self.refresh()
+        except BaseException:
             self.close()
-            raise RecordingError(
-                f"{path} is a directory; give a recording (.mcap), or open it as a FileStorage"
-            )
+            raise
 
     def read(self, offset: int, length: int) -> bytes:
         if self._fd < 0:
             raise RecordingError(f"{self.name} is closed; open it again with Recording(...)")
-        data = os.pread(self._fd, length, offset) if offset + length <= self.size else b""
+        data = b""
+        if offset + length <= self.size:
+            data = _refusals_told(self.name, offset, length, lambda: self._read(offset, length))
         if len(data) != length:
             raise FormatError(
                 f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
             )
         return data
 
+    def _read(self, offset: int, length: int) -> bytes:
+        data = os.pread(self._fd, length, offset)
+        while len(data) < length:  # Linux reads at most 2 GiB at once
+            more = os.pread(self._fd, length - len(data), offset + len(data))
+            if not more:
+                break
+            data += more
+        return data
+
     def refresh(self) -> None:
-        self.size = os.fstat(self._fd).st_size
+        try:
+            status = os.fstat(self._fd)
+        except OSError as err:
+            raise RecordingError(f"{self.name} cannot be read: {refused(err)}") from err
+        if stat.S_ISDIR(status.st_mode):
+            raise RecordingError(
+                f"{self.name} is a directory; give a recording (.mcap), or open it as a FileStorage"
+            )
+        self.size = status.st_size
 
     def close(self) -> None:
         if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
+            fd, self._fd = self._fd, -1
+            with contextlib.suppress(OSError):  # nothing was written
+                os.close(fd)
 
     def __del__(self) -> None:
         with contextlib.suppress(AttributeError):
@@ -93,11 +115,14 @@ class FileSource:
                 f"{self.name}: expected {length} bytes at offset {offset}, found the end at {self.size}"
             )
         with self._lock:
-            self._file.seek(offset)
-            data = self._file.read(length)
+            data = _refusals_told(self.name, offset, length, lambda: self._read(offset, length))
         if len(data) != length:
             raise FormatError(f"{self.name}: expected {length} bytes at offset {offset}, found {len(data)}")
         return data
+
+    def _read(self, offset: int, length: int) -> bytes:
+        self._file.seek(offset)
+        return self._file.read(length)
 
     def refresh(self) -> None:
         with self._lock:
@@ -106,6 +131,16 @@ class FileSource:
     def close(self) -> None:
         if self._owned:
             self._file.close()
+
+
+def _refusals_told(name: str, offset: int, length: int, read: Callable[[], bytes]) -> bytes:
+    """What `read` gives; a disk or a connection that fails is no defect of the file."""
+    try:
+        return read()
+    except OSError as err:
+        raise RecordingError(
+            f"{name}: could not read {length} bytes at offset {offset}: {refused(err)}"
+        ) from err
 
 
 def open_source(source: str | os.PathLike[str] | BinaryIO) -> Source:

@@ -36,6 +36,7 @@ from tupli_mcap.recording.logs import EventLog, StepLog
 from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.worker import ChunkWorker
+from tupli_mcap.system import refused
 
 __all__ = ["FORMAT_VERSION", "RECORDING_METADATA", "Mode", "RecordingWriter", "WriterOptions"]
 
@@ -107,8 +108,11 @@ class RecordingWriter:
         self.lock = FileLock(self.path, options.mode)
         try:
             self._open()
-        except BaseException:
-            self.lock.release()
+        except BaseException as err:
+            with contextlib.suppress(RecordingError):
+                self.lock.release()
+            if isinstance(err, OSError):
+                raise RecordingError(f"{self.path} cannot be recorded to: {refused(err)}") from err
             raise
         _live.add(self)
 
@@ -125,7 +129,7 @@ class RecordingWriter:
             os.ftruncate(self.lock.fd, 0)
         except OSError as err:
             raise RecordingError(
-                f"{self.path} cannot be recorded to: {err.strerror}; choose a regular file"
+                f"{self.path} cannot be emptied ({refused(err)}); choose a regular file"
             ) from err
         now = time.time_ns()
         values = {
@@ -169,9 +173,14 @@ class RecordingWriter:
 
     def cut(self) -> None:
         """On append: takes index and summary off the file. Before, nothing in it has changed."""
-        if not self._is_cut:
-            os.ftruncate(self.lock.fd, self.container.position)
-            self._is_cut = True
+        if self._is_cut:
+            return
+        at = self.container.position
+        try:
+            os.ftruncate(self.lock.fd, at)
+        except OSError as err:
+            raise RecordingError(f"{self.path} could not be cut off at offset {at}: {refused(err)}") from err
+        self._is_cut = True
 
     def _areas(self, step_capacity: int = 0) -> list[Area]:
         has_infos = self.channels.info is not None
@@ -376,6 +385,8 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Writes everything recorded so far into chunks (the file still has no summary)."""
+        if self.failed is not None:
+            raise self.failed
         with self.whole:
             self._flush(keep_last=self.start_is_droppable())
 

@@ -1,0 +1,127 @@
+"""Full disks, quotas, failing disks and too many files: one clear error, and everything recorded stays.
+
+A seeded sample of what `tools/faults.py` runs in full.
+"""
+
+from __future__ import annotations
+
+import errno
+import random
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Sampler
+from faults import Faults
+from faulty_recordings import WORKLOADS, Case, calls_of, cases, run_case
+from gymnasium import spaces
+
+from tupli_mcap import RecordEpisodes, Recording, RecordingError
+
+BOX = spaces.Box(-1, 1, (3,), np.float32)
+
+
+def sampler(space: gym.Space[Any] = BOX) -> gym.Env[Any, Any]:
+    return Sampler(space, spaces.Discrete(3), length=5)
+
+
+@pytest.mark.parametrize("name", WORKLOADS)
+def test_the_kth_call_of_a_rollout_fails(tmp_path: Path, name: str) -> None:
+    calls = calls_of(name, tmp_path / "whole")
+    every = list(cases(calls))
+    said = 0
+    for i, case in enumerate(random.Random(name).sample(every, 4)):
+        outcome = run_case(name, tmp_path / str(i), case)
+        assert outcome.hit, case
+        said += outcome.said
+    assert said >= 2  # what is not said is only tidying up
+
+
+def test_the_harness_notices_a_step_that_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tupli_mcap.recording.container import Container
+
+    write = Container.write
+    monkeypatch.setattr(
+        Container, "write", lambda self, data: write(self, data) if self.position < 4000 else None
+    )
+    with pytest.raises((AssertionError, UserWarning), match="steps"):
+        run_case("box", tmp_path, Case(-1, errno.EIO, False))
+
+
+def test_an_image_chunk_that_is_refused_is_no_wrong_step(tmp_path: Path) -> None:
+    space = spaces.Box(0, 255, (8, 8, 3), np.uint8)
+    env = RecordEpisodes(sampler(space), tmp_path / "r.mcap", chunk_size=1000)
+    env.reset()
+    env.step(0)
+    with Faults(tmp_path, 0, errno.ENOSPC, lasting=True)(), pytest.raises(RecordingError) as caught:
+        for _ in range(50):
+            env.step(0)
+    assert str(caught.value).startswith(f"{tmp_path}/r.mcap: could not write ")
+    assert "No space left on device; free some space there" in str(caught.value)
+    with pytest.raises(RecordingError, match="No space left on device"):
+        env.close()
+
+
+def test_a_disk_that_cannot_be_read_is_no_defect(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(sampler(), path) as env:
+        env.reset()
+        for _ in range(5):
+            env.step(0)
+
+    def read() -> None:
+        with Recording(path) as recording:
+            recording.read()
+            list(recording.episodes[0])
+            recording.read_attachment("benchmark.json")
+
+    with Faults(tmp_path)() as whole:
+        read()
+    assert len(whole.calls) > 5
+    for at in range(len(whole.calls)):
+        with Faults(tmp_path, at, errno.EIO)() as faults:
+            if faults and whole.calls[at][0] == "close":  # nothing was written
+                read()
+                continue
+            with pytest.raises(RecordingError, match=r"r\.mcap.* Input/output error; check the disk"):
+                read()
+
+
+def test_a_journal_that_cannot_be_read_is_not_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    live = RecordEpisodes(sampler(), path)
+    live.reset()
+    for _ in range(3):
+        live.step(0)
+    journal = tmp_path / "r.mcap.journal"
+
+    class OnlyTheJournal(Faults):
+        def check(self, kind: str, name: str) -> None:
+            if name == str(journal):
+                super().check(kind, name)
+
+    with (
+        OnlyTheJournal(tmp_path, 0, errno.EMFILE)(),
+        pytest.raises(
+            RecordingError, match=r"its journal r\.mcap\.journal cannot be read: Too many open files"
+        ),
+    ):
+        Recording(path)
+    live.close()
+
+
+def test_opening_to_append_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(sampler(), path) as env:
+        env.reset()
+        env.step(0)
+    before = path.read_bytes()
+    RecordEpisodes(sampler(), path, mode="a").close()
+    assert path.read_bytes() == before
+    env = RecordEpisodes(sampler(), path, mode="a")
+    env.reset()
+    assert Recording(path).complete
+    env.close()
+    assert path.read_bytes() == before
