@@ -501,6 +501,8 @@ class TestFileStorage(StorageContract):
         for one in made:
             storage.delete_episode(one.id)
         assert not (storage.root / made[0].recording).exists()
+        assert list((storage.root / "recordings" / header.id).iterdir()) == []
+        storage.delete_benchmark(header.id)
         assert list((storage.root / "recordings").iterdir()) == []
 
     def test_a_plain_recording_can_be_dropped_in(self, storage: FileStorage) -> None:

@@ -17,7 +17,7 @@ from tupli_mcap import trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
 from tupli_mcap.environment import Snapshot, build, record_environment
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError
-from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, FilterEQ, RLTuple
+from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.common import first_defect
 from tupli_mcap.storage.document import benchmark_hash, facts_about, pack, recording_attachments, unpack
@@ -186,6 +186,10 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     def _open(self) -> RecordEpisodes:
         if self.id is None:
             raise StorageError("this environment is not stored yet: call store(name=...) first")
+        with self.storage.beginning_recording():
+            return self._begin(self.id)
+
+    def _begin(self, benchmark_id: str) -> RecordEpisodes:
         callback = self.metadata_callback
         if callback is not None and self.rl_tuple_cls is not RLTuple:
             callback = Retyped(callback, self.rl_tuple_cls)
@@ -200,13 +204,13 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
                     attachments={},
                     **self._recording_options,
                 )
-        benchmark = self.storage.load_benchmark(self.id)
-        self._path = self.storage.new_recording_path(self.id)
+        benchmark = self.storage.load_benchmark(benchmark_id)
+        self._path = self.storage.new_recording_path(benchmark_id)
         return RecordEpisodes(
             self._tap,
             self._path,
             metadata_callback=callback,
-            benchmark_id=self.id,
+            benchmark_id=benchmark_id,
             attachments=recording_attachments(benchmark.serialized),
             **self._recording_options,
         )
@@ -301,15 +305,13 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             NotFoundError: The benchmark is not stored.
+            StorageError: Its episodes are to be deleted while somebody else records more; nothing is deleted.
         """
         uri = self._stored_id()
         artifacts = unpack(self.storage.load_benchmark(uri).serialized).artifacts
         self._finish()
         self._path = None
-        episodes = 0
-        if delete_episodes:
-            episodes = self.storage.delete_episodes(FilterEQ(key="benchmark_id", value=uri))
-        self.storage.delete_benchmark(uri)
+        episodes = self.storage.delete_benchmark(uri, episodes=delete_episodes)
         self.id = None
         gone: list[str] = []
         kept: dict[str, tuple[str, ...]] = {}

@@ -18,6 +18,7 @@ from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, Storag
 from tupli_mcap.dataset.tuples import Tuples
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage.tuples import anew
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -145,8 +146,12 @@ class TupliDataset:
         Raises:
             SpaceError: the steps of two recordings do not fit into one array; the message says which.
         """
-        self._query.refresh()
-        self._query.read(FIVE)
+
+        def attempt() -> None:
+            self._query.refresh()
+            self._query.read(FIVE)
+
+        anew(attempt)  # episodes that are deleted while they are read are listed no more the next time
 
     # --- what is in it ---
 

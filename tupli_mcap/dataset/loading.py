@@ -13,7 +13,7 @@ from tupli_mcap.dataset.columns import FieldBuilder, check_layouts, pick
 from tupli_mcap.dataset.progress import Progress, progress
 from tupli_mcap.dataset.selection import TupleSelector
 from tupli_mcap.dataset.sources import Source
-from tupli_mcap.errors import StorageError
+from tupli_mcap.errors import NotFoundError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import EpisodeHeader
@@ -61,7 +61,7 @@ def read_columns(
 
     Raises:
         SpaceError: two recordings do not fit into one array.
-        StorageError: an episode is not in its recording any more.
+        NotFoundError: an episode is not in its recording any more.
     """
     total = sum(header.n_tuples for header in headers)
     reader = _Reader(fields, selector, known, total)
@@ -148,7 +148,7 @@ def _positions(recording: Recording, headers: Sequence[EpisodeHeader]) -> tuple[
     gone = np.flatnonzero(positions < 0)
     short = np.flatnonzero(recording.index["length"][positions] < lengths) if not len(gone) else gone
     if len(short):
-        raise StorageError(
+        raise NotFoundError(
             f"{recording.name}: episode {headers[int(short[0])].episode} was listed, but is not there as it "
             "was: the file has been changed since; call load() to list the episodes anew"
         )

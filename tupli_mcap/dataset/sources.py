@@ -132,10 +132,12 @@ class FilesSource:
         files: dict[str, str] = {}  # episode id -> file
         found: list[EpisodeHeader] = []
         for name in self.names:
+            # first: what was deleted may be taken out of the file, and out of the note, meanwhile
+            deleted = set() if "://" in name else Sidecar.read(Path(name)).deleted
             with Recording(name) as recording:
                 if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                     continue
-                headers = list(_episode_headers(recording, name))
+                headers = list(_episode_headers(recording, name, deleted))
             copies = [header for header in headers if header.id in files]
             if copies:
                 warnings.warn(
@@ -180,9 +182,8 @@ def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
     return files
 
 
-def _episode_headers(recording: Recording, name: str) -> Iterator[EpisodeHeader]:
+def _episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:
     """Headers as a storage would list them; `recording` of each is the name the file was opened by."""
-    deleted = set() if recording.path is None else Sidecar.read(recording.path).deleted
     index = recording.index
     times = np.datetime_as_string(index["end_time"].astype("datetime64[ns]"), unit="us", casting="unsafe")
     columns: list[Any] = [

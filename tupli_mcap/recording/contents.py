@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +14,7 @@ from tupli_mcap.recording.checksums import check_crc
 from tupli_mcap.recording.claims import check_chunks
 from tupli_mcap.recording.container import CHUNK_ROWS, Rows
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME, EpisodeIndex
+from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import (
     check_magic,
@@ -32,6 +34,8 @@ _KEYS = (
 _CHANNEL_KEYS = (
     "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields",
 )  # fmt: skip
+_ATTEMPTS = 5
+_PAUSE = 0.01  # seconds: a writer begins, ends or goes on within that
 _VALUES = (
     ("uuid", "32 hexadecimal digits", re.compile("[0-9a-f]{32}")),
     ("created_ns", "a time in decimal digits", re.compile("[0-9]{1,19}")),
@@ -69,11 +73,24 @@ class Contents:
 
 
 def read_contents(source: Source) -> Contents:
-    """Reads a finished file by its summary, another by recovery.
+    """Reads a finished file by its summary, another by recovery; anew if a writer changes it meanwhile.
 
     Raises:
         FormatError: no MCAP file, no recording of ours, or damaged.
     """
+    for _ in range(_ATTEMPTS):
+        size = source.size
+        try:
+            return _read_contents(source)
+        except FormatError:
+            source.refresh()
+            if source.size == size and (source.path is None or not is_locked(source.path)):
+                raise
+        time.sleep(_PAUSE)
+    return _read_contents(source)
+
+
+def _read_contents(source: Source) -> Contents:
     check_magic(source)
     if not has_summary(source):
         from tupli_mcap.recording.recover import find_journal, recover_contents

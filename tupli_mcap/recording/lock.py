@@ -15,12 +15,13 @@ import secrets
 import stat
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.system import refused
 
-__all__ = ["FileLock", "close_private", "is_locked", "open_private"]
+__all__ = ["FileLock", "close_private", "is_locked", "open_private", "writers_kept_out"]
 
 _BUSY = (errno.EAGAIN, errno.EACCES)
 _PATIENCE = 2.0  # seconds to wait for those who only ask whether the writer lives
@@ -184,10 +185,24 @@ def _link(temporary: Path, path: Path) -> None:
         temporary.unlink()
 
 
-def _open_locked(path: Path, *, hint: str) -> int:
+@contextlib.contextmanager
+def writers_kept_out(path: Path) -> Iterator[None]:
+    """Nobody writes to a recording while it is read, replaced or deleted.
+
+    Raises:
+        RecordingError: somebody does, or it is gone.
+    """
+    fd = _open_locked(path, flags=os.O_RDONLY, hint="it was deleted")
+    try:
+        yield
+    finally:
+        close_private(fd)
+
+
+def _open_locked(path: Path, *, flags: int = os.O_RDWR, hint: str) -> int:
     while True:
         try:
-            fd = open_private(path, os.O_RDWR)
+            fd = open_private(path, flags)
         except FileNotFoundError as err:
             raise RecordingError(f"{path} cannot be recorded to: it does not exist; {hint}") from err
         except OSError as err:

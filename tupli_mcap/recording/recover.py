@@ -43,7 +43,7 @@ from tupli_mcap.recording.salvage import (
 )
 from tupli_mcap.recording.scan import Scan, is_ours, scan
 from tupli_mcap.recording.source import Source
-from tupli_mcap.recording.summary import foreign, parse_record, records
+from tupli_mcap.recording.summary import foreign, has_summary, parse_record, records
 from tupli_mcap.system import refused
 
 __all__ = ["belongs", "define", "find_journal", "head", "misplaced_journal", "recover_contents"]
@@ -82,6 +82,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
     found = scan(source)
     if isinstance(journal, Exception):
         if found.channels:  # defined when the journal is there: without them no step has been taken
+            _check_unchanged(source)
             warnings.warn(_missing(source, metadata, journal), UserWarning, stacklevel=6)
         journal = None
     elif journal is not None and not belongs(journal.info, metadata):
@@ -113,6 +114,13 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
             _salvage(source, found, journal, layout, [c.id for c in steps], tail)
         _complete(source, found, layout, [c.id for c in steps], tail, contents)
     return contents
+
+
+def _check_unchanged(source: Source) -> None:
+    """Raises FormatError if the writer has made the journal since it was looked for, or finished the file."""
+    source.refresh()
+    if has_summary(source) or isinstance(find_journal(source), JournalContents):
+        raise FormatError(f"{source.name} was changed while it was read; read it again")
 
 
 def find_journal(source: Source) -> JournalContents | Exception | None:

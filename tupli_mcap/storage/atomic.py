@@ -13,8 +13,9 @@ from types import TracebackType
 from typing import Self
 
 from tupli_mcap.errors import StorageError
+from tupli_mcap.recording.lock import close_private, open_private
 
-__all__ = ["Lock", "LockError", "fill", "os_errors", "write_bytes"]
+__all__ = ["Lock", "LockError", "fill", "locked", "os_errors", "write_bytes"]
 
 
 def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
@@ -66,7 +67,7 @@ class LockError(StorageError):
 
 class Lock:
     """Keeps the other processes and threads out while a block reads, changes and writes. Reentrant in a
-    thread.
+    thread. A forked child does not inherit it.
 
     Raises:
         LockError: The file cannot be opened.
@@ -74,11 +75,17 @@ class Lock:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self._forget()
+
+    def _forget(self) -> None:
+        self._process = os.getpid()
         self._thread_lock = threading.RLock()
         self._depth = 0
         self._fd = -1
 
     def __enter__(self) -> Self:
+        if self._process != os.getpid():  # held by a thread that is not here, perhaps
+            self._forget()
         self._thread_lock.acquire()
         try:
             if self._depth == 0:
@@ -92,8 +99,7 @@ class Lock:
     def _open(self) -> None:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-            fcntl.flock(self._fd, fcntl.LOCK_EX)
+            self._fd = locked(self._path)
         except OSError as err:
             raise LockError(
                 f"cannot change the storage: its lock {str(self._path)!r} cannot be taken: "
@@ -103,10 +109,24 @@ class Lock:
     def __exit__(
         self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._process != os.getpid() or self._fd < 0:
+            return  # the block was entered before the fork, by the parent
         self._depth -= 1
         if self._depth == 0:
-            os.close(self._fd)  # which unlocks it
+            fd, self._fd = self._fd, -1
+            close_private(fd)
         self._thread_lock.release()
+
+
+def locked(path: Path, *, exclusive: bool = True) -> int:
+    """A descriptor that holds the lock of a file (made if it is missing), for `close_private`."""
+    fd = open_private(path, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
+    except BaseException:  # Ctrl-C while waiting
+        close_private(fd)
+        raise
+    return fd
 
 
 def _umask() -> int:

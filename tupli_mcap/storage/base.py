@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +51,12 @@ class TupliStorage(ABC):
         """The benchmarks a filter is true of, oldest first."""
 
     @abstractmethod
-    def delete_benchmark(self, uri: str) -> None:
-        """Delete a benchmark; its episodes and artifacts stay."""
+    def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
+        """Delete a benchmark, and with `episodes` its episodes too; returns how many of them. Artifacts stay.
+
+        Raises:
+            StorageError: `episodes` are to be deleted while somebody records more of them; nothing is deleted.
+        """
 
     @abstractmethod
     def publish_benchmark(self, uri: str, publish_in: str = "global") -> None:
@@ -137,6 +142,11 @@ class TupliStorage(ABC):
     @abstractmethod
     def new_recording_path(self, benchmark_id: str) -> Path:
         """Where a new recording of a stored benchmark may be written; nothing is there yet."""
+
+    def beginning_recording(self) -> AbstractContextManager[object]:
+        """Held from looking up a benchmark until the file to record to is open, so that it is not deleted in
+        between."""
+        return nullcontext()
 
     @abstractmethod
     def ingest(self, path: Path) -> None:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from tupli_mcap import trust as _trust
 from tupli_mcap.environment import EnvironmentRecord, sha256
-from tupli_mcap.errors import FormatError, StepError, StorageError
+from tupli_mcap.errors import FormatError, NotFoundError, StepError, StorageError
 from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
@@ -39,6 +39,7 @@ from tupli_mcap.storage.document import (
 )
 from tupli_mcap.storage.recordings import episode_id
 from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.tuples import anew
 
 if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
@@ -69,10 +70,15 @@ def write(storage: FileStorage, benchmark_id: str, target: Path, filter: BaseFil
     _refuse_existing(target)
     attachments = _attachments(storage, benchmark_id)
     of_benchmark: BaseFilter = FilterEQ(key="benchmark_id", value=benchmark_id)
-    headers = storage.list_episodes(of_benchmark if filter is None else of_benchmark & filter)
-    with os_errors("cannot write the bundle", target), fill(target) as temporary:
-        temporary.unlink()
-        _write_episodes(storage, benchmark_id, headers, temporary, attachments)
+    wanted = of_benchmark if filter is None else of_benchmark & filter
+
+    def attempt() -> None:
+        headers = storage.list_episodes(wanted)
+        with os_errors("cannot write the bundle", target), fill(target) as temporary:
+            temporary.unlink()
+            _write_episodes(storage, benchmark_id, headers, temporary, attachments)
+
+    anew(attempt)
     return target
 
 
@@ -114,8 +120,9 @@ def read(storage: FileStorage, path: Path, *, trust: bool = False) -> str:
             storage.store_artifact(data, metadata)
         if trust:
             _trust.trust(record.digest)
-        storage.store_benchmark(query)
-        _copy(storage, recording, path, header.id)
+        with storage.import_lock:
+            storage.store_benchmark(query)
+            _copy(storage, recording, path, header.id)
     return header.id
 
 
@@ -150,6 +157,7 @@ def from_recording(path: Path, target: Path, storage: FileStorage | None = None)
         StorageError: Something is missing and no storage given, or the file exists or cannot be written.
     """
     _refuse_existing(target)
+    deleted = Sidecar.read(path).deleted  # first: they may be deleted for good meanwhile
     with Recording(path) as recording:
         attachments: Attachments = {}
         if recording.benchmark_id:
@@ -164,7 +172,6 @@ def from_recording(path: Path, target: Path, storage: FileStorage | None = None)
                 attachments = _attachments(storage, recording.benchmark_id)
         else:
             _environment(recording, path)  # refuses a recording that carries none
-        deleted = Sidecar.read(path).deleted
         kept = [int(number) for number in recording.index["episode"] if int(number) not in deleted]
         with os_errors("cannot write the bundle", target), fill(target) as temporary:
             temporary.unlink()
@@ -264,6 +271,8 @@ def _episodes(storage: FileStorage, headers: Sequence[EpisodeHeader]) -> Iterato
         with storage.open_recording(name) as recording:
             positions = {int(number): i for i, number in enumerate(recording.index["episode"])}
             for header in group:
+                if header.episode not in positions:
+                    raise NotFoundError(f"episode {header.id} was deleted meanwhile")
                 episode = recording.episodes[positions[header.episode]]
                 steps = list(episode)
                 yield EpisodeData(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import shutil
 import tempfile
 import weakref
@@ -15,7 +16,12 @@ from sqlalchemy import Connection, Select, delete, func, insert, select
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, split_key
-from tupli_mcap.storage.database import CatalogDamagedError, CatalogUnusableError, Database
+from tupli_mcap.storage.database import (
+    CatalogDamagedError,
+    CatalogMovedError,
+    CatalogUnusableError,
+    Database,
+)
 from tupli_mcap.storage.rows import (
     EpisodeRow,
     RecordingStamp,
@@ -38,7 +44,14 @@ from tupli_mcap.storage.tables import (
     of_one_recording,
 )
 
-__all__ = ["Catalog", "CatalogDamagedError", "CatalogUnusableError", "EpisodeRow", "RecordingStamp"]
+__all__ = [
+    "Catalog",
+    "CatalogDamagedError",
+    "CatalogMovedError",
+    "CatalogUnusableError",
+    "EpisodeRow",
+    "RecordingStamp",
+]
 
 _ROWS_AT_ONCE: Final = 20_000
 _OWN_COLUMNS: Final = ("n_tuples", "env", "end", "episode_return", "seed", "created_at", "created_by")
@@ -65,7 +78,7 @@ class Catalog:
         self._temporary = None if path else tempfile.mkdtemp(prefix="tupli-mcap-")
         self.path = path or Path(self._temporary or "") / "catalog.sqlite"
         self._database = Database(self.path)
-        self._finalizer = weakref.finalize(self, _release, self._database, self._temporary)
+        self._finalizer = weakref.finalize(self, _release, self._database, self._temporary, os.getpid())
         try:
             self._database.open()
         except BaseException:
@@ -76,6 +89,11 @@ class Catalog:
     def is_temporary(self) -> bool:
         """Whether nobody else sees it."""
         return self._temporary is not None
+
+    @property
+    def identity(self) -> tuple[int, int] | None:
+        """Tells the file of the last transaction from others that were at its path."""
+        return self._database.identity
 
     def close(self) -> None:
         """Release the file; closing twice is fine."""
@@ -247,7 +265,7 @@ def _key_statements(name: str, inside: tuple[str, ...], number: int) -> Iterator
     yield f"CREATE INDEX {declared_index(number)} ON {EPISODE.name} ({', '.join(map(_quoted, columns))})"
 
 
-def _release(database: Database, temporary: str | None) -> None:
+def _release(database: Database, temporary: str | None, process: int) -> None:
     database.close()
-    if temporary is not None:
+    if temporary is not None and process == os.getpid():  # not a forked child's
         shutil.rmtree(temporary, ignore_errors=True)

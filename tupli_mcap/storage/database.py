@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+from urllib.parse import quote
 
-from sqlalchemy import URL, Connection, Engine, create_engine, event
+from sqlalchemy import URL, Connection, Dialect, Engine, Pool, create_engine, event
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.schema import CreateIndex, CreateTable
 
 from tupli_mcap.errors import FilterError, StorageError
+from tupli_mcap.recording.lock import close_private
+from tupli_mcap.storage.atomic import locked
 from tupli_mcap.storage.sqlite import register_functions
 from tupli_mcap.storage.tables import APPLICATION_ID, METADATA, VERSION
 
@@ -36,6 +38,10 @@ class CatalogDamagedError(StorageError):
     """The catalog's file is damaged; `Catalog.reset` makes an empty one, to be filled from the recordings."""
 
 
+class CatalogMovedError(StorageError):
+    """The catalog's file was deleted or replaced during a transaction: the next one is on the new file."""
+
+
 class CatalogUnusableError(StorageError):
     """The system does not let the catalog be written: the disk is full, the file is another user's, ..."""
 
@@ -48,9 +54,10 @@ class Database:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._engine = _engine(path)
+        self._engine = _engine(path, lock=_lock_file(path))
         self._lock = threading.Lock()
         self._process = os.getpid()
+        self._inherited: list[Pool] = []  # a parent's connections, which a child must not even close
         self._identity: tuple[int, int] | None = None
         self._closed = False
 
@@ -66,7 +73,8 @@ class Database:
     def close(self) -> None:
         """Close the connections; closing twice is fine."""
         self._closed = True
-        self._engine.dispose(close=self._process == os.getpid())
+        self._leave_parent()
+        self._engine.dispose()
 
     def replace(self) -> None:
         """Put an empty catalog in the file's place."""
@@ -79,28 +87,45 @@ class Database:
 
         Raises:
             StorageError: SQLite refuses, or the catalog is closed.
+            CatalogMovedError: The file was deleted or replaced meanwhile.
             CatalogDamagedError: The file is damaged.
             FilterError: The statement is too large for SQLite.
         """
         with _translated(self.path):
             self._refresh()
-            with self._engine.connect() as connection:
-                if write:
-                    connection.execution_options(tupli_write=True)
-                with connection.begin():
-                    yield connection
+            opened = self._identity
+            try:
+                with self._engine.connect() as connection:
+                    if write:
+                        connection.execution_options(tupli_write=True)
+                    with connection.begin():
+                        yield connection
+            except DBAPIError as err:
+                if _identity(self.path) != opened:
+                    raise CatalogMovedError(f"catalog {str(self.path)!r} was replaced meanwhile") from err
+                raise
+
+    @property
+    def identity(self) -> tuple[int, int] | None:
+        """Tells the file of the last transaction from others that were at its path."""
+        return self._identity
 
     def _refresh(self) -> None:
         if self._closed:
             raise StorageError(f"catalog {str(self.path)!r} is closed")
+        self._leave_parent()
         with self._lock:
-            if self._process != os.getpid():
-                # SQLite forbids to carry a connection over a fork, and to close it in the child.
-                self._engine.dispose(close=False)
-                self._process = os.getpid()
             if _identity(self.path) != self._identity:
                 self._engine.dispose()
                 self._open()
+
+    def _leave_parent(self) -> None:
+        """In a forked child: SQLite forbids to carry a connection over a fork, and to close it in the child."""
+        if self._process != os.getpid():
+            self._process = os.getpid()
+            self._lock = threading.Lock()  # held by a thread that is not here, perhaps
+            self._inherited.append(self._engine.pool)
+            self._engine.dispose(close=False)
 
     def _open(self) -> None:
         try:
@@ -112,7 +137,12 @@ class Database:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if not _is_catalog(self._engine, self.path):
             with _exclusive(self.path):
-                if not _is_catalog(self._engine, self.path):  # else another process was first
+                engine = _engine(self.path)
+                try:
+                    is_there = _is_catalog(engine, self.path)  # another process was first
+                finally:
+                    engine.dispose()
+                if not is_there:
                     self._create()
         self._identity = _identity(self.path)
 
@@ -121,7 +151,7 @@ class Database:
         self._engine.dispose()
         new = self.path.with_name(f"{self.path.name}.new")
         _remove(new)
-        engine = _engine(new)
+        engine = _engine(new, new=True)
         try:
             with engine.connect() as connection, connection.begin():
                 _create_tables(connection)
@@ -134,8 +164,23 @@ class Database:
         self._identity = _identity(self.path)
 
 
-def _engine(path: Path) -> Engine:
-    engine = create_engine(URL.create("sqlite", database=str(path)))
+def _engine(path: Path, *, new: bool = False, lock: Path | None = None) -> Engine:
+    """An engine for a file; each connection is opened while the file is kept from being replaced by `lock`."""
+    # A file that is deleted meanwhile must not come back, empty, without the lock of those who make one.
+    uri = f"file:{quote(str(path))}?mode={'rwc' if new else 'rw'}"
+    engine = create_engine(URL.create("sqlite", database=uri, query={"uri": "true"}))
+
+    @event.listens_for(engine, "do_connect")
+    def _connect(dialect: Dialect, _: object, args: Any, kwargs: Any) -> Any:
+        with contextlib.nullcontext() if lock is None else _shared(lock):
+            connection: Any = dialect.connect(*args, **kwargs)
+            try:
+                # Opens what SQLite keeps beside the file, by name: it would take a new file's for that of the old.
+                connection.execute("PRAGMA schema_version").fetchone()
+            except BaseException:
+                connection.close()
+                raise
+        return connection
 
     @event.listens_for(engine, "connect")
     def _prepare(connection: sqlite3.Connection, _: object) -> None:
@@ -164,7 +209,7 @@ def _is_catalog(engine: Engine, path: Path) -> bool:
             version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
             names = set(connection.exec_driver_sql("SELECT name FROM sqlite_master").scalars())
     except DBAPIError as err:
-        if _is_damage(err):
+        if _is_damage(err) or not path.exists():
             return False
         raise
     return (application, version) == (APPLICATION_ID, VERSION) and names >= set(METADATA.tables)
@@ -181,7 +226,7 @@ def _create_tables(connection: Connection) -> None:
 
 def _remove(path: Path) -> None:
     """Delete a database and what SQLite keeps beside it (which would be taken for the next one's)."""
-    for suffix in ("-wal", "-shm", "-journal", ""):
+    for suffix in ("", "-wal", "-shm", "-journal"):  # the file first: nobody may open it without the others
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
@@ -193,12 +238,32 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
+def _lock_file(path: Path) -> Path:
+    return path.with_name(f"{path.name}.lock")
+
+
 @contextlib.contextmanager
 def _exclusive(path: Path) -> Iterator[None]:
     """Hold the lock of those who create or replace the file."""
-    with path.with_name(f"{path.name}.lock").open("ab") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    fd = locked(_lock_file(path))
+    try:
         yield
+    finally:
+        close_private(fd)
+
+
+@contextlib.contextmanager
+def _shared(lock: Path) -> Iterator[None]:
+    """Keep others from replacing the file. A storage that can only be read has nobody who would."""
+    try:
+        fd = locked(lock, exclusive=False)
+    except OSError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        close_private(fd)
 
 
 @contextlib.contextmanager

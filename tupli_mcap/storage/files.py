@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from tupli_mcap.errors import FormatError, StorageError
+from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording, write_recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
@@ -28,6 +29,7 @@ from tupli_mcap.schema import (
     Episode,
     EpisodeHeader,
     EpisodeItem,
+    FilterEQ,
 )
 from tupli_mcap.storage import bundles
 from tupli_mcap.storage.artifacts import ArtifactFiles
@@ -38,7 +40,7 @@ from tupli_mcap.storage.common import first_defect
 from tupli_mcap.storage.document import declared_spaces, recording_attachments
 from tupli_mcap.storage.handmade import episode_data, episode_spaces
 from tupli_mcap.storage.recordings import RecordingFiles
-from tupli_mcap.storage.tuples import with_tuples
+from tupli_mcap.storage.tuples import anew, with_tuples
 
 __all__ = ["FileStorage"]
 
@@ -69,6 +71,7 @@ class FileStorage(TupliStorage):
         with os_errors("cannot make the storage", self.root):
             self.root.mkdir(parents=True, exist_ok=True)
         self._lock = Lock(self.root / ".lock")
+        self.import_lock = Lock(self.root / ".import.lock")  # two imports of one file would copy it twice
         self._benchmarks = BenchmarkFiles(self.root / "benchmarks", self._lock)
         self._artifacts = ArtifactFiles(self.root / "artifacts", self._lock)
         self._recordings = RecordingFiles(self.root, self._lock, self._settings().declared_keys)
@@ -100,8 +103,28 @@ class FileStorage(TupliStorage):
     def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
         return self._benchmarks.list(filter)
 
-    def delete_benchmark(self, uri: str) -> None:
-        self._benchmarks.delete(uri)
+    def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
+        with self._lock:
+            deleted = 0
+            if episodes:
+                self._refuse_live(uri)
+                deleted = self._recordings.delete(
+                    self._recordings.headers(FilterEQ(key="benchmark_id", value=uri))
+                )
+            self._benchmarks.delete(uri)
+            self._recordings.remove_directory(self.root / "recordings" / uri)
+            return deleted
+
+    def _refuse_live(self, uri: str) -> None:
+        live = self._recordings.live(uri)
+        if live:
+            raise StorageError(
+                f"benchmark {uri} is being recorded to {', '.join(map(str, live[:3]))}: nothing is deleted; "
+                "close that first, or keep the episodes"
+            )
+
+    def beginning_recording(self) -> AbstractContextManager[object]:
+        return self._lock
 
     def publish_benchmark(self, uri: str, publish_in: str = "global") -> None:
         self._benchmarks.publish(uri, publish_in)
@@ -169,8 +192,12 @@ class FileStorage(TupliStorage):
                 benchmark_id=benchmark_id,
                 attachments=recording_attachments(benchmark.serialized),
             )
-        self.ingest(path)
-        return self._recordings.of_recording(path)
+        with self._lock:
+            if not self._benchmarks.exists(benchmark_id):  # deleted meanwhile, with its episodes
+                path.unlink()
+                raise NotFoundError(f"benchmark {benchmark_id} was deleted while an episode was recorded")
+            self.ingest(path)
+            return self._recordings.of_recording(path)
 
     def list_episodes(
         self,
@@ -183,8 +210,13 @@ class FileStorage(TupliStorage):
         for name, number in (("limit", 0 if limit is None else limit), ("offset", offset)):
             if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 1 << 63:
                 raise StorageError(f"expected {name} to be an integer from 0, found {number!r:.80}")
-        headers = self._recordings.headers(filter, limit=limit, offset=offset)
-        return list(with_tuples(headers, self.open_recording)) if include_tuples else headers
+        if not include_tuples:
+            return self._recordings.headers(filter, limit=limit, offset=offset)
+        return anew(
+            lambda: list(
+                with_tuples(self._recordings.headers(filter, limit=limit, offset=offset), self.open_recording)
+            )
+        )
 
     def count_episodes(self, filter: BaseFilter | None = None) -> int:
         return self._recordings.count(filter)
@@ -194,12 +226,11 @@ class FileStorage(TupliStorage):
         return self._recordings.explain(filter)
 
     def delete_episode(self, uri: str) -> None:
-        self._recordings.delete([self._recordings.header(uri)])
+        if not self._recordings.delete([self._recordings.header(uri)]):
+            raise NotFoundError(f"episode {uri} was deleted by somebody else meanwhile")
 
     def delete_episodes(self, filter: BaseFilter) -> int:
-        headers = self._recordings.headers(filter)
-        self._recordings.delete(headers)
-        return len(headers)
+        return self._recordings.delete(self._recordings.headers(filter))
 
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:
         self._recordings.publish(self._recordings.header(uri), publish_in)
@@ -214,7 +245,13 @@ class FileStorage(TupliStorage):
         self._recordings.ingest(path)
 
     def open_recording(self, recording: str) -> Recording:
-        return Recording(self._recordings.path(recording))
+        path = self._recordings.path(recording)
+        try:
+            return Recording(path)
+        except RecordingError as err:
+            if path.exists():
+                raise
+            raise NotFoundError(f"recording {recording!r} was deleted meanwhile") from err
 
     def declare_key(self, key: str) -> None:
         self._recordings.declare_key(key)

@@ -8,15 +8,22 @@ import os
 import re
 import secrets
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
-from tupli_mcap.recording.lock import FileLock, is_locked
+from tupli_mcap.recording.lock import is_locked, writers_kept_out
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, LockError, os_errors
-from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, CatalogUnusableError, RecordingStamp
+from tupli_mcap.storage.catalog import (
+    Catalog,
+    CatalogDamagedError,
+    CatalogMovedError,
+    CatalogUnusableError,
+    RecordingStamp,
+)
 from tupli_mcap.storage.common import LOCAL_USER, published_in
 from tupli_mcap.storage.entries import catalog_rows
 from tupli_mcap.storage.scan import scan, stamp_of
@@ -25,6 +32,8 @@ from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
 __all__ = ["RecordingFiles", "episode_id"]
 
 _LIVE = -1  # in place of a stamp that must not be believed next time
+_ATTEMPTS = 100  # at a catalog that is deleted or replaced again and again
+_T = TypeVar("_T")
 _EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
 
 
@@ -41,6 +50,7 @@ class RecordingFiles:
         self._lock = lock
         self._declared_keys = list(declared_keys)
         self._opened: Catalog | None = None
+        self._synced: tuple[int, int] | None = None  # the catalog that has been brought up to date
         self._warned: set[tuple[str, RecordingStamp]] = set()
 
     def close(self) -> None:
@@ -52,18 +62,30 @@ class RecordingFiles:
 
     def of_recording(self, path: Path) -> list[EpisodeHeader]:
         """The episodes of a recording that has just been ingested, without a look at the others."""
-        relative = path.relative_to(self._root).as_posix()
-        return self._catalog.episodes(FilterEQ(key="recording", value=relative))
+        wanted = FilterEQ(key="recording", value=path.relative_to(self._root).as_posix())
+        with contextlib.suppress(CatalogMovedError):
+            found = self._catalog.episodes(wanted)
+            if found:
+                return found
+        return self.headers(wanted)
 
     def headers(
         self, filter: BaseFilter | None, *, limit: int | None = None, offset: int = 0
     ) -> list[EpisodeHeader]:
-        self.sync()
-        return self._catalog.episodes(filter, limit=limit, offset=offset)
+        return self._settled(lambda: self._catalog.episodes(filter, limit=limit, offset=offset))
 
     def count(self, filter: BaseFilter | None) -> int:
-        self.sync()
-        return self._catalog.count(filter)
+        return self._settled(lambda: self._catalog.count(filter))
+
+    def _settled(self, ask: Callable[[], _T]) -> _T:
+        """What a catalog says that is up to date, and that nobody has put another in the place of since."""
+        for _ in range(_ATTEMPTS):
+            self.sync()
+            with contextlib.suppress(CatalogMovedError):
+                found = ask()
+                if self._catalog.identity == self._synced:
+                    return found
+        raise StorageError(f"the catalog of {str(self._root)!r} is replaced all the time; try again later")
 
     def explain(self, filter: BaseFilter | None) -> str:
         return self._catalog.explain(filter)
@@ -82,7 +104,9 @@ class RecordingFiles:
         match = _EPISODE_ID.match(uri) if isinstance(uri, str) else None
         if match:
             # What the catalog knows already may be out of date in all but where the episode is.
-            found = self._catalog.episodes(FilterEQ(key="id", value=uri), limit=1)
+            found = []
+            with contextlib.suppress(CatalogMovedError):
+                found = self._catalog.episodes(FilterEQ(key="id", value=uri), limit=1)
             if found and self._holds(found[0]):
                 return found[0]
             found = self.headers(FilterEQ(key="id", value=uri), limit=1)
@@ -159,10 +183,10 @@ class RecordingFiles:
 
     def reindex(self) -> None:
         """Forget the catalog and fill it from the files."""
-        self._catalog.reset()
-        self._declare_all(self._catalog)
-        self._warned.clear()
-        self._sync()
+        with contextlib.nullcontext() if self._catalog.is_temporary else self._lock:  # nobody sees half of it
+            self._catalog.reset()
+            self._warned.clear()
+            self._sync()
 
     def ingest(self, path: Path) -> None:
         """Catalogue one recording; a finished one without episodes is removed instead.
@@ -181,17 +205,28 @@ class RecordingFiles:
             if not path.exists():  # without a step, or deleted since
                 self._catalog.remove_recording(relative)
                 return
+            held = -1
             try:
                 held = self._put(relative, path, stamp_of(path))
+            except CatalogMovedError:
+                pass  # the next query fills the new one
             except CatalogUnusableError as err:
                 self._use_temporary(err)
                 held = self._put(relative, path, stamp_of(path))
-            if not held and not is_locked(path):
+            if held == 0:
                 self._remove(relative, path)
 
     def _sync(self) -> None:
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(CatalogMovedError):
+                if self._sync_once():
+                    return
+        raise StorageError(f"the catalog of {str(self._root)!r} is replaced all the time; try again later")
+
+    def _sync_once(self) -> bool:
+        """False if the catalog was replaced meanwhile."""
         if not self._changes():
-            return
+            return True
         # One process at a time: what another one read a moment ago must not replace what is newer.
         with contextlib.nullcontext() if self._catalog.is_temporary else self._lock:
             for relative, path in self._changes().items():
@@ -199,6 +234,7 @@ class RecordingFiles:
                     self._catalog.remove_recording(relative)
                 else:
                     self._try_to_put(relative, path)
+            return self._catalog.identity == self._synced
 
     def _changes(self) -> dict[str, Path | None]:
         """Recordings that the catalog does not know as they are; None for those that are gone.
@@ -206,6 +242,9 @@ class RecordingFiles:
         The latter come first: a file that was moved is no copy of itself.
         """
         known = self._catalog.recordings()
+        if self._catalog.identity != self._synced:
+            self._synced = self._catalog.identity
+            self._declare_all(self._catalog)  # another process may have made it
         with os_errors("cannot list the recordings below", self._root):
             found = sorted(scan(self._root))
         changes: dict[str, Path | None] = dict.fromkeys(known.keys() - {item.relative for item in found})
@@ -267,41 +306,76 @@ class RecordingFiles:
     # --- changes ---
 
     def publish(self, header: EpisodeHeader, group: str) -> None:
-        path = self.path(header.recording)
         with self._lock:
+            path = self.path(header.recording)
             sidecar = Sidecar.read(path)
             groups = sidecar.published_in.get(header.episode, [LOCAL_USER])
             sidecar.published_in[header.episode] = published_in(groups, group)
             sidecar.write(path)  # the next query notices
 
-    def delete(self, headers: Sequence[EpisodeHeader]) -> None:
-        """Delete episodes: by a note beside their recording, or with it where nothing else is left in it."""
+    def delete(self, headers: Sequence[EpisodeHeader]) -> int:
+        """Delete episodes: by a note beside their recording, or with it where nothing else is left in it.
+
+        Returns how many there still were.
+        """
         by_recording: dict[str, set[int]] = {}
         for header in headers:
             by_recording.setdefault(header.recording, set()).add(header.episode)
+        deleted = 0
         for relative, numbers in by_recording.items():
-            with self._lock:
-                self._delete(relative, numbers)
+            with self._lock, contextlib.suppress(NotFoundError):  # somebody else was first
+                deleted += self._delete(relative, numbers)
+        return deleted
 
-    def _delete(self, relative: str, numbers: set[int]) -> None:
+    def _delete(self, relative: str, numbers: set[int]) -> int:
         path = self.path(relative)
         sidecar = Sidecar.read(path)
-        sidecar.deleted |= numbers
         with Recording(path) as recording:
-            left = {int(number) for number in recording.index["episode"]} - sidecar.deleted
-        if left or is_locked(path):
-            sidecar.write(path)  # the next query notices
-            return
-        self._remove(relative, path)
+            there = {int(number) for number in recording.index["episode"]} - sidecar.deleted
+        sidecar.deleted |= numbers
+        # first the note: a crash, or a writer that goes on with the file, must not bring anything back
+        sidecar.write(path)  # the next query notices
+        if there <= numbers:
+            self._remove(relative, path)
+        return len(there & numbers)
 
     def _remove(self, relative: str, path: Path) -> None:
-        with os_errors("cannot delete the recording", path):
-            for gone in (path, journal_path(path), sidecar_path(path)):
-                gone.unlink(missing_ok=True)
-        self._catalog.remove_recording(relative)
-        if path.parent.parent == self._root / "recordings":
+        """Delete a recording, unless somebody is writing to it."""
+        try:
+            with writers_kept_out(path), os_errors("cannot delete the recording", path):
+                with Recording(path) as recording:
+                    left = {int(n) for n in recording.index["episode"]} - Sidecar.read(path).deleted
+                if left:  # somebody has written to it meanwhile
+                    return
+                for gone in (path, journal_path(path), sidecar_path(path)):
+                    gone.unlink(missing_ok=True)
+        except RecordingError:
+            return
+        with contextlib.suppress(CatalogMovedError):
+            self._catalog.remove_recording(relative)
+        self.remove_directory(path.parent)
+
+    def remove_directory(self, directory: Path) -> None:
+        """Remove the directory of a benchmark's recordings if it is empty and the benchmark gone.
+
+        While there is one, somebody may be about to record to it.
+        """
+        if directory.parent != self._root / "recordings":
+            return
+        if not (self._root / "benchmarks" / f"{directory.name}.json").exists():
             with contextlib.suppress(OSError):  # not empty
-                path.parent.rmdir()
+                directory.rmdir()
+
+    def live(self, benchmark_id: str) -> list[Path]:
+        """The recordings of a benchmark that are being written."""
+        found = []
+        for item in sorted(scan(self._root)):
+            path = self._root / item.relative
+            if is_locked(path):
+                with contextlib.suppress(RecordingError, FormatError), Recording(path) as recording:
+                    if recording.benchmark_id == benchmark_id:
+                        found.append(path)
+        return found
 
     def compact(self) -> int:
         """Rewrite the recordings that hold deleted episodes; returns how many bytes that freed.
@@ -312,24 +386,27 @@ class RecordingFiles:
         for item in sorted(scan(self._root)):
             path = self._root / item.relative
             with self._lock:
-                if path.exists() and Sidecar.read(path).deleted and not is_locked(path):
-                    freed += self._compact(path)
+                if not path.exists() or not Sidecar.read(path).deleted:
+                    continue
+                try:
+                    with writers_kept_out(path):  # nobody appends meanwhile
+                        freed += self._compact(path)
+                except RecordingError:
+                    if path.exists() and not is_locked(path):
+                        raise
+                    continue
+                self.ingest(path)
         return freed
 
     def _compact(self, path: Path) -> int:
         sidecar = Sidecar.read(path)
         before = path.stat().st_size
-        writer_lock = FileLock(path, "a")  # nobody appends meanwhile
-        try:
-            with os_errors("cannot rewrite the recording", path), Recording(path) as recording:
-                kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
-                rewrite_recording(recording, path, episodes=kept)
-                journal_path(path).unlink(missing_ok=True)
-        finally:
-            writer_lock.release()
+        with os_errors("cannot rewrite the recording", path), Recording(path) as recording:
+            kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
+            rewrite_recording(recording, path, episodes=kept)
+            journal_path(path).unlink(missing_ok=True)
         groups = {number: sidecar.published_in[number] for number in kept if number in sidecar.published_in}
         Sidecar(published_in=groups).write(path)
-        self.ingest(path)
         return before - path.stat().st_size
 
 
