@@ -113,8 +113,8 @@ def test_reads_what_the_environment_returned(name: str, tmp_path: Path) -> None:
     with Recording(place(name, tmp_path)) as recording:
         assert recording.complete == (name not in UNFINISHED)
         assert_same(list(as_read(recording)), expected(name))
-        number = load_tool().FEATURES
-        assert int(recording.uuid, 16) == 1 + list(number).index(name) or name == "rewritten"
+        number = list(load_tool().FEATURES).index(name)
+        assert int(recording.uuid, 16) == 1 + number or name == "rewritten"
         assert recording.num_steps == sum(len(episode["rewards"]) for episode in expected(name))
 
 

@@ -36,6 +36,7 @@ DIRECTORY = Path(__file__).parents[1] / "tests" / "golden"
 COLUMNS = ("states", "actions", "rewards", "terminals", "timeouts", "infos")
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 1_000_000
+BOOT = "00000000-0000-0000-0000-000000000000"  # none of any machine: what is not shown to be whole does not count
 
 Log = dict[str, Any]
 Observe = Callable[[int, int], Any]
@@ -53,6 +54,7 @@ def made_up_world(number: int) -> Iterator[None]:
         mock.patch("time.time_ns", side_effect=clock),
         mock.patch("uuid.uuid4", return_value=known),
         mock.patch("tupli_mcap.recording.writer.version", return_value="1"),
+        mock.patch("tupli_mcap.recording.writer.boot_id", return_value=BOOT),
         mock.patch("tupli_mcap.recording.rewrite.version", return_value="1"),
     ):
         yield
@@ -368,10 +370,11 @@ def bundle(path: Path) -> list[Log]:
 
 
 def unfinished(path: Path, env: Played) -> list[Log]:
-    """What a killed process leaves: a file without a summary, and its journal."""
+    """What a power loss leaves at the best: a file without a summary, and its journal."""
     with tempfile.TemporaryDirectory() as directory:
         live = Path(directory, path.name)
-        with RecordEpisodes(env, live, compression="none", attachments={}, chunk_size=400) as recorder:
+        options: dict[str, Any] = {"compression": "none", "attachments": {}, "chunk_size": 400}
+        with RecordEpisodes(env, live, durability="step", **options) as recorder:
             roll(recorder, env, [3, 4, 2], action)
             shutil.copy(live, path)
             journal = journal_path(live).read_bytes()

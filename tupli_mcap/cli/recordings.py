@@ -42,6 +42,12 @@ class _Mode(StrEnum):
     a = "a"
 
 
+class _Durability(StrEnum):
+    os = "os"
+    chunk = "chunk"
+    step = "step"
+
+
 class _Compression(StrEnum):
     zstd = "zstd"
     lz4 = "lz4"
@@ -83,6 +89,9 @@ def _record(
     record_info: Annotated[
         bool, typer.Option("--record-info", help="Record the infos of steps too.")
     ] = False,
+    durability: Annotated[
+        _Durability, typer.Option(help="What a power loss leaves: step and chunk wait for the disk.")
+    ] = _Durability.os,
     as_json: Json = False,
 ) -> None:
     """Record rollouts of an environment.
@@ -105,6 +114,7 @@ def _record(
             mode=mode.value,
             compression=compression.value,
             record_info=record_info,
+            durability=durability.value,
             progress=progress,
         )
     if as_json:

@@ -110,10 +110,12 @@ def make_row_encoder(
     cursor: Cursor,
     images: Sequence[ImageSink],
     switch: Callable[[], None],
+    seal: Callable[[int], None] | None = None,
 ) -> RowEncoder:
     """Generates the encoder of a constant layout that writes into `buffer` at `cursor`.
 
-    `images` has a sink for each image leaf; `switch` is called when the row after the last one has been started.
+    `images` has a sink for each image leaf; `switch` is called when the row after the last one has been started;
+    `seal`, if given, with the offset of each committed row.
     """
     message = layout.step_message
     size = message.record_size
@@ -160,12 +162,13 @@ def make_row_encoder(
     if layout.reward_space is not None:
         put_lines.append(f"amount = {source.bind('total', layout.reward_total)}(reward)")
         amount = "amount"
-    text = _render(put_lines, first_lines, size, amount)
+    text = _render(put_lines, first_lines, size, amount, "" if seal is None else "    seal(offset)\n")
     namespace = dict(
         source.names,
         buffer=buffer,
         cursor=cursor,
         switch=switch,
+        seal=seal,
         pack=Struct(shifted.format).pack_into,
         pack_state=Struct(head.format).pack_into,
         commit=COMMIT.pack_into,
@@ -187,7 +190,9 @@ def _shift(head: _Packed, size: int, tail: _Packed) -> _Packed:
     return joined
 
 
-def _render(put_lines: Sequence[str], first_lines: Sequence[str], size: int, amount: str) -> str:
+def _render(
+    put_lines: Sequence[str], first_lines: Sequence[str], size: int, amount: str, committed: str
+) -> str:
     def block(lines: Sequence[str]) -> str:
         return "".join(f"        {line}\n" for line in lines)
 
@@ -199,6 +204,7 @@ def _render(put_lines: Sequence[str], first_lines: Sequence[str], size: int, amo
         "    except Exception as err:\n"
         "        raise diagnose(action, state, reward, err) from err\n"
         f"    commit(buffer, offset + {SEQUENCE_OFFSET}, cursor.sequence, time_ns())\n"
+        f"{committed}"
         "    cursor.sequence += 1\n"
         f"    cursor.total += {amount}\n"
         f"    cursor.offset = offset = offset + {size}\n"

@@ -16,6 +16,7 @@ from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import COMPRESSIONS, Container
 from tupli_mcap.recording.contents import Contents, read_contents
+from tupli_mcap.recording.durability import sync_file
 from tupli_mcap.recording.journal import journal_info, journal_path
 from tupli_mcap.recording.recover import belongs, head, misplaced_journal
 from tupli_mcap.recording.source import PathSource, Source
@@ -49,6 +50,7 @@ def resume(writer: RecordingWriter) -> None:
             raise RecordingError(
                 f"{writer.path} holds episodes of benchmark {found or 'none'!r}, not {asked!r}; record to another file"
             )
+        _check_aligned(writer, contents)
         _restore(writer, contents, source)
     finally:
         source.close()
@@ -62,6 +64,8 @@ def resume(writer: RecordingWriter) -> None:
         writer.container.add_chunk(rows)
     for name, (media_type, data) in new.items():
         writer.container.add_attachment(name, media_type, data, time.time_ns())
+    if contents.tail:  # the journal they come from may have been on the disk, and will be replaced
+        sync_file(writer.lock.fd, str(writer.path))
 
 
 def _check_journal(path: Path, metadata: Mapping[str, str]) -> None:
@@ -99,6 +103,25 @@ def _is_same(path: Path, metadata: Mapping[str, str]) -> bool:
         return False
     finally:
         source.close()
+
+
+def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
+    """New rows must go on where the old ones end; a power loss, or a lost journal, may leave steps without images."""
+    counts: dict[int, int] = {}
+    for row in contents.table:
+        counts[int(row["channel"])] = counts.get(int(row["channel"]), 0) + int(row["rows"])
+    for channel in contents.channels.values():
+        if "leaf" not in channel.metadata:
+            continue
+        steps = next(
+            c for c in contents.channels.values() if c.topic == f"{channel.topic.partition('image/')[0]}step"
+        )
+        found, expected = counts.get(channel.id, 0), counts.get(steps.id, 0)
+        if found != expected:
+            raise RecordingError(
+                f"{writer.path} lost its end: expected {expected} images in {channel.topic}, found {found}; "
+                f'"tupli-mcap recover {writer.path}" writes what is whole to a new file, which can be appended to'
+            )
 
 
 def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:

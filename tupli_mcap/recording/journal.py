@@ -25,6 +25,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.recording.durability import boot_id, sync_directory
 from tupli_mcap.system import refused
 
 __all__ = [
@@ -125,14 +126,21 @@ class Journal:
                 f"{path}: could not make the journal of {size} bytes: {refused(err)} (journal_dir=)"
             ) from err
 
-    def publish(self) -> None:
-        """Puts the journal in its place, instead of one that may be there; until then it is not found."""
+    def publish(self, *, durable: bool = False) -> None:
+        """Puts the journal in its place, instead of one that may be there; until then it is not found.
+
+        With `durable` it is on the disk before its name is.
+        """
+        if durable:
+            self.sync()
         try:
             self._temporary.replace(self.path)
         except OSError as err:
             with contextlib.suppress(OSError):
                 self._temporary.unlink()
             raise RecordingError(f"{self.path}: could not put the journal in place: {refused(err)}") from err
+        if durable:
+            sync_directory(self.path.parent)
 
     def buffer(self, name: str) -> memoryview:
         """The bytes of an area."""
@@ -154,8 +162,17 @@ class Journal:
         return area
 
     def sync(self) -> None:
-        """Writes the mapped pages to the disk."""
-        self._map.flush()
+        """Waits until every mapped page that changed is on the disk.
+
+        Raises:
+            RecordingError: the disk refused.
+        """
+        try:
+            self._map.flush()
+        except OSError as err:
+            raise RecordingError(
+                f"{self.path}: the journal could not be synced to the disk: {refused(err)}"
+            ) from err
 
     def close(self, *, unlink: bool) -> None:
         """Lets go of the map (freed with its last view) and, with `unlink`, removes the file.
@@ -214,6 +231,22 @@ class JournalContents(NamedTuple):
     info: dict[str, Any]
     areas: dict[str, Area]
     data: dict[str, np.ndarray[Any, np.dtype[np.uint8]]]
+
+    @property
+    def torn(self) -> bool:
+        """True if rows in it may be torn: the machine has started anew since, or it is not the one that recorded."""
+        boot, now = self.info.get("boot"), boot_id()
+        return bool(boot and now and boot != now)
+
+    @property
+    def sealed_records(self) -> bool:
+        """True if the records of its logs carry checksums."""
+        return self.info.get("seals") in ("records", "rows")
+
+    @property
+    def sealed_rows(self) -> bool:
+        """True if its rows carry checksums too."""
+        return self.info.get("seals") == "rows"
 
 
 def read_journal(path: Path) -> JournalContents:

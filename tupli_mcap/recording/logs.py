@@ -10,6 +10,7 @@ import struct
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
+from zlib import crc32
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
+from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.journal import LogArea
 
 __all__ = ["EventLog", "StepLog", "group_records", "iter_records", "leaf_encoders"]
@@ -26,7 +28,8 @@ __all__ = ["EventLog", "StepLog", "group_records", "iter_records", "leaf_encoder
 Sink = Callable[[Rows], None]
 Encoder = Callable[[Any, bytearray, int], None]
 _HEADER = 64
-_EVENT = struct.Struct("<BQHIQQ4s")
+_FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
+_CHECKSUM = struct.Struct("<Q")
 
 
 def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
@@ -48,8 +51,8 @@ def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, i
         start = end
 
 
-def group_records(data: memoryview) -> list[Rows]:
-    """The records in `data` by channel, in their order."""
+def group_records(data: memoryview, *, sealed: bool = False) -> list[Rows]:
+    """The records in `data` by channel, in their order; of a journal (`sealed`), with their `publish_time`."""
     groups: dict[int, tuple[list[bytes], list[int], list[int], int]] = {}
     whole = bytes(data)
     for start, end, channel, sequence, log_time in iter_records(data):
@@ -63,8 +66,18 @@ def group_records(data: memoryview) -> list[Rows]:
     for channel, (parts, sizes, times, first) in groups.items():
         offsets = np.zeros(len(sizes), dtype=np.uint64)
         np.cumsum(sizes[:-1], out=offsets[1:])
-        rows.append(Rows(channel, first, b"".join(parts), offsets, np.array(times, dtype=np.uint64)))
+        joined = bytearray().join(parts)
+        at = np.array(times, dtype="<u8")
+        if sealed:
+            _publish(joined, offsets, at)
+        rows.append(Rows(channel, first, joined, offsets, at))
     return rows
+
+
+def _publish(records: bytearray, offsets: Any, times: Any) -> None:
+    """Sets `publish_time`, where a journal keeps checksums, to `log_time`."""
+    places = offsets[:, None] + np.arange(23, 31, dtype=np.uint64)
+    np.frombuffer(records, np.uint8)[places] = times.view(np.uint8).reshape(-1, 8)
 
 
 class EventLog:
@@ -99,16 +112,15 @@ class EventLog:
         for channel, body in messages:
             sequence = sequences[channel]
             sequences[channel] = sequence + 1
-            head = _EVENT.pack(
-                5, _EVENT.size - 9 + len(body), channel, sequence, time_ns, time_ns, CDR_HEADER
-            )
-            data += head + body
+            front = _FRONT.pack(5, BODY - 9 + len(body), channel, sequence, time_ns)
+            tail = CDR_HEADER + body
+            data += front + _CHECKSUM.pack(crc32(tail, crc32(front))) + tail
         end = self._position + len(data)
         if end > self._capacity:
             self.flush()
             end = len(data)
             if end > self._capacity:
-                for rows in group_records(memoryview(data)):
+                for rows in group_records(memoryview(data), sealed=True):
                     self._sink(rows)
                 self._can_drop = False
                 return time_ns
@@ -131,7 +143,7 @@ class EventLog:
         keep_last = keep_last and self._can_drop
         end = self._last if keep_last else self._position
         last = bytes(self._records[end : self._position])
-        for rows in group_records(self._records[:end]):
+        for rows in group_records(self._records[:end], sealed=True):
             self._sink(rows)
         self._commit[0] = 0
         self._records[: len(last)] = last
@@ -261,7 +273,8 @@ class StepLog:
         self._reserve(len(out) + len(pending))
         self._time = max(time.time_ns(), self._time)
         out[BODY : BODY + 8] = self._pending[BODY : BODY + 8]  # a new episode may have begun in between
-        RECORD_HEADER.pack_into(out, 0, 5, len(out) - 9, self._channel, self.count, self._time, self._time)
+        _FRONT.pack_into(out, 0, 5, len(out) - 9, self._channel, self.count, self._time)
+        seal(out, 0, len(out), memoryview(pending)[STATE:])
         records, start = self._records[self._half], self._position
         end = start + len(out)
         records[start:end] = out
@@ -320,11 +333,11 @@ class StepLog:
         self._ends[other][0] = 0
         self._records[other][: len(self._pending)] = self._pending
         self._half, self._position, self._emitted = other, 0, 0
-        for rows in group_records(self._records[full][begin:end]):
+        for rows in group_records(self._records[full][begin:end], sealed=True):
             self._sink(rows)
 
     def flush(self) -> None:
         """Writes the committed records that are not in the file yet."""
         begin, self._emitted = self._emitted, self._position
-        for rows in group_records(self._records[self._half][begin : self._position]):
+        for rows in group_records(self._records[self._half][begin : self._position], sealed=True):
             self._sink(rows)

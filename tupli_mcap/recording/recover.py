@@ -55,6 +55,7 @@ class _Tail:
 
     rows: list[Rows] = field(default_factory=list)
     pending: dict[int, bytes] = field(default_factory=dict)
+    left_out: int = 0  # steps in the journal that a power loss may have torn
 
 
 def head(source: Source) -> dict[str, str]:
@@ -113,6 +114,8 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         if journal is not None:
             _salvage(source, found, journal, layout, [c.id for c in steps], tail)
         _complete(source, found, layout, [c.id for c in steps], tail, contents)
+        if tail.left_out and journal is not None and journal.torn:
+            warnings.warn(_torn(source, tail.left_out), UserWarning, stacklevel=6)
     return contents
 
 
@@ -193,6 +196,14 @@ def _foreign_journal(source: Source, metadata: Mapping[str, str]) -> str:
     )
 
 
+def _torn(source: Source, steps: int) -> str:
+    return (
+        f"{source.name}: the machine that recorded it has been started anew since, or this is another one: {steps} "
+        "step(s) in its journal cannot be shown to be whole and are left out; on the machine and boot that recorded "
+        'it, they can be read: finish the recording there, with "tupli-mcap recover" or by appending to it'
+    )
+
+
 def define(
     schemas: dict[int, Schema], channels: dict[int, Channel], journal: JournalContents, name: str
 ) -> None:
@@ -240,9 +251,10 @@ def _salvage(
                 last = store.rows(span.chunk, layout.step_message.dtype)[span.begin]
             rows, _ = committed_rows(salvage, first, channel, last)
             total = first + (0 if rows is None else len(rows.offsets))
-            following = salvage.following(total - 1)
+            tail.left_out += salvage.left_out
+            following = salvage.following(total - 1, layout.state_end)
             if following is not None:
-                tail.pending[env] = following.tobytes()[BODY + 8 : layout.state_end]
+                tail.pending[env] = following
         else:
             log = _log_area(journal, f"steps/{env}")
             entries = [e for e in log_records(journal, log, {channel: first}) if e[0] == channel]
@@ -288,16 +300,16 @@ def _salvage_images(
             if c.topic == f"{topic.removesuffix('/step')}/image/{leaf.name}"
         )
         dtype = layout.image_messages[leaf.name].dtype
-        salvage = Salvage(journal, _rows_area(journal, f"{leaf.name}/{env}"), 0, dtype, channel)
+        area = _rows_area(journal, f"{leaf.name}/{env}")
+        salvage = Salvage(journal, area, 0, dtype, channel, rewritten=True)  # by resets
         rows = image_rows(salvage, found.counts.get(channel, 0), steps, channel)
         if rows is not None:
             tail.rows.append(rows)
-        following = salvage.following(steps)
-        pending = salvage.rows[salvage.rows["#sequence"] == steps]
-        if following is None and not len(pending):
+        pending = salvage.row(steps)
+        if pending is None:
             tail.pending.pop(env, None)
-        elif env in tail.pending and len(pending):
-            tail.pending[env] += pending[-1]["data"].tobytes()
+        elif env in tail.pending:
+            tail.pending[env] += pending["data"].tobytes()
 
 
 class _Episodes:
@@ -334,28 +346,30 @@ def _complete(
         return
     store = ChunkStore(source, _table(found, tail.rows), [bytes(r.data) for r in tail.rows], 1 << 26)
     episodes = _Episodes(store, topics)
+    available = [_available(store, topics, layout, found.channels[channel]) for channel in steps]
+    tail.left_out += sum(map(store.count, steps)) - sum(available)
     made: list[tuple[int, int, int, bytes]] = []
     counts = {topics[t]: store.count(topics[t]) for t in ("/episode_start", "/episode_end", "/final_state")}
     for number, (_, _, end) in list(episodes.ends.items()):
-        if end.env >= len(steps) or end.first_row + end.length > store.count(steps[end.env]):
+        if end.env >= len(steps) or end.first_row + end.length > available[end.env]:
             del episodes.ends[number]  # its steps were lost with the end of the file
-    for start, time in _unstarted(store, layout, steps, set(episodes.starts)):
+    for start, time in _unstarted(store, layout, steps, available, set(episodes.starts)):
         channel = topics["/episode_start"]
         made.append((channel, counts[channel], time, record(channel, counts[channel], time, start.encode())))
         episodes.starts[start.episode] = (counts[channel], time, start)
         counts[channel] += 1
     for number in sorted(set(episodes.starts) - set(episodes.ends)):
         _, _, start = episodes.starts[number]
-        facts = _rows_of(store, layout, steps, start, number)
+        facts = _rows_of(store, layout, steps, available, start, number)
         if facts is None:
             continue  # a reset without a step is no episode
         length, total, how, end_time = facts
-        if how == INTERRUPTED:
-            episodes.finals.pop(number, None)  # of a step that was not finished
+        if how == INTERRUPTED:  # what is there is that of a later step, which was lost
+            episodes.finals.pop(number, None)
         if (
             number not in episodes.finals
             and start.env in tail.pending
-            and _is_last(store, steps, start, length)
+            and start.first_row + length == available[start.env] == store.count(steps[start.env])
         ):
             channel = topics["/final_state"]
             body = number.to_bytes(4, "little") + start.env.to_bytes(4, "little") + tail.pending[start.env]
@@ -398,29 +412,37 @@ def _index(episodes: _Episodes, table: np.ndarray[Any, Any]) -> EpisodeIndex:
 
 
 def _unstarted(
-    store: ChunkStore, layout: StepLayout, steps: list[int], known: set[int]
+    store: ChunkStore, layout: StepLayout, steps: list[int], available: list[int], known: set[int]
 ) -> Iterator[tuple[EpisodeStart, int]]:
     """Starts made for episodes that have steps but lost their `/episode_start` (with the journal), and their times."""
     for env, channel in enumerate(steps):
         row, last = 0, -1
-        for episode, _, _, time in _step_facts(store, layout, channel, 0, store.count(channel)):
+        for episode, _, _, time in _step_facts(store, layout, channel, 0, available[env]):
             if episode != last and episode not in known:
                 yield EpisodeStart(episode, env, row, False, False, "", "", "{}"), time
             row, last = row + 1, episode
 
 
-def _is_last(store: ChunkStore, steps: list[int], start: EpisodeStart, length: int) -> bool:
-    return start.first_row + length == store.count(steps[start.env])
+def _available(store: ChunkStore, topics: dict[str, int], layout: StepLayout, channel: Channel) -> int:
+    """Steps of a sub-environment that are whole: of which all images are there."""
+    top = channel.topic.removesuffix("/step")
+    images = [topics.get(f"{top}/image/{leaf.name}", 0) for leaf in layout.images]
+    return min(store.count(one) for one in (channel.id, *images))
 
 
 def _rows_of(
-    store: ChunkStore, layout: StepLayout, steps: list[int], start: EpisodeStart, number: int
+    store: ChunkStore,
+    layout: StepLayout,
+    steps: list[int],
+    available: list[int],
+    start: EpisodeStart,
+    number: int,
 ) -> tuple[int, float, int, int] | None:
     """(length, return, end, time of the last step) of an episode without an end; None if it has no step."""
     if start.env >= len(steps):
         return None
     channel = steps[start.env]
-    count = store.count(channel) - start.first_row
+    count = available[start.env] - start.first_row
     if count <= 0:
         return None
     total, length, last, time = 0.0, 0, (False, False), 0

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.events import EpisodeStart
@@ -101,7 +100,9 @@ def _merge(gathered: Gathered, journal: JournalContents) -> None:
                 area = journal.areas.get(f"{leaf.name}/{env}")
                 if not isinstance(area, RowArea):
                     raise FormatError(f"the journal has no rows '{leaf.name}/{env}'")
-                pending = _add_images(gathered, Salvage(journal, area, 0, dtype, image), image, stop)
+                pending = _add_images(
+                    gathered, Salvage(journal, area, 0, dtype, image, rewritten=True), image, stop
+                )
             state = None if state is None or pending is None else state + pending
         if state is not None:
             gathered.states[env] = state
@@ -179,8 +180,7 @@ def _add_rows(
                 same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
                 rows["step"][:same] = first - begun + np.arange(same)
             _add(gathered, channel, first, len(rows), rows.view(np.uint8).tobytes())
-    following = salvage.following(_stop(gathered, channel) - 1)
-    return None if following is None else following.tobytes()[BODY + 8 : layout.state_end]
+    return salvage.following(_stop(gathered, channel) - 1, layout.state_end)
 
 
 def _row_before(gathered: Gathered, channel: int, first: int, dtype: np.dtype[Any]) -> tuple[int, int, int]:
@@ -196,7 +196,8 @@ def _add_images(gathered: Gathered, salvage: Salvage, channel: int, stop: int) -
     """Takes the images of steps before `stop`; returns the running state's."""
     for low, high in _missing(gathered, channel):
         for rows in salvage.runs(low, min(high, stop)):
+            rows["#publish_time"] = rows["#log_time"]
             _add(gathered, channel, int(rows["#sequence"][0]), len(rows), rows.view(np.uint8).tobytes())
-    running = salvage.rows[salvage.rows["#sequence"] == stop]
-    data: bytes | None = running[-1]["data"].tobytes() if len(running) else None
+    running = salvage.row(stop)
+    data: bytes | None = None if running is None else running["data"].tobytes()
     return data

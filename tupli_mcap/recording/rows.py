@@ -18,6 +18,7 @@ from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLay
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
+from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.journal import RowArea
 from tupli_mcap.recording.worker import ChunkWorker
 
@@ -89,7 +90,10 @@ class SingleRows:
         images: list[ImageSink],
         first: int = 0,
         deriver: RowDeriver | None = None,
+        *,
+        sealed: bool = False,
     ) -> None:
+        self._sealed = sealed
         self._layout = layout
         self._dtype = layout.step_message.dtype
         self._area = area
@@ -103,7 +107,9 @@ class SingleRows:
         self.cursor.sequence = first
         self.cursor.end = area.rows * area.row_size
         self._header = layout.step_message.header(channel)
-        encoder = make_row_encoder(layout, buffer, self.cursor, images, self._switch)
+        encoder = make_row_encoder(
+            layout, buffer, self.cursor, images, self._switch, self._seal if sealed else None
+        )
         self.put = encoder.put
         self.put_state = encoder.put_state
         self._state_end = encoder.state_end
@@ -125,6 +131,10 @@ class SingleRows:
         """The CDR bytes of the running row's state, as they follow `episode` and `env` in `/final_state`."""
         start = self.cursor.offset
         return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
+
+    def _seal(self, offset: int) -> None:
+        end = offset + self._area.row_size
+        seal(self._buffer, offset, end, self._buffer[end + STATE : end + self._state_end])
 
     def _switch(self) -> None:
         """The half is full: go on in the other one, then write this one as a chunk."""
@@ -148,7 +158,9 @@ class SingleRows:
         if begin == end:
             return
         size = self._area.row_size
-        data = self._buffer[start + begin * size : start + end * size]
+        data: Any = self._buffer[start + begin * size : start + end * size]
+        if self._sealed:
+            data = bytearray(data)  # until the chunk is on the disk, the rows in the journal stay as sealed
         rows = np.frombuffer(data, self._dtype)
         self._deriver.fill(rows)
         self._sink(even_rows(self._channel, first, data, rows))
@@ -168,8 +180,11 @@ class ImageRows:
         first: int = 0,
         time_ns: int = 0,
         worker: ChunkWorker | None = None,
+        *,
+        sealed: bool = False,
     ) -> None:
         self._worker = worker
+        self._sealed = sealed
         self._jobs: dict[int, Future[None]] = {}  # chunks being written, by the half they are in
         self._due: tuple[int, int, int, int] | None = None  # a full half: what `_emit` will be given
         self._leaf = leaf
@@ -220,6 +235,9 @@ class ImageRows:
         row["#log_time"] = row["#publish_time"] = now
         row["sec"], row["nanosec"] = divmod(now, 10**9)
         row["#sequence"] = self._sequence
+        if self._sealed:
+            start = self._half * self._area.half + self._row * self._area.row_size
+            seal(self._buffer, start, start + self._area.row_size, b"")
 
     def pending(self) -> bytes:
         """The running row's image."""
@@ -260,8 +278,13 @@ class ImageRows:
             return
         size = self._area.row_size
         start = half * self._area.half
-        data = self._buffer[start + begin * size : start + end * size]
-        rows = even_rows(self._channel, first, data, np.frombuffer(data, self._rows.dtype))
+        data: Any = self._buffer[start + begin * size : start + end * size]
+        if self._sealed:
+            data = bytearray(data)
+        table: Array = np.frombuffer(data, self._rows.dtype)
+        if self._sealed:
+            table["#publish_time"] = table["#log_time"]
+        rows = even_rows(self._channel, first, data, table)
         if worker is None:
             self._sink(rows)
         else:

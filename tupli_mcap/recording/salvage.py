@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
+from tupli_mcap.recording.durability import SECTOR, STATE, checksum, seal_of
 from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea
 from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.rows import RowDeriver, even_rows
@@ -20,38 +22,58 @@ from tupli_mcap.recording.vector_rows import HOLE
 __all__ = ["Salvage", "committed_rows", "image_rows", "log_records", "running_record", "to_rows"]
 
 Array = np.ndarray[Any, Any]
+SEQUENCE_END = 15  # of `sequence` in a Message record
 
 
 class Salvage:
-    """The rows of one RowArea's channel block, in both halves."""
+    """The rows of one RowArea's channel block, in both halves.
+
+    Of a journal that may be torn, only rows count that prove to be whole: by their checksums, or by lying in
+    sectors that were written after them; the latter shows nothing where committed rows may be `rewritten`. `left_out`
+    counts the others that `after` met.
+    """
 
     def __init__(
-        self, contents: JournalContents, area: RowArea, block: int, dtype: np.dtype[Any], channel: int
+        self,
+        contents: JournalContents,
+        area: RowArea,
+        block: int,
+        dtype: np.dtype[Any],
+        channel: int,
+        *,
+        rewritten: bool = False,
     ) -> None:
         shape = (2, area.channels, area.rows + 1, area.row_size)
         if area.row_size != dtype.itemsize or contents.data[area.name].size != np.prod(shape):
             raise FormatError(
                 f"the journal's area {area.name!r} has rows of {area.row_size} bytes, not {dtype.itemsize}"
             )
-        self._bytes = contents.data[area.name].reshape(shape)[:, block]
-        self.rows: Array = np.ascontiguousarray(self._bytes).view(dtype)[..., 0]
+        self._bytes = np.ascontiguousarray(contents.data[area.name].reshape(shape)[:, block])
+        self._area = area
+        self._block = block
+        self.rows: Array = self._bytes.view(dtype)[..., 0]
         committed = (
             (self.rows["#opcode"] == 5) & (self.rows["#channel"] == channel) & (self.rows["#log_time"] != 0)
         )
         committed &= self.rows["#sequence"] != HOLE
         committed[:, area.rows] = False  # the spare row is never committed
-        self._halves, self._places = np.nonzero(committed)
+        halves, places = np.nonzero(committed)
+        order = np.argsort(self.rows["#sequence"][halves, places], kind="stable")
+        self._halves, self._places = halves[order], places[order]
         self._sequences = self.rows["#sequence"][self._halves, self._places].astype(np.int64)
-        self._limit = area.rows
+        self._torn, self._sealed = contents.torn, contents.sealed_rows
+        self._rewritten = rewritten
+        self.left_out = 0
 
     def after(self, first: int) -> Array:
         """A copy of the rows with sequence `first`, `first + 1`, … until one is missing."""
-        order = np.argsort(self._sequences, kind="stable")
-        sequences = self._sequences[order]
-        start = int(np.searchsorted(sequences, first))
-        run = sequences[start:]
+        start = int(np.searchsorted(self._sequences, first))
+        run = self._sequences[start:]
         good = int(np.argmin(np.append(run == first + np.arange(len(run)), False)))
-        chosen = order[start : start + good]
+        if self._torn:
+            whole = next((i for i in range(good) if not self._is_whole(start + i)), good)
+            self.left_out, good = good - whole, whole
+        chosen = slice(start, start + good)
         return self.rows[self._halves[chosen], self._places[chosen]].copy()
 
     def runs(self, first: int, stop: int) -> list[Array]:
@@ -59,6 +81,9 @@ class Salvage:
         wanted = np.flatnonzero((self._sequences >= first) & (self._sequences < stop))
         sequences, places = np.unique(self._sequences[wanted], return_index=True)
         chosen = wanted[places]
+        if self._torn:
+            whole = np.array([self._is_whole(int(i)) for i in chosen], dtype=np.bool_)
+            chosen, sequences = chosen[whole], sequences[whole]
         edges = np.flatnonzero(np.diff(sequences) != 1) + 1
         return [
             self.rows[self._halves[part], self._places[part]].copy()
@@ -66,14 +91,51 @@ class Salvage:
             if len(part)
         ]
 
-    def following(self, sequence: int) -> Array | None:
-        """The row that was running when the one with `sequence` was committed; None if that one is not here."""
-        found = np.flatnonzero(self._sequences == sequence)
-        if not len(found):
+    def row(self, sequence: int) -> Array | None:
+        """The committed row with `sequence`; None if it is not here."""
+        found = self._find(sequence)
+        if found is None or (self._torn and not self._is_whole(found)):
             return None
-        half, place = int(self._halves[found[0]]), int(self._places[found[0]])
-        row: Array = self.rows[half, place + 1]
+        row: Array = self.rows[self._halves[found], self._places[found]]
         return row
+
+    def following(self, sequence: int, state_end: int) -> bytes | None:
+        """The state in the row that was running when the one with `sequence` was committed; None if it is not here."""
+        found = self._find(sequence)
+        if found is None:
+            return None
+        half, place = self._halves[found], self._places[found]
+        state = self._bytes[half, place + 1, STATE:state_end].tobytes()
+        if self._torn:
+            sealed = int(self.rows["#publish_time"][half, place]) >> 32
+            if not self._sealed or zlib.crc32(state) != sealed:
+                return None
+        return state
+
+    def _find(self, sequence: int) -> int | None:
+        found = int(np.searchsorted(self._sequences, sequence))
+        if found == len(self._sequences) or self._sequences[found] != sequence:
+            return None
+        return found
+
+    def _is_whole(self, i: int) -> bool:
+        """Whether the i-th committed row was on the disk as it had been committed."""
+        half, place, size = int(self._halves[i]), int(self._places[i]), self._area.row_size
+        if self._sealed:
+            return (
+                checksum(self._bytes[half, place].tobytes())
+                == int(self.rows["#publish_time"][half, place]) & 0xFFFFFFFF
+            )
+        if self._rewritten:
+            return False
+        start = half * self._area.half + self._block * self._area.block + place * size
+        if start // SECTOR == (start + size - 1) // SECTOR:
+            return True
+        # A row of less than a sector lies in two at most. The second one also holds the commitment of the next row,
+        # which came later: where that is on the disk, so is the end of this row.
+        follows = i + 1 < len(self._sequences) and self._sequences[i + 1] == self._sequences[i] + 1
+        beside = follows and (int(self._halves[i + 1]), int(self._places[i + 1])) == (half, place + 1)
+        return beside and size <= SECTOR - SEQUENCE_END
 
 
 def committed_rows(
@@ -93,6 +155,7 @@ def committed_rows(
 def image_rows(salvage: Salvage, first: int, steps: int, channel: int) -> Rows | None:
     """Images of committed steps: rows from `first` up to `steps`."""
     rows = salvage.after(first)[: max(0, steps - first)]
+    rows["#publish_time"] = rows["#log_time"]
     return even_rows(channel, first, rows.view(np.uint8).tobytes(), rows) if len(rows) else None
 
 
@@ -102,12 +165,21 @@ def log_records(
     """(channel, sequence, log_time, record) of the committed records that are not in the file, in order.
 
     `counts` are the rows of each channel that are in the file; None: all committed records, each once.
+    A record whose checksum differs ends its half.
     """
     found: list[tuple[int, int, int, bytes]] = []
     for half in range(area.halves):
         data = _half(contents, area, half)
-        for start, end, channel, sequence, log_time in iter_records(data):
-            found.append((channel, sequence, log_time, bytes(data[start:end])))
+        for start, end, channel, sequence, log_time in _whole_records(contents, data):
+            time = log_time.to_bytes(8, "little")
+            found.append(
+                (
+                    channel,
+                    sequence,
+                    log_time,
+                    b"".join((data[start : start + 23], time, data[start + 31 : end])),
+                )
+            )
     found.sort(key=lambda entry: (entry[0], entry[1]))
     if counts is None:
         return list({entry[:2]: entry for entry in found}.values())
@@ -117,6 +189,16 @@ def log_records(
             expected[entry[0]] = entry[1] + 1
             kept.append(entry)
     return kept
+
+
+def _whole_records(contents: JournalContents, data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
+    try:
+        for start, end, channel, sequence, log_time in iter_records(data):
+            if contents.sealed_records and checksum(data[start:end]) != seal_of(data, start)[0]:
+                return
+            yield start, end, channel, sequence, log_time
+    except FormatError:  # torn
+        return
 
 
 def _half(contents: JournalContents, area: LogArea, half: int) -> memoryview:
@@ -157,7 +239,17 @@ def running_record(
             continue
         try:
             body = raw[BODY:]
-            return bytes(body[8 : MessageDecoder(layout).state(body)])
+            state = bytes(body[8 : MessageDecoder(layout).state(body)])
         except FormatError:
             continue
+        if not contents.torn or _last_seal(contents, _half(contents, area, half)) == zlib.crc32(state):
+            return state
     return None
+
+
+def _last_seal(contents: JournalContents, data: memoryview) -> int | None:
+    """The checksum of the state that follows the last committed record."""
+    last = None
+    for start, *_ in _whole_records(contents, data):
+        last = seal_of(data, start)[1]
+    return last

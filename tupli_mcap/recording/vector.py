@@ -80,6 +80,7 @@ class VectorRecorder:
             raise self._writer.failed
         with self._writer.whole:
             self._reset(states, facts, mask)
+        self._writer.sync_step()
 
     def _reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None) -> None:
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
@@ -88,6 +89,7 @@ class VectorRecorder:
             self._end(int(i), INTERRUPTED)
             self._replace_facts(int(i), facts[int(i)])
             ended[int(i)] = False
+        self._writer.sync_step()  # before the running states are written over
         self._ended, self._any_ended = ended, bool(ended.any())
         self._fresh = True
         self._was_reset = True

@@ -7,7 +7,7 @@ its sequence; holes are squeezed out when the rows go to the file.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.journal import RowArea
 from tupli_mcap.recording.rows import HOLE, Array, RowDeriver, Sink, even_rows
 
@@ -34,7 +35,13 @@ class VectorRows:
         sink: Sink,
         counts: Array,
         derivers: Sequence[RowDeriver] | None = None,
+        *,
+        settle: Callable[[], None] | None = None,
+        sealed: bool = False,
     ) -> None:
+        self._settle = settle
+        self._sealed = sealed
+        self._buffer = buffer
         message = layout.step_message
         self._layout = layout
         self._area = area
@@ -118,6 +125,8 @@ class VectorRows:
         else:
             self._sequence[half, :, row] = np.where(active, self.counts, HOLE)
             self.counts += active
+        if self._sealed:
+            self._seal(active)
         self._row = row + 1
         if self._row == self._area.rows:
             self._switch()
@@ -126,6 +135,13 @@ class VectorRows:
         """The CDR bytes of a sub-environment's running state, as they follow `episode` and `env` in `/final_state`."""
         data: bytes = self._state_bytes[self._half, i, self._row, BODY + 8 : self._state_end].tobytes()
         return data
+
+    def _seal(self, active: Array | None) -> None:
+        size = self._area.row_size
+        for i in range(len(self._channels)) if active is None else np.flatnonzero(active).tolist():
+            start = self._half * self._area.half + i * self._area.block + self._row * size
+            end = start + size
+            seal(self._buffer, start, end, self._buffer[end + STATE : end + self._state_end])
 
     def _switch(self) -> None:
         half, rows, flushed = self._half, self._area.rows, self._flushed
@@ -149,7 +165,11 @@ class VectorRows:
             rows = self._rows[half, i, begin:end]
             if not whole[i]:
                 rows = rows[kept[i]]
+            elif self._sealed:  # until the chunk is on the disk, the rows in the journal stay as sealed
+                rows = np.frombuffer(bytearray(rows.view(np.uint8)), rows.dtype)
             if len(rows):
                 self._derivers[i].fill(rows)
                 data = np.ascontiguousarray(rows).view(np.uint8)
                 self._sink(even_rows(channel, int(rows["#sequence"][0]), data, rows))
+        if self._settle is not None:
+            self._settle()

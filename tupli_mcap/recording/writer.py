@@ -25,6 +25,7 @@ from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.container import Container, Rows
+from tupli_mcap.recording.durability import Durability, boot_id, check_durability, sync_directory, sync_file
 from tupli_mcap.recording.events import (
     EpisodeEnd,
     EpisodeStart,
@@ -52,6 +53,7 @@ class WriterOptions(NamedTuple):
     """How to write: `chunk_size` in bytes before compression, `flush_seconds` None flushes by size only.
 
     A new recording that no step came into is removed when it is closed, unless `keep_empty`.
+    `durability` says what a power loss leaves: what the system happened to write, every chunk, or every step.
     """
 
     compression: str = "zstd"
@@ -62,6 +64,7 @@ class WriterOptions(NamedTuple):
     chunk_size: int = 256 * 1024
     flush_seconds: float | None = None
     keep_empty: bool = False
+    durability: Durability = "os"
 
 
 _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
@@ -86,6 +89,8 @@ class RecordingWriter:
         self.journal: Journal | None = None
         self.rows: SingleRows | StepLog | None = None
         self.vector: VectorRows | list[StepLog] | None = None
+        self._durable = options.durability != "os"
+        self._sealed = options.durability == "step"
         self.images: list[list[ImageRows]] = []
         self.worker = ChunkWorker(self.add_chunk)
         self.events: EventLog | None = None
@@ -170,6 +175,9 @@ class RecordingWriter:
         # after the journal: a file that has channels and no end has one
         self.cut()
         self.container.define_channels()
+        if self._durable:
+            self._settle()
+            sync_directory(self._place.parent)
 
     def cut(self) -> None:
         """On append: takes index and summary off the file. Before, nothing in it has changed."""
@@ -202,7 +210,7 @@ class RecordingWriter:
         layout, channels = self._laid(), self.channels
         counts, before_ns = self.container.counts, self.container.end_time
         self.journal = self._new_journal(areas)
-        self.journal.publish()
+        self.journal.publish(durable=self._durable)
         rows_area, log_area = self.journal.row_area, self.journal.log_area
         buffer = self.journal.buffer
         self.images = []
@@ -212,7 +220,7 @@ class RecordingWriter:
                     ImageRows(
                         leaf, layout.image_messages[leaf.name], rows_area(f"{leaf.name}/{i}"),
                         buffer(f"{leaf.name}/{i}"), channel, self.add_chunk, counts[channel], before_ns,
-                        self.worker if leaf.size >= _LARGE_ROW else None,
+                        self.worker if leaf.size >= _LARGE_ROW else None, sealed=self._sealed,
                     )
                     for i, channel in enumerate(ids)
                 ]
@@ -235,12 +243,14 @@ class RecordingWriter:
             before = np.array([counts[c] for c in channels.steps], dtype=np.int64)
             derivers = [RowDeriver(time_ns=before_ns) for _ in channels.steps]
             self.vector = VectorRows(
-                layout, rows_area("steps"), buffer("steps"), channels.steps, self.add_chunk, before, derivers
-            )
+                layout, rows_area("steps"), buffer("steps"), channels.steps, self._write_chunk, before, derivers,
+                settle=self._settle if self._durable else None, sealed=self._sealed,
+            )  # fmt: skip
         else:
             self.rows = SingleRows(
                 layout, rows_area("steps"), buffer("steps"), channels.steps[0], self.add_chunk,
                 [sinks[0] for sinks in self.images], counts[channels.steps[0]], RowDeriver(time_ns=before_ns),
+                sealed=self._sealed,
             )  # fmt: skip
         events = {c: counts[c] for c in (channels.final_state, channels.start, channels.end)}
         self.events = EventLog(log_area("events"), buffer("events"), self.add_chunk, events, before_ns)
@@ -336,7 +346,13 @@ class RecordingWriter:
     # ---- chunks
 
     def add_chunk(self, rows: Rows) -> None:
-        """Writes a chunk; after a failure nothing more is accepted, and the journal keeps what it holds."""
+        """Writes a chunk, to the disk where durability is asked for."""
+        self._write_chunk(rows)
+        if self._durable:
+            self._settle()
+
+    def _write_chunk(self, rows: Rows) -> None:
+        """After a failure nothing more is accepted, and the journal keeps what it holds."""
         if self.failed is not None:
             raise self.failed
         if rows.first + len(rows.offsets) > LAST_ROW:
@@ -345,6 +361,19 @@ class RecordingWriter:
             )
         with self.whole:
             self.container.add_chunk(rows)
+
+    def _settle(self) -> None:
+        """Waits until what was written is on the disk: the journal first, for it holds the ends of the episodes."""
+        with self.whole:
+            if self.journal is not None:
+                self.journal.sync()
+            sync_file(self.lock.fd, str(self.path))
+
+    def sync_step(self) -> None:
+        """Waits until everything put so far is on the disk, where durability of steps is asked for."""
+        if self._sealed and self.journal is not None and self.failed is None:
+            with self.whole:
+                self.journal.sync()
 
     def stop(self, err: BaseException) -> None:
         """After something that was left half done: nothing more is accepted, and the journal keeps what it holds."""
@@ -415,7 +444,7 @@ class RecordingWriter:
         for name, events in (("events", self.events), ("info", self.infos)):
             if events is not None:
                 events.move(journal.log_area(name), journal.buffer(name))
-        journal.publish()
+        journal.publish(durable=self._durable)
         self.journal = journal
 
     def _new_journal(self, areas: Sequence[Area]) -> Journal:
@@ -424,6 +453,8 @@ class RecordingWriter:
             "uuid": self.uuid,
             **({"rewritten": self.rewritten} if self.rewritten else {}),
             **({} if self.journal_place.parent == self._place.parent else {"recording": str(self._place)}),
+            "boot": boot_id(),
+            "seals": "rows" if self._sealed else "records",
             "vector": self.is_vector,
             "channels": [channels.steps, channels.images, *channels[2:]],
             "definitions": {str(c): self.container.definitions(c).hex() for c in self.container.channels},
@@ -453,6 +484,9 @@ class RecordingWriter:
             data = self.index.encode(self.container.chunk_rows)
             self.container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, time.time_ns())
             self.container.finish()
+            if self._durable:  # before the journal goes
+                sync_file(self.lock.fd, str(self.path))
+                sync_directory(self._place.parent)
         except BaseException:
             if self.journal is not None:
                 self.journal.close(unlink=False)
@@ -496,7 +530,8 @@ class RecordingWriter:
         place.with_name(f"{place.name}.tmp").unlink(missing_ok=True)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
-            RecordingWriter(self._place, WriterOptions(self.options.compression, "a")).close()
+            options = WriterOptions(self.options.compression, "a", durability=self.options.durability)
+            RecordingWriter(self._place, options).close()
 
     def abandon(self) -> None:
         """In a forked child: lets go of the file and its lock without writing; the parent goes on."""
@@ -530,6 +565,7 @@ def _checked(options: WriterOptions) -> WriterOptions:
     """The options, with a place for the journal that does not depend on the process's directory."""
     if options.chunk_size < 1:
         raise RecordingError(f"chunk_size: expected at least 1 byte, found {options.chunk_size!r}")
+    check_durability(options.durability)
     if options.journal_dir is None:
         return options
     if not Path(options.journal_dir).is_dir():

@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.infos import RecordInfo
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.writer import Mode
@@ -52,6 +53,7 @@ def record_rollouts(
     mode: Mode = "x",
     compression: str = "zstd",
     record_info: RecordInfo = False,
+    durability: Durability = "os",
     progress: Callable[[int], None] | None = None,
 ) -> RolloutSummary:
     """Records `steps` steps of a registered environment into the MCAP file `path`.
@@ -63,7 +65,7 @@ def record_rollouts(
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
-        mode, compression, record_info: as `RecordEpisodes` has them.
+        mode, compression, record_info, durability: as `RecordEpisodes` has them.
         progress: called with the number of steps so far, a few hundred times.
 
     Raises:
@@ -85,12 +87,20 @@ def record_rollouts(
                 mode=mode,
                 compression=compression,
                 record_info=record_info,
+                durability=durability,
                 attachments=attachments,
             )
             with _closing(vector, mode):
                 done = _run_vector(vector, steps, seed, policy, report)
         else:
-            single = RecordEpisodes(made, path, mode=mode, compression=compression, record_info=record_info)
+            single = RecordEpisodes(
+                made,
+                path,
+                mode=mode,
+                compression=compression,
+                record_info=record_info,
+                durability=durability,
+            )
             with _closing(single, mode):
                 done = _run(single, steps, seed, policy, report)
     with Recording(path) as recording:

@@ -16,6 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.events import TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
@@ -50,6 +51,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         flush_seconds: also write chunks this many seconds after the last ones, full or not.
         journal_dir: where the journal goes, if not beside the recording (a local disk for a network path).
         chunk_size: bytes of a chunk before compression.
+        durability: what a power loss or a crash of the system leaves. "os": what it happened to have written (a killed
+            process loses nothing in any case); "chunk": every chunk, waiting for the disk after each; "step": every
+            step, waiting for the disk in each `step()`, which takes as long as the disk does (0.1 to 20 ms).
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
@@ -74,6 +78,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         flush_seconds: float | None = None,
         journal_dir: str | os.PathLike[str] | None = None,
         chunk_size: int = 256 * 1024,
+        durability: Durability = "os",
     ) -> None:
         super().__init__(env)
         self.path = Path(path)
@@ -84,7 +89,14 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         wanted = record_info is not False or step_callback is not None
         self._infos = InfoRecorder(record_info) if wanted else None
         options = WriterOptions(
-            compression, mode, benchmark_id, attachments, journal_dir, chunk_size, flush_seconds
+            compression,
+            mode,
+            benchmark_id,
+            attachments,
+            journal_dir,
+            chunk_size,
+            flush_seconds,
+            durability=durability,
         )
         spaces = StepLayout(
             env.observation_space, env.action_space, reward_space
@@ -101,7 +113,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         self._watches = metadata_callback is not None or wanted
         # shared with the finalizer, which must not hold the wrapper
         self._episode_metadata: list[str] = ["{}"]
-        self._flush_seconds = flush_seconds
+        self._plain = not self._watches and flush_seconds is None and durability != "step"
         self._stepped = False
         self._state: Any = None
         self._finalizer = weakref.finalize(self, _close, self._recorder, self._episode_metadata)
@@ -133,11 +145,12 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
                     self._state = copy.deepcopy(state)
                 else:
                     self._watch(action, state, reward, terminal, timeout, info)
-            if self._flush_seconds is not None:
-                self._writer.flush_if_due()
         finally:  # a callback that raises changes nothing about what the environment did
             if terminal or timeout:
                 self._end(TERMINAL if terminal else TIMEOUT)
+        if not self._plain:
+            self._writer.flush_if_due()
+            self._writer.sync_step()
         return result
 
     def reset(

@@ -17,6 +17,7 @@ from gymnasium.vector.utils import iterate
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
 from tupli_mcap.recording.vector import VectorRecorder
@@ -56,6 +57,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         flush_seconds: float | None = None,
         journal_dir: str | os.PathLike[str] | None = None,
         chunk_size: int = 256 * 1024,
+        durability: Durability = "os",
         autoreset_mode: str | None = None,
     ) -> None:
         super().__init__(env)
@@ -77,7 +79,14 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         spaces = StepLayout(env.single_observation_space, env.single_action_space, reward_space)
         spaces.to_metadata()
         options = WriterOptions(
-            compression, mode, benchmark_id, attachments, journal_dir, chunk_size, flush_seconds
+            compression,
+            mode,
+            benchmark_id,
+            attachments,
+            journal_dir,
+            chunk_size,
+            flush_seconds,
+            durability=durability,
         )
         self._writer = RecordingWriter(path, options)
         try:
@@ -103,6 +112,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         finally:  # a callback that raises changes nothing about what the environments did
             self._recorder.finish(terminals, infos)
         self._writer.flush_if_due()
+        self._writer.sync_step()
         return result
 
     def reset(

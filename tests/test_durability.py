@@ -1,0 +1,157 @@
+"""Power losses: what was synced survives, and what was not is left out rather than wrong."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from power_loss import KINDS, check, crash, record
+
+from tupli_mcap import FileStorage, FormatError, RecordEpisodes, Recording, RecordingError, TupliEnvWrapper
+from tupli_mcap.recording import journal_path, writer
+
+
+@pytest.mark.parametrize("durability", ["step", "chunk", "os"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_was_synced_survives(kind: str, durability: str, tmp_path: Path) -> None:
+    story = record(tmp_path / "live.mcap", kind, durability, 40, 300_000 if kind == "frames" else 2000)
+    rng = random.Random(f"{kind} {durability}")
+    place = tmp_path / "r.mcap"
+    kept = []
+    for _ in range(6 if kind == "frames" else 40):
+        at = rng.randrange(len(story.moments))
+        kept.append(check(story, place, crash(story, at, place, rng)))
+    if durability != "os":
+        assert max(kept) > 0
+        assert all(crash(story, len(story.moments) - 1, place, rng))
+
+
+def test_in_step_durability_all_that_returned_is_there(tmp_path: Path) -> None:
+    story = record(tmp_path / "live.mcap", "box", "step", 40)
+    place, rng = tmp_path / "r.mcap", random.Random(1)
+    for at, moment in enumerate(story.moments):
+        if moment.steps[0]:
+            needed = crash(story, at, place, rng)
+            assert check(story, place, needed) >= moment.steps[0] == needed[0]
+    assert needed == [40]
+
+
+@pytest.mark.parametrize("kind", ["box", "text", "image"])
+def test_cut_at_every_byte(kind: str, tmp_path: Path) -> None:
+    """The file or the journal ends early: what is read is true, and what both hold is all there."""
+    story = record(tmp_path / "live.mcap", kind, "step", 30, 1000)
+    last = story.moments[-1]
+    place = tmp_path / "r.mcap"
+    assert last.journal is not None
+    counts = []
+    journal_path(place).write_bytes(last.journal)
+    step = 37 if kind == "box" else 97
+    for size in [*range(0, len(last.file), step), len(last.file)]:
+        place.write_bytes(last.file[:size])
+        counts.append(check(story, place, [0]))
+    assert counts[-1] == 30
+    journal_path(place).unlink()
+    alone = check(story, place, [0])
+    for size in range(0, min(len(last.journal), 12_000), 151):
+        journal_path(place).write_bytes(last.journal[:size])
+        assert check(story, place, [0]) >= alone
+
+
+def test_without_seals_only_what_shows_to_be_whole_counts(tmp_path: Path) -> None:
+    story = record(tmp_path / "live.mcap", "large", "os", 4, 30_000)
+    place = tmp_path / "r.mcap"
+    place.write_bytes(story.moments[-1].file)
+    journal_path(place).write_bytes(story.moments[-1].journal or b"")
+    with pytest.warns(UserWarning, match=r"started anew since.*1 step\(s\) in its journal.*left out"):
+        assert Recording(place).num_steps == 3  # in the file: there was a flush
+
+
+def test_small_rows_are_shown_to_be_whole_by_those_after_them(tmp_path: Path) -> None:
+    story = record(tmp_path / "live.mcap", "box", "os", 30, 30_000)
+    place = tmp_path / "r.mcap"
+    place.write_bytes(story.moments[-1].file)
+    journal_path(place).write_bytes(story.moments[-1].journal or b"")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        assert 29 <= Recording(place).num_steps <= 30
+
+
+def test_on_the_same_boot_every_row_counts(tmp_path: Path) -> None:
+    path = tmp_path / "live.mcap"
+    env = RecordEpisodes(gym.make("CartPole-v1"), path)
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(0)
+    copy = tmp_path / "copy.mcap"
+    shutil.copy(path, copy)
+    shutil.copy(journal_path(path), journal_path(copy))
+    env.close()
+    assert Recording(copy).num_steps == 5
+
+
+def test_durability_costs_syncs_where_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[str] = []
+    real_file, real_journal, real_directory = writer.sync_file, writer.Journal.sync, writer.sync_directory
+    monkeypatch.setattr(writer, "sync_file", lambda *a: (synced.append("file"), real_file(*a))[1])
+    monkeypatch.setattr(
+        writer, "sync_directory", lambda *a: (synced.append("directory"), real_directory(*a))[1]
+    )
+    monkeypatch.setattr(writer.Journal, "sync", lambda *a: (synced.append("journal"), real_journal(*a))[1])
+    counts: dict[str, list[str]] = {}
+    for durability in ("os", "chunk", "step"):
+        env = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / f"{durability}.mcap", durability=durability)
+        env.reset(seed=1)
+        for _ in range(5):
+            env.step(0)
+        before = list(synced)
+        env.close()
+        counts[durability] = [*before, "|", *synced[len(before) :]]
+        synced.clear()
+    assert counts["os"] == ["|"]
+    first = ["journal", "journal", "file", "directory"]
+    assert counts["chunk"][: len(first) + 1] == [*first, "|"]
+    assert counts["step"][: len(first)] == first
+    assert (
+        counts["step"][len(first) : counts["step"].index("|")] == ["journal"] * 7
+    )  # two at the reset, and the steps
+    assert counts["chunk"][-2:] == counts["step"][-2:] == ["file", "directory"]
+
+
+def test_every_recorder_takes_it(tmp_path: Path) -> None:
+    storage = FileStorage(tmp_path / "lab")
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), storage=storage, durability="chunk")
+    env.store(name="pole")
+    env.reset(seed=1)
+    env.step(0)
+    env.close()
+    assert len(storage.list_episodes()) == 1
+    with pytest.raises(
+        RecordingError, match=r"durability: expected one of \['os', 'chunk', 'step'\], found 'disk'"
+    ):
+        wrong: Any = "disk"
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", durability=wrong)
+
+
+def test_a_damaged_seal_is_not_passed_on(tmp_path: Path) -> None:
+    """A flipped bit in a record of the journal ends what is read of it, on any boot."""
+    path = tmp_path / "live.mcap"
+    env = RecordEpisodes(gym.make("CartPole-v1"), path)
+    env.reset(seed=123456789)
+    env.step(0)
+    data = bytearray(journal_path(path).read_bytes())
+    at = data.index(b"123456789")
+    data[at] ^= 1
+    copy = tmp_path / "copy.mcap"
+    shutil.copy(path, copy)
+    journal_path(copy).write_bytes(data)
+    env.close()
+    episode = Recording(copy).episodes[0:1]
+    assert [e.seed for e in episode] == [None]
+    with pytest.raises(FormatError, match="cut off or damaged"):
+        copy.write_bytes(path.read_bytes()[:100])
+        Recording(copy)

@@ -1,0 +1,103 @@
+"""What survives a power loss: when file and journal are synced, and how a torn journal row is told from a whole one.
+
+A killed process loses nothing of a journal: its pages are the kernel's. A kernel that goes down loses the pages it had
+not written, in any order and in parts. Whether that may have happened is known from the boot the journal was made in;
+if it was another one, only rows count that prove to be whole.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.system import refused
+
+__all__ = [
+    "SECTOR",
+    "STATE",
+    "Durability",
+    "boot_id",
+    "check_durability",
+    "checksum",
+    "seal",
+    "seal_of",
+    "sync_directory",
+    "sync_file",
+]
+
+Durability = Literal["os", "chunk", "step"]
+SECTOR = 512  # bytes a disk writes as one
+_SEAL = struct.Struct("<II")
+_SEAL_START, _SEAL_END = 23, 31  # of `publish_time`, which is derived when a row goes to a chunk
+STATE = BODY + 8  # where the state starts in a step's record
+
+
+def check_durability(value: Any) -> None:
+    """Raises RecordingError unless it is one of the settings."""
+    if value not in get_args(Durability):
+        raise RecordingError(f"durability: expected one of {list(get_args(Durability))}, found {value!r:.80}")
+
+
+def boot_id() -> str:
+    """What tells this boot of this machine from any other; empty where the system does not say."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
+
+
+def checksum(record: bytes | bytearray | memoryview) -> int:
+    """CRC-32 of a Message record, its `publish_time` left out."""
+    view = memoryview(record)
+    return zlib.crc32(view[_SEAL_END:], zlib.crc32(view[:_SEAL_START]))
+
+
+def seal(view: bytearray | memoryview, start: int, end: int, running: bytes | memoryview) -> None:
+    """Writes the checksums of a record, and of the state that follows its step, in place of `publish_time`."""
+    whole = checksum(memoryview(view)[start:end])
+    _SEAL.pack_into(view, start + _SEAL_START, whole, zlib.crc32(running))
+
+
+def seal_of(view: bytes | memoryview, start: int) -> tuple[int, int]:
+    """The two checksums of the record at `start`."""
+    whole, running = _SEAL.unpack_from(view, start + _SEAL_START)
+    return whole, running
+
+
+def sync_file(fd: int, name: str) -> None:
+    """Waits until the file's data, and its size, are on the disk.
+
+    Raises:
+        RecordingError: the disk refused; what it took before is unknown.
+    """
+    try:
+        if hasattr(fcntl, "F_FULLFSYNC"):  # macOS: its fsync stops at the drive's cache
+            fcntl.fcntl(fd, fcntl.F_FULLFSYNC)
+        elif hasattr(os, "fdatasync"):
+            os.fdatasync(fd)
+        else:
+            os.fsync(fd)
+    except OSError as err:
+        raise RecordingError(f"{name}: could not be synced to the disk: {refused(err)}") from err
+
+
+def sync_directory(path: Path) -> None:
+    """Waits until the names in a directory are on the disk.
+
+    Raises:
+        RecordingError: the disk refused.
+    """
+    try:
+        fd = os.open(path, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | os.O_CLOEXEC)
+        try:
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+    except OSError as err:
+        raise RecordingError(f"{path}: could not be synced to the disk: {refused(err)}") from err
