@@ -18,13 +18,21 @@ import numpy as np
 from environments import Sampler, same
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
-from killed_recorder import KINDS
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording
 from tupli_mcap.recording import journal as journals
 from tupli_mcap.recording import journal_path, writer
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
+KINDS: dict[str, Any] = {
+    "box": spaces.Box(-1, 1, (4,), np.float32),
+    "text": spaces.Dict({"note": spaces.Text(30), "x": spaces.Discrete(5)}),
+    "image": spaces.Dict({"camera": spaces.Box(0, 255, (8, 8, 3), np.uint8), "x": spaces.Box(-1, 1, (1,))}),
+    "large": spaces.Dict({"x": spaces.Discrete(5), "y": spaces.Box(-1, 1, (600,))}),
+    "frames": spaces.Box(0, 255, (80, 80, 3), np.uint8),
+    "vector": spaces.Box(-1, 1, (4,), np.float32),
+    "info": spaces.Box(-1, 1, (4,), np.float32),
+}
 SECTOR = 512
 OTHER_BOOT = "00000000-0000-0000-0000-000000000000"
 Step = tuple[Any, Any, Any, bool, bool, Any]  # state, action, reward, terminal, timeout, next state
@@ -52,7 +60,7 @@ class Story:
 
 
 def record(path: Path, kind: str, durability: str, steps: int, chunk_size: int = 2000) -> Story:
-    """Records `steps` steps of a kind of `killed_recorder`, and remembers every moment. The recording is left open."""
+    """Records `steps` steps of one of KINDS, and remembers every moment. The recording is left open."""
     story = Story(path, durability)
     live = journal_path(path)
     last = {"file": -1, "journal": -1}
