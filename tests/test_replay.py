@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 from collections.abc import Callable
@@ -12,6 +13,8 @@ import gymnasium as gym
 import jsonschema
 import numpy as np
 import pytest
+from environments import Sampler
+from sample_spaces import SPACES, space_id
 
 from tupli_mcap import (
     EpisodeData,
@@ -27,6 +30,7 @@ from tupli_mcap import (
     write_recording,
 )
 from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.replay import (
     CERTIFICATE_NAME,
     Certificate,
@@ -397,3 +401,149 @@ def test_a_storage_sees_its_recording_with_the_certificate(tmp_path: Path) -> No
     bundle = storage.bundle(str(env.id), tmp_path / "bundle.mcap")
     with Recording(bundle) as recording:
         assert read_certificate(recording) == certificate
+
+
+def test_a_repaired_recording_keeps_what_replaying_needs(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("Blackjack-v1"), tmp_path / "a.mcap") as env:
+        env.reset(seed=3)
+        roll(env, 20, seed=None)
+    recover_recording(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    check_complete(certify(tmp_path / "b.mcap"))
+
+
+# --- environments of every kind ---
+
+
+class Drifting(gym.Wrapper[Any, Any, Any, Any]):
+    """Carries state from one episode to the next, whatever the seed."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.taken = 0
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self.taken += 1
+        state, reward, terminal, timeout, info = self.env.step(action)
+        return state, float(reward) + self.taken, terminal, timeout, info
+
+
+def test_a_pickled_environment_goes_on_from_its_captured_state(tmp_path: Path) -> None:
+    inner = Drifting(gym.make("FrozenLake-v1"))
+    roll(inner, 17, seed=4)
+    with RecordEpisodes(inner, tmp_path / "a.mcap") as env:
+        for seed in (None, 5, 5, None, 6):
+            env.reset(seed=seed)
+            done = False
+            while not done:
+                _, _, terminal, timeout, _ = env.step(env.action_space.sample())
+                done = terminal or timeout
+    certificate = certify(tmp_path / "a.mcap")
+    check_complete(certificate)
+    assert certificate.versions["python"] == certificate.recorded_versions["python"]
+    assert certify(tmp_path / "a.mcap", episodes=[4]).agrees  # which needs the wrapper's state from before
+
+
+def test_running_statistics_are_repeated(tmp_path: Path) -> None:
+    inner = gym.wrappers.NormalizeReward(gym.wrappers.NormalizeObservation(gym.make("Pendulum-v1")))
+    check_complete(certify(record(tmp_path / "a.mcap", inner, 450)))
+
+
+def test_episodes_that_an_autoreset_wrapper_starts(tmp_path: Path) -> None:
+    inner = gym.wrappers.Autoreset(gym.make("FrozenLake-v1"))
+    with RecordEpisodes(inner, tmp_path / "a.mcap") as env:
+        env.reset(seed=1)
+        for _ in range(100):
+            env.step(2)
+    certificate = certify(tmp_path / "a.mcap")
+    check_complete(certificate)
+    assert certificate.agreed.episodes > 5
+
+
+@pytest.mark.filterwarnings("ignore:.*You are calling 'step")
+def test_episodes_without_a_reset_and_with_options(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "a.mcap") as env:
+        env.reset(seed=1, options={"low": -0.2, "high": 0.2})
+        for _ in range(40):  # goes on after its end
+            env.step(0)
+        env.reset(options={"low": 0.0, "high": 0.01})
+        env.step(1)
+    certificate = certify(tmp_path / "a.mcap")
+    check_complete(certificate)
+    assert certificate.agreed.episodes > 5
+
+
+@pytest.mark.parametrize("space", SPACES, ids=space_id)
+def test_every_space(tmp_path: Path, space: gym.Space[Any]) -> None:
+    env = Sampler(
+        space, copy.deepcopy(space), length=4
+    )  # an action space of its own, with a generator of its own
+    check_complete(certify(record(tmp_path / "a.mcap", env, 14, seed=2)))
+
+
+class Breaking(gym.Env[Any, Any]):
+    """Raises at a step that the recording has, if it is told to."""
+
+    observation_space = gym.spaces.Dict(
+        {"pos": gym.spaces.Box(-9, 9, (2,), np.float64), "n": gym.spaces.Discrete(9)}
+    )
+    action_space = gym.spaces.Discrete(2)
+    breaks_at: int | None = None
+    places = 9
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._state(), {}
+
+    def _state(self) -> Any:
+        return {"pos": self.np_random.normal(size=2)[: self.places], "n": self.steps % 9}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self.steps == self.breaks_at:
+            raise RuntimeError("no more\nfuel")
+        self.steps += 1
+        return self._state(), 0.0, False, False, {}
+
+
+def test_an_error_of_the_environment_is_a_divergence(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", Breaking(), 10)
+    check_complete(certify(path))
+    broken = Breaking()
+    broken.breaks_at = 6
+    first = certify(path, env=broken).first
+    assert first is not None
+    assert (first.kind, first.step, first.found) == ("error", 6, "RuntimeError: no more fuel")
+
+
+def test_another_shape_is_a_divergence_at_its_key(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", Breaking(), 10)
+    other = Breaking()
+    other.places = 1
+    first = certify(path, env=other).first
+    assert first is not None
+    assert (first.step, first.leaf, first.path) == (0, "state_pos", "state['pos']")
+    assert "expected shape (2,), found shape (1,)" in first.found
+    assert first.largest_difference is None
+
+
+def test_an_environment_with_other_spaces_is_refused(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 10)
+    with pytest.raises(RecordingError, match="expected an environment with the observation_space"):
+        certify(path, env=gym.make("Pendulum-v1"))
+
+
+def test_a_recording_without_an_environment(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "a.mcap", attachments={}) as env:
+        roll(env, 20)
+    with pytest.raises(RecordingError, match="carries no environment"):
+        certify(tmp_path / "a.mcap")
+    check_complete(certify(tmp_path / "a.mcap", env=gym.make("CartPole-v1")))
+
+
+def test_a_recording_without_episodes(tmp_path: Path) -> None:
+    env = gym.make("CartPole-v1")
+    spaces = {"observation_space": env.observation_space, "action_space": env.action_space}
+    write_recording(tmp_path / "a.mcap", [], **spaces)
+    certificate = certify(tmp_path / "a.mcap", env=env)
+    assert not certificate.agrees and not certificate.complete
+    assert certificate.recorded.episodes == 0

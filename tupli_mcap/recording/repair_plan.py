@@ -83,6 +83,9 @@ class Told:
     """What the messages of the episode channels say (time, message), and what the index says, by episode."""
 
     starts: dict[int, tuple[int, EpisodeStart]] = field(default_factory=dict)
+    resets: dict[int, list[tuple[int, EpisodeStart]]] = field(
+        default_factory=dict
+    )  # those before it, without a step
     ends: dict[int, tuple[int, EpisodeEnd]] = field(default_factory=dict)
     finals: dict[int, int] = field(default_factory=dict)
     index: dict[int, int] = field(default_factory=dict)
@@ -94,7 +97,7 @@ class PlannedEpisode(NamedTuple):
 
     `head`, `tail`: its first step was the old one's first, its last one the old one's last. `length`: of the old
     episode, None if not known. `final`: its row in the old `/final_state` (as packed), -1 for the running state, None
-    if there is none. `orphan`: metadata of the old episode, whose end is not here.
+    if there is none. `orphan`: metadata of the old episode, whose end is not here. `resets`: without a step, before it.
     """
 
     number: int
@@ -107,6 +110,7 @@ class PlannedEpisode(NamedTuple):
     end: tuple[int, EpisodeEnd]
     final: int | None
     orphan: str = ""
+    resets: tuple[tuple[int, EpisodeStart], ...] = ()
 
 
 @dataclass
@@ -208,6 +212,8 @@ def read_told(gathered: Gathered, store: PackedStore, channels: Channels) -> Tol
         except FormatError:
             told.bad += 1
             continue
+        if start.episode in told.starts:
+            told.resets.setdefault(start.episode, []).append(told.starts[start.episode])
         told.starts[start.episode] = (time, start)
     for _, time, body in messages(store, channels.end):
         try:
@@ -339,7 +345,10 @@ class _Planner:
         end = self._end(segment, number, length, final is not None, head=head, tail=tail)
         told = self._told.ends.get(segment.episode)
         orphan = "" if told is None or tail else told[1].metadata
-        return PlannedEpisode(number, segment, whole, head, tail, length, start, end, final, orphan)
+        resets = tuple(
+            reset for reset in self._told.resets.get(number, ()) if head and reset[1].env == segment.env
+        )
+        return PlannedEpisode(number, segment, whole, head, tail, length, start, end, final, orphan, resets)
 
     def _final(self, segment: Segment, closing: bool) -> int | None:
         told = self._told.ends.get(segment.episode)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import re
 import time
@@ -204,7 +205,8 @@ class RepairWriter:
     ) -> None:
         starts = sorted(plan.episodes, key=lambda e: (e.start[0], e.number))
         ends = sorted(plan.episodes, key=lambda e: (e.end[0], e.number))
-        start_rows = {e.number: i for i, e in enumerate(starts)}
+        counts = itertools.accumulate(len(e.resets) + 1 for e in starts)
+        start_rows = {e.number: count - 1 for e, count in zip(starts, counts, strict=True)}
         end_rows = {e.number: i for i, e in enumerate(ends)}
         with_final = [e for e in ends if e.final is not None]
         final_rows = {e.number: i for i, e in enumerate(with_final)}
@@ -225,7 +227,12 @@ class RepairWriter:
                 ),
                 text,
             )  # fmt: skip
-        self._put(new.start, ((e.start[0], moved[e.number][0].encode()) for e in starts))
+        resets = {
+            e.number: [(time, reset._replace(first_row=rows[e.number])) for time, reset in e.resets]
+            for e in starts
+        }
+        told = ([*resets[e.number], (e.start[0], moved[e.number][0])] for e in starts)
+        self._put(new.start, ((time, start.encode()) for found in told for time, start in found))
         self._put(new.end, ((e.end[0], moved[e.number][1].encode()) for e in ends))
         self._put(new.final_state, ((e.end[0], self._final(e, store, old)) for e in with_final))
 

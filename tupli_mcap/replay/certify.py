@@ -26,7 +26,7 @@ _MAX_DIVERGENCES = 100
 _REASONS: dict[SkipKind, str] = {
     "unseeded": "reset without a seed, from a random state that the recording does not hold",
     "after_divergence": "reset without a seed, after an episode that diverged",
-    "no_predecessor": "reset without a seed, after episodes that are not in the recording any more",
+    "no_predecessor": "reset without a seed, after steps or episodes that are not in the recording any more",
 }
 
 
@@ -90,7 +90,7 @@ class _Certifier:
             if self._chosen:
                 self._checker = Checker(self._recording.layout, casts=self._recording.is_vector)
                 for plans in plan_episodes(self._recording, captured=captured):
-                    self._replay(_needed(plans, self._chosen))
+                    self._sub_environment(plans)
         return self._certificate()
 
     def _make(self) -> gym.Env[Any, Any]:
@@ -105,8 +105,19 @@ class _Certifier:
     def _replayer(self) -> Replayer:
         return Replayer(self._make, owned=self._given is None)
 
+    def _sub_environment(self, plans: list[EpisodePlan]) -> None:
+        """The chosen episodes of one sub-environment, and what they go on from; everything before them too if a wrapper
+        seems to carry state beyond a seed."""
+        everything = _up_to_last(plans, self._chosen)
+        needed = _needed(everything, self._chosen)
+        self._replay(needed)
+        if len(needed) < len(everything) and self._given is None:
+            outcomes = [self._outcomes[plan.position] for plan in needed if plan.number in self._chosen]
+            if any(isinstance(outcome, Divergence) for outcome in outcomes):
+                self._replay(everything)
+
     def _replay(self, plans: list[EpisodePlan]) -> None:
-        """Episodes of one sub-environment, in order."""
+        """Episodes in order, on one environment."""
         replayer = self._replayer()
         doubt: SkipKind | None = "unseeded"
         try:
@@ -261,6 +272,11 @@ def _chosen(recording: Recording, episodes: Sequence[int] | None) -> frozenset[i
             "`tupli-mcap episodes` lists them"
         )
     return chosen
+
+
+def _up_to_last(plans: list[EpisodePlan], chosen: frozenset[int]) -> list[EpisodePlan]:
+    last = max((i for i, plan in enumerate(plans) if plan.number in chosen), default=-1)
+    return plans[: last + 1]
 
 
 def _needed(plans: list[EpisodePlan], chosen: frozenset[int]) -> list[EpisodePlan]:

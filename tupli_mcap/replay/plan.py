@@ -31,7 +31,7 @@ class EpisodePlan(NamedTuple):
         environment in the file is as it was before that reset), "follows" (no seed, the episode before it is
         recorded), "continues" (no reset at all), "unknown" (no seed, and what came before it is not recorded).
     after_end: the episode before it in its sub-environment came to an end, so that it was not cut short by this reset.
-    gap: episodes that came before it are not in the recording any more.
+    gap: what came before it is not all in the recording any more.
     resets: those to be made, the last one is the episode's; none if it continues without one.
     auto: it may have been started by `gymnasium.wrappers.Autoreset`, which resets in `step`.
     """
@@ -77,13 +77,15 @@ def _plan(recording: Recording, position: int, before: int | None, captured: boo
     # Numbers count over all sub-environments: whose episode is missing cannot be said.
     gap = number != position if before is None else number - position != _shift(recording, before)
     after_end = before is not None and recording.index[before]["end"] != INTERRUPTED
+    # an episode that was cut out of damage, or made by hand, does not tell where it left the environment
+    gap = gap or (before is not None and recording.index[before]["final_row"] < 0)
     earlier = recording.resets_before(position)
     lost = [i for i, reset in enumerate(earlier) if reset.continued]
     starts = [*(earlier[lost[-1] + 1 :] if lost else earlier), start]
     seeded = [i for i, reset in enumerate(starts) if reset.seed_number is not None]
     how: How
     if start.continued:
-        how = "unknown" if before is None else "continues"
+        how = "continues" if after_end else "unknown"
         starts = []
     elif seeded:
         how = "seeded" if starts[seeded[-1]].seed_given else "drawn"
