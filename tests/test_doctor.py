@@ -24,6 +24,7 @@ from tupli_mcap import (
     TupliDataset,
     TupliEnvWrapper,
     rewrite_recording,
+    vector,
     write_recording,
 )
 from tupli_mcap.cli import app
@@ -230,6 +231,14 @@ def test_outside_of_the_space(
     assert finding.count == 3 * size
     good_path = scripted(tmp_path / "good.mcap", lambda n: good, space)
     assert examine(good_path).of("outside-space") == ()
+
+
+def test_choices_beyond_all_integers(tmp_path: Path) -> None:
+    huge = spaces.Discrete(2**62 + 5, start=2**62)
+    path = scripted(
+        tmp_path / "a.mcap", lambda n: np.int64(2**62 + n), huge, act=lambda n: 2**62, actions=huge
+    )
+    assert {finding.check for finding in examine(path).findings} == {"duplicate-episodes"}
 
 
 def test_rounding_errors_at_a_bound_are_no_warning(tmp_path: Path) -> None:
@@ -439,6 +448,48 @@ def test_missing_final_states(tmp_path: Path) -> None:
     assert found(examine(path), "missing-final-state").severity is INFO
 
 
+class EarlyReset(gym.Wrapper[Any, Any, Any, Any]):
+    """Resets by itself, and gives the fresh observation with the last reward, as same-step autoreset does."""
+
+    def step(self, action: Any) -> Any:
+        state, reward, terminal, timeout, info = self.env.step(action)
+        if terminal or timeout:
+            state, _ = self.env.reset()
+        self.fresh = state
+        return state, reward, terminal, timeout, info
+
+    def reset(self, **_: Any) -> Any:
+        return (self.fresh if hasattr(self, "fresh") else self.env.reset()[0]), {}
+
+
+@pytest.mark.parametrize("block_bytes", [1, 8 << 20])
+@pytest.mark.parametrize(
+    "space", [UNIT, spaces.Dict({"a": UNIT, "b": spaces.Text(9)})], ids=["array", "text"]
+)
+def test_final_states_of_the_next_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, space: gym.Space[Any], block_bytes: int
+) -> None:
+    monkeypatch.setattr("tupli_mcap.doctor.blocks.BLOCK_BYTES", block_bytes)
+    bad = record(tmp_path / "bad.mcap", EarlyReset(Sampler(space, spaces.Discrete(3))), 70)
+    finding = found(examine(bad), "final-state-is-reset")
+    assert (finding.severity, finding.count, finding.total) == (WARNING, 9, 9)
+    assert places(finding) == [(i, 7) for i in range(5)]
+    good = record(tmp_path / "good.mcap", Sampler(space, spaces.Discrete(3)), 70)
+    assert examine(good).of("final-state-is-reset") == ()
+
+
+def test_stepping_on_without_a_reset(tmp_path: Path) -> None:
+    with RecordEpisodes(Scripted(still, UNIT, length=4), tmp_path / "a.mcap") as env:
+        for _ in range(3):
+            env.reset()
+            for _ in range(5):
+                env.step(0)
+    finding = found(examine(tmp_path / "a.mcap"), "missing-reset")
+    assert (finding.severity, finding.count, finding.total) == (WARNING, 3, 6)
+    assert places(finding) == [(1, None), (3, None), (5, None)]
+    assert examine(scripted(tmp_path / "b.mcap")).of("missing-reset") == ()
+
+
 def test_episodes_of_unusual_length(tmp_path: Path) -> None:
     path = by_hand(tmp_path / "a.mcap", [{"length": 1500 if i == 4 else 12} for i in range(20)])
     finding = found(examine(path), "episode-length")
@@ -474,17 +525,35 @@ def test_duplicates_by_chance_are_no_warning(tmp_path: Path) -> None:
         assert places(finding) == [(0, None), (1, None), (2, None)]
 
 
-@pytest.mark.parametrize("block_bytes", [1, 500])
-def test_digests_do_not_depend_on_blocks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
+@pytest.mark.parametrize("block_bytes", [1, 500, 20_000])
+@pytest.mark.parametrize("variable", [False, True], ids=["constant", "variable"])
+def test_findings_do_not_depend_on_blocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, variable: bool
 ) -> None:
-    space = spaces.Dict({"x": UNIT, "note": spaces.Text(4), "cam": spaces.Box(0, 255, (2, 2, 3), np.uint8)})
+    parts = {"x": UNIT, "cam": spaces.Box(0, 255, (2, 2, 3), np.uint8)}
+    space = spaces.Dict({**parts, **({"note": spaces.Text(4)} if variable else {})})
+    clock = Clock(monkeypatch)
 
     def observe(n: int) -> Any:
-        return {"x": still(n), "note": "ab"[n % 2], "cam": np.full((2, 2, 3), n, np.uint8)}
+        clock.now += 5 * 10**9 if n == 70 else 10**6
+        state = still(n) if n != 33 else np.float32([0, np.nan, 2])
+        frame = np.full((2, 2, 3), n if n < 40 else 40, np.uint8)
+        return {"x": state, "cam": frame, **({"note": "abc"[n % 3]} if variable else {})}
 
-    path = scripted(tmp_path / "a.mcap", observe, space, length=20)
+    def reward(n: int) -> float:
+        return 1e7 if n == 21 else float(n % 5)
+
+    path = scripted(tmp_path / "a.mcap", observe, space, length=80, reward=reward)
     whole = examine(path)
+    expected = {
+        "nan",
+        "outside-space",
+        "frozen-frames",
+        "reward-outliers",
+        "duplicate-episodes",
+        "clock-jump",
+    }
+    assert expected <= {finding.check for finding in whole.findings}
     monkeypatch.setattr("tupli_mcap.doctor.blocks.BLOCK_BYTES", block_bytes)
     assert examine(path) == whole
     assert found(whole, "duplicate-episodes").count == 2
@@ -612,6 +681,19 @@ def test_clock_jumps(
     assert (finding.severity, finding.count, finding.total) == (severity, 3, 27)
     assert places(finding) == [(0, 6), (1, 6), (2, 6)]
     assert "the median is 1.0 ms" in finding.message
+
+
+def test_clocks_of_sub_environments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch)
+    envs = gym.make_vec("CartPole-v1", 3, vectorization_mode="sync")
+    with vector.RecordEpisodes(envs, tmp_path / "a.mcap") as env:
+        env.action_space.seed(1)
+        env.reset(seed=1)
+        for n in range(8):
+            clock.now += 30 * 10**9 if n == 5 else 10**6
+            env.step(env.action_space.sample())
+    finding = found(examine(tmp_path / "a.mcap"), "clock-jump")
+    assert (finding.count, finding.total, places(finding)) == (3, 21, [(0, 5), (1, 5), (2, 5)])
 
 
 def test_a_clock_that_was_set_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -753,6 +835,12 @@ def test_command_exit_codes(tmp_path: Path) -> None:
     assert run(tmp_path / "missing.mcap", "--fail-on", "never")[0] == 1
     assert run(bad, "--check", "nam")[0] == 2
     assert run(bad, "--filter", "nonsense = 1")[0] == 2
+    assert run(warned, "--fail-on", "warning", "--check", "unused-action")[0] == 0
+    many = "unused-action.steps_each=5"
+    few = scripted(tmp_path / "few.mcap", act=lambda n: n % 2)
+    assert run(few, "--fail-on", "warning", "--check", "unused-action", "--set", many)[0] == 1
+    for wrong in ("unused-action.nothing=3", "nothing.frames=3", many.replace("5", "many")):
+        assert run(few, "--set", wrong)[0] == 2
     assert run(bad, "--filter", "n_tuples > 10")[0] == 0
 
 

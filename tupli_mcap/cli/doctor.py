@@ -57,6 +57,10 @@ def _doctor(
     skip: Annotated[
         list[str] | None, typer.Option("--skip", metavar="ID", help="Leave this check out (repeatable).")
     ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="ID.NAME=N", help="Another threshold; --list --json names them."),
+    ] = None,
     list_checks: Annotated[bool, typer.Option("--list", help="List the checks instead.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -81,6 +85,7 @@ def _doctor(
             paths or ["."],
             checks=check,
             skip=skip or (),
+            thresholds=_thresholds(settings or ()),
             episode_filter=filter_of(filter_text),
             progress=progress,
         )
@@ -93,6 +98,23 @@ def _doctor(
         failing += diagnosis.at_least(Severity[fail_on.name.upper()])
     if failing:
         raise typer.Exit(1)
+
+
+def _thresholds(settings: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Thresholds by check, from texts such as `frozen-frames.frames=50`."""
+    from tupli_mcap.doctor import CHECKS
+
+    found: dict[str, dict[str, float]] = {}
+    for setting in settings:
+        name, _, text = setting.partition("=")
+        check, _, threshold = name.partition(".")
+        if check not in CHECKS or threshold not in CHECKS[check].thresholds:
+            raise typer.BadParameter(f"there is no threshold {name!r}; see tupli-mcap doctor --list --json")
+        try:
+            found.setdefault(check, {})[threshold] = float(text)
+        except ValueError as err:
+            raise typer.BadParameter(f"expected a number for {name}, found {text!r}") from err
+    return found
 
 
 def _print_checks(as_json: bool) -> None:

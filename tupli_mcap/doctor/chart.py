@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from tupli_mcap.doctor.blocks import Array, Block, blocks
 from tupli_mcap.doctor.findings import MAX_PLACES, Place
 from tupli_mcap.doctor.gather.digests import Digests
+from tupli_mcap.doctor.gather.resets import Seams, continued
 from tupli_mcap.doctor.gather.sequence import Clock, Flags, Frames, Rewards
 from tupli_mcap.doctor.gather.values import ArrayValues, VariableValues
 from tupli_mcap.errors import FormatError
@@ -20,7 +22,7 @@ from tupli_mcap.recording.describe import state_of
 
 __all__ = ["NEEDS", "Chart"]
 
-NEEDS = frozenset({"values", "frames", "clock", "rewards", "flags", "digests"})
+NEEDS = frozenset({"values", "frames", "clock", "rewards", "flags", "digests", "seams"})
 
 
 class Chart:
@@ -48,6 +50,7 @@ class Chart:
         self.clock = Clock()
         self.flags = Flags()
         self.digests: Digests | None = None
+        self.seams: Seams | None = None
 
     def measure(self, needs: Collection[str]) -> None:
         """Read the steps once.
@@ -70,6 +73,8 @@ class Chart:
             }
         if "digests" in needs:
             self.digests = Digests(layout.leaves)
+        if "seams" in needs:
+            self.seams = Seams(layout.state)
         for block in blocks(self.recording, self.positions):
             self._put(block, needs)
 
@@ -103,6 +108,8 @@ class Chart:
             self.flags.put(block)
         if self.digests is not None:
             self.digests.put(block)
+        if self.seams is not None:
+            self.seams.put(block)
 
     def places(self, found: Iterable[tuple[int, ...]]) -> tuple[Place, ...]:
         """The first (episode, step, ...) as places."""
@@ -113,6 +120,11 @@ class Chart:
         """The first episodes of a mask over `rows`."""
         numbers = self.rows["episode"][chosen][:MAX_PLACES]
         return tuple(Place(self.path, int(number)) for number in numbers)
+
+    @cached_property
+    def continued(self) -> Array:
+        """Which of the episodes began with a step after an end, without a reset (bool)."""
+        return continued(self.recording, self.rows)
 
     def metadata_text(self, i: int) -> str:
         """The metadata of the i-th of the episodes, as JSON text."""

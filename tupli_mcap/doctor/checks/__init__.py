@@ -7,7 +7,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from tupli_mcap.doctor.checks import actions, clocks, endings, files, repeats, rewarding, values, variation
+from tupli_mcap.doctor.checks import (
+    actions,
+    clocks,
+    endings,
+    files,
+    repeats,
+    resets,
+    rewarding,
+    values,
+    variation,
+)
 from tupli_mcap.doctor.findings import Finding
 
 __all__ = ["CHECKS", "Check"]
@@ -62,6 +72,13 @@ CHECKS: dict[str, Check] = {
         Check(
             "missing-final-state", "episodes whose last next state is unknown", endings.missing_final_state
         ),
+        Check(
+            "final-state-is-reset",
+            "final states that belong to the next episode",
+            resets.final_state_is_reset,
+            frozenset({"seams"}),
+        ),
+        Check("missing-reset", "steps after an end without a reset", resets.missing_reset),
         Check("one-step-episodes", "episodes of a single step", endings.one_step_episodes),
         Check("episode-length", "episodes longer than the limit, or than all others", endings.episode_length),
         Check(

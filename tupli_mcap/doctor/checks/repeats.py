@@ -56,11 +56,10 @@ def duplicate_episodes(recordings: Sequence[Contents], *, rarity: float = 1000) 
     if not copies.any():
         return
     lengths = np.concatenate([found.lengths for found in recordings]).astype(np.float64)
-    choices = np.concatenate([np.full(len(found.digests), found.choices) for found in recordings])
-    with np.errstate(divide="ignore"):
-        chance = (choices > 0) & (
-            lengths * np.log(np.maximum(choices, 1)) <= np.log(rarity) + 2 * np.log(total)
-        )
+    choices = np.concatenate([np.full(len(found.digests), float(found.choices)) for found in recordings])
+    alike = np.array([(choices == found.choices).sum() for found in recordings], np.float64)
+    pairs = 2 * np.log(np.repeat(alike, [len(found.digests) for found in recordings]))
+    chance = (choices > 0) & (lengths * np.log(np.maximum(choices, 1)) <= np.log(rarity) + pairs)
     owners = np.repeat(np.arange(len(recordings)), [len(found.digests) for found in recordings])
     numbers = np.concatenate([found.numbers for found in recordings])
     for severity, chosen in ((Severity.WARNING, copies & ~chance), (Severity.INFO, copies & chance)):

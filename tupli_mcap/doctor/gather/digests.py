@@ -23,12 +23,10 @@ class Digests:
         self._packed = [leaf for leaf in leaves if leaf.kind not in ("image", "variable") and leaf.size]
         self._single = [leaf for leaf in leaves if leaf.kind in ("image", "variable")]
         # Content that differs in structure only must differ too.
-        self._head = repr([(leaf.path, leaf.kind, leaf.shape) for leaf in leaves]).encode()
-        self._running = self._new()
+        head = repr([(leaf.path, leaf.kind, leaf.shape) for leaf in leaves]).encode()
+        self._empty = hashlib.blake2b(head, digest_size=_SIZE)
+        self._running = self._empty.copy()
         self._done: list[bytes] = []
-
-    def _new(self) -> Any:
-        return hashlib.blake2b(self._head, digest_size=_SIZE)
 
     def put(self, block: Block) -> None:
         packed = self._pack(block)
@@ -40,7 +38,7 @@ class Digests:
                 feed(self._running, block.leaves[leaf.name][start : start + length])
             if block.whole or i + 1 < len(block.lengths):
                 self._done.append(self._running.digest())
-                self._running = self._new()
+                self._running = self._empty.copy()
 
     def _pack(self, block: Block) -> Array:
         columns = [np.ascontiguousarray(block.leaves[leaf.name]) for leaf in self._packed]

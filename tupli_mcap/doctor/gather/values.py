@@ -19,6 +19,7 @@ __all__ = ["ArrayValues", "VariableValues", "bounds_of"]
 Locate = Callable[[int], tuple[int, int]]
 _NARROW = 64  # elements a step up to which a transposed copy makes reductions quicker
 _MANY_ACTIONS = 1 << 12
+_INT64_MAX = 2**63 - 1
 
 
 def bounds_of(leaf: Leaf) -> tuple[Array, Array]:
@@ -27,12 +28,16 @@ def bounds_of(leaf: Leaf) -> tuple[Array, Array]:
     if isinstance(space, spaces.Box):
         return space.low.reshape(-1), space.high.reshape(-1)
     if isinstance(space, spaces.Discrete):
-        start = int(space.start)
-        return np.array([start]), np.array([start + int(space.n) - 1])
+        return _choices([int(space.start)], [int(space.n)])
     if isinstance(space, spaces.MultiDiscrete):
-        low = np.asarray(space.start).reshape(-1).astype(np.int64)
-        return low, low + space.nvec.reshape(-1) - 1
+        return _choices(np.asarray(space.start).reshape(-1).tolist(), space.nvec.reshape(-1).tolist())
     return np.zeros(leaf.size, np.int8), np.ones(leaf.size, np.int8)
+
+
+def _choices(starts: list[int], sizes: list[int]) -> tuple[Array, Array]:
+    # As Python's integers: a file may claim choices beyond what int64 holds.
+    ends = [min(start + n - 1, _INT64_MAX) for start, n in zip(starts, sizes, strict=True)]
+    return np.array([min(start, _INT64_MAX) for start in starts], np.int64), np.array(ends, np.int64)
 
 
 class ArrayValues:
