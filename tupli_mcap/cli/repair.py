@@ -1,4 +1,4 @@
-"""Commands on damaged files: recover."""
+"""Commands on files that may be damaged: verify, recover."""
 
 from __future__ import annotations
 
@@ -11,16 +11,65 @@ from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import Column, bytes_of, number, print_json, print_table
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording.findings import VerifyReport
     from tupli_mcap.recording.repair import RecoveryReport
 
 __all__ = ["register"]
 
+_STATES = {"unfinished": "not finished", "recording": "being recorded"}
 _SHOWN = 20  # damaged places, lost episodes: what is beyond is in --json
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the application."""
+    app.command("verify")(_verify)
     app.command("recover")(_recover)
+
+
+def _verify(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(metavar="PATH...", help="Recordings, other MCAP files, directories, storages."),
+    ],
+    as_json: Json = False,
+) -> None:
+    """Check files for damage: structure, CRCs, indexes, layouts, alignment, digests.
+
+    Every episode has to start, go on and end, without a gap or a step twice. Of a storage, artifacts, benchmarks
+    and the catalog are checked too. Nothing is executed, nothing is written. Exit code 1 if something is damaged.
+    """
+    from tupli_mcap.storage.verify import StorageReport, verify_paths
+
+    found = StorageReport()
+    for report in verify_paths(paths):
+        found.files.append(report)
+        if not as_json:
+            _print_verified(report)
+    if as_json:
+        print_json(found.to_json())
+    elif len(found.files) > 1:
+        print(f"{number(len(found.files))} verified, {number(len(found.damaged))} damaged")
+    if not found.ok:
+        raise typer.Exit(1)
+
+
+def _print_verified(report: VerifyReport) -> None:
+    """A line on a file, and one on each problem."""
+    facts = {
+        "recording": f"{number(report.episodes)} episodes, {number(report.steps)} steps",
+        "mcap": f"no recording, {number(report.messages)} messages",
+        "storage": f"{number(report.attachments)} artifacts",
+    }[report.kind]
+    damage = f"{number(len(report.errors) + report.more)} problems"
+    state = "" if report.state == "complete" else f", {_STATES[report.state]}"
+    print(f"{report.path}: {'ok' if report.ok else damage} ({facts}{state})")
+    shown = report.problems[:_SHOWN]
+    for problem in shown:
+        place = f"{problem.place}: " if problem.place else ""
+        print(f"  {problem.severity}: {place}{problem.message}; {problem.advice}")
+    hidden = len(report.problems) - len(shown) + report.more
+    if hidden:
+        print(f"  ... and {number(hidden)} more; see --json")
 
 
 def _recover(

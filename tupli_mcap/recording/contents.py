@@ -28,10 +28,10 @@ from tupli_mcap.recording.summary import (
 __all__ = ["Contents", "read_contents"]
 
 RECORDING_METADATA = "tupli_mcap.recording"
-_KEYS = (
+RECORDING_KEYS = (
     "uuid", "format_version", "library", "created_ns", "benchmark_id", "journal", "rewritten", "next_episode",
 )  # fmt: skip
-_CHANNEL_KEYS = (
+CHANNEL_KEYS = (
     "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields",
 )  # fmt: skip
 _ATTEMPTS = 5
@@ -133,8 +133,8 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
         FormatError: they are not numbered from 0, or the metadata of a channel is damaged.
     """
     for channel in channels.values():
-        if _is_ours(channel.topic):
-            check_crc(channel.metadata, _CHANNEL_KEYS, f"{name}: the metadata of channel {channel.topic}")
+        if is_ours(channel.topic):
+            check_crc(channel.metadata, CHANNEL_KEYS, f"{name}: the metadata of channel {channel.topic}")
     found = [channel for channel in channels.values() if channel.topic.endswith("/step")]
     by_env = {channel.metadata.get("env", ""): channel for channel in found}
     numbers = [str(i) for i in range(len(found))]
@@ -145,7 +145,7 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
     return [by_env[number] for number in numbers]
 
 
-def _is_ours(topic: str) -> bool:
+def is_ours(topic: str) -> bool:
     return topic in ("/final_state", "/info") or topic.endswith("/step") or "/image/" in topic
 
 
@@ -154,7 +154,7 @@ def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
     version = found.get("format_version")
     if version != "1":
         raise FormatError(f"{source.name}: expected format version '1', found {version!r}; update tupli-mcap")
-    metadata = check_crc(found, _KEYS, f"{source.name}: the metadata record {RECORDING_METADATA!r}")
+    metadata = check_crc(found, RECORDING_KEYS, f"{source.name}: the metadata record {RECORDING_METADATA!r}")
     for key, what, pattern in _VALUES:
         if not pattern.fullmatch(metadata.get(key, "")):
             raise FormatError(f"{source.name}: expected {key!r} of {what}, found {metadata.get(key)!r:.60}")

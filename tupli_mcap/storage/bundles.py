@@ -114,7 +114,7 @@ def read(storage: FileStorage, path: Path, *, trust: bool = False) -> str:
         StorageError: It carries no benchmark, or lacks an artifact.
     """
     with Recording(path) as recording:
-        record, header, query = _incoming(recording, path)
+        record, header, query = incoming(recording, path)
         artifacts = _read_artifacts(storage, recording, record, path)
         for data, metadata in artifacts:
             storage.store_artifact(data, metadata)
@@ -132,7 +132,7 @@ def preview(storage: FileStorage | None, path: Path) -> ImportPreview:
     storage: None stands for an empty one.
     """
     with Recording(path) as recording:
-        record, header, _ = _incoming(recording, path)
+        record, header, _ = incoming(recording, path)
         found = artifacts_of(record, str(path))
         _read_artifacts(storage, recording, record, path)
         known = set() if storage is None else {item.id for item in storage.list_artifacts()}
@@ -179,7 +179,7 @@ def from_recording(path: Path, target: Path, storage: FileStorage | None = None)
     return target
 
 
-def _incoming(recording: Recording, path: Path) -> tuple[EnvironmentRecord, BenchmarkHeader, BenchmarkQuery]:
+def incoming(recording: Recording, path: Path) -> tuple[EnvironmentRecord, BenchmarkHeader, BenchmarkQuery]:
     record = _environment(recording, path)
     header = _header(record, path)
     query = BenchmarkQuery(

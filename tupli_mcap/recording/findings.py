@@ -1,0 +1,104 @@
+"""What verification finds: typed problems, each with its place and what to do about it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+__all__ = ["Findings", "Problem", "VerifyReport"]
+
+_MOST = 1000  # problems that are kept of a file; the others are counted
+_RECOVER = "save what is good with tupli-mcap recover"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something found in a file. `severity` "error": the file is damaged; "note": worth to know.
+
+    kind: "file", "record", "chunk", "message_index", "attachment", "metadata", "summary", "index", "layout", "rows",
+        "episode", "final_state", "info", "image", "benchmark", "journal", or one of a storage's.
+    offset: in the file (bytes). channel: a topic. episode, step: numbers.
+    """
+
+    kind: str
+    message: str
+    severity: str = "error"
+    advice: str = _RECOVER
+    offset: int | None = None
+    channel: str | None = None
+    episode: int | None = None
+    step: int | None = None
+
+    @property
+    def place(self) -> str:
+        """Where it is, for people; empty if it is the whole file."""
+        parts = [
+            f"{name} {value}"
+            for name, value in (
+                ("offset", self.offset),
+                ("channel", self.channel),
+                ("episode", self.episode),
+                ("step", self.step),
+            )
+            if value is not None
+        ]
+        return ", ".join(parts)
+
+
+@dataclass
+class VerifyReport:
+    """What was verified in a file, and what was found.
+
+    kind: "recording" (ours) or "mcap". state: "complete", "unfinished" (its writer was killed) or "recording" (a
+    writer is at work on it). more: problems beyond the first thousand.
+    """
+
+    path: str
+    kind: str = "recording"
+    state: str = "complete"
+    size: int = 0
+    chunks: int = 0
+    messages: int = 0
+    episodes: int = 0
+    steps: int = 0
+    attachments: int = 0
+    problems: list[Problem] = field(default_factory=list)
+    more: int = 0
+
+    @property
+    def errors(self) -> list[Problem]:
+        """The problems that are damage."""
+        return [problem for problem in self.problems if problem.severity == "error"]
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is no damage."""
+        return not self.errors
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as JSON has it."""
+        return {**asdict(self), "ok": self.ok}
+
+
+class Findings:
+    """Takes problems down in a report."""
+
+    def __init__(self, report: VerifyReport) -> None:
+        self.report = report
+
+    def error(self, kind: str, message: str, **place: Any) -> None:
+        """Damage, where it is (`Problem`'s fields)."""
+        self._add(Problem(kind, message, **place))
+
+    def note(self, kind: str, message: str, advice: str, **place: Any) -> None:
+        """Something that is no damage."""
+        self._add(Problem(kind, message, "note", advice, **place))
+
+    def _add(self, problem: Problem) -> None:
+        if len(self.report.problems) < _MOST:
+            self.report.problems.append(problem)
+        else:
+            self.report.more += 1
+
+    def __len__(self) -> int:
+        return len(self.report.errors) + self.report.more

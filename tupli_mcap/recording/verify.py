@@ -1,0 +1,138 @@
+"""`verify_recording`: everything that can be wrong with an MCAP file, ours or not. Nothing in it is executed."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import warnings
+from pathlib import Path
+
+from tupli_mcap.environment import EnvironmentRecord
+from tupli_mcap.errors import FormatError, RecordingError, TupliError
+from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
+from tupli_mcap.recording.journal import journal_path
+from tupli_mcap.recording.lock import is_locked
+from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.repair_gather import may_be_recording
+from tupli_mcap.recording.source import PathSource, Source
+from tupli_mcap.recording.summary import has_summary
+from tupli_mcap.recording.tail import read_tail
+from tupli_mcap.recording.verify_episodes import verify_episodes
+from tupli_mcap.recording.verify_foreign import verify_foreign
+from tupli_mcap.recording.verify_structure import Structure
+
+__all__ = ["Problem", "VerifyReport", "verify_recording"]
+
+_ARTIFACT = "artifacts/"
+
+
+def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
+    """Checks a file: structure, every CRC, indexes against contents, layouts, alignment, digests.
+
+    Of an MCAP file that is none of ours structure, CRCs and indexes are checked. A file that cannot be read is
+    reported, as a problem. Chunks are read one at a time.
+
+    Raises:
+        RecordingError: there is no such file.
+    """
+    report = VerifyReport(str(path))
+    findings = Findings(report)
+    try:
+        source = PathSource(Path(path))
+    except RecordingError:
+        if not Path(path).is_file():
+            raise
+        findings.error("file", "it cannot be opened", advice="check its permissions")
+        return report
+    try:
+        _verify(source, findings)
+    except (FormatError, OSError) as err:
+        findings.error("file", str(err).removeprefix(f"{source.name}: "))
+    finally:
+        source.close()
+    return report
+
+
+def _verify(source: Source, findings: Findings) -> None:
+    report = findings.report
+    report.size = source.size
+    if not source.size:
+        findings.error("file", "it is empty", advice="delete it, or record again")
+        return
+    live = source.path is not None and is_locked(source.path)
+    tail = read_tail(source)
+    if not may_be_recording(source, tail):
+        report.kind = "mcap"
+        verify_foreign(source, tail, findings)
+        return
+    if not has_summary(source) and tail.index is None:
+        report.state = "recording" if live else "unfinished"
+        _note_unfinished(source, findings)
+    Structure(source, tail, findings).run()
+    _contents(source, findings)
+    if live and report.state == "complete":
+        report.state = "recording"
+
+
+def _note_unfinished(source: Source, findings: Findings) -> None:
+    if findings.report.state == "recording":
+        findings.note("file", "a writer is at work on it", "verify it again once it is closed")
+        return
+    findings.note(
+        "file",
+        "its writer did not finish it; all finished steps are there",
+        "append to it, or write a finished copy with tupli-mcap recover",
+    )
+    if source.path is not None and not journal_path(source.path).exists():
+        findings.note(
+            "journal",
+            "there is no journal beside it: steps not yet in a chunk are not here",
+            "keep a recording and its journal together",
+        )
+
+
+def _contents(source: Source, findings: Findings) -> None:
+    """What a reader sees."""
+    damaged = len(findings)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # what they say of the journal is a note
+            recording = Recording(source.name if source.path is None else source.path)
+    except (FormatError, RecordingError) as err:
+        if not damaged:  # else the reader says again what is known, or what follows from it
+            findings.error("layout", str(err).removeprefix(f"{source.name}: "))
+        return
+    with recording:
+        findings.report.attachments = len(recording.attachments)
+        verify_episodes(recording, findings)
+        _carried(recording, findings)
+
+
+def _carried(recording: Recording, findings: Findings) -> None:
+    """The benchmark and the artifacts, by their digests."""
+    for name in recording.attachments:
+        try:
+            if name.startswith(_ARTIFACT):
+                found = hashlib.sha256(recording.read_attachment(name)).hexdigest()
+                if found != name.removeprefix(_ARTIFACT):
+                    findings.error("attachment", f"the artifact {name!r:.90} has the SHA-256 {found}")
+            elif name == "benchmark.json":
+                _benchmark(recording, findings)
+        except TupliError as err:
+            findings.error("benchmark", str(err).removeprefix(f"{recording.name}: "))
+    if "env.cloudpickle" in recording.attachments and "benchmark.json" not in recording.attachments:
+        findings.error("benchmark", "it carries a pickled environment without 'benchmark.json'")
+
+
+def _benchmark(recording: Recording, findings: Findings) -> None:
+    record: EnvironmentRecord = recording.benchmark.record  # checks the digests of spec and pickle
+    told = record.benchmark or {}
+    if "id" in told and told["id"] != recording.benchmark_id:
+        why = f"it carries benchmark {told['id']!r:.70}, its episodes are of {recording.benchmark_id!r:.70}"
+        findings.error("benchmark", why)
+    carried = [name for name in recording.attachments if name.startswith(_ARTIFACT)]
+    missing = [item for item in told.get("artifacts", []) if _ARTIFACT + str(item) not in carried]
+    if carried and missing:
+        findings.error(
+            "benchmark", f"it lacks artifacts of its benchmark: {', '.join(map(str, missing))[:200]}"
+        )

@@ -1,0 +1,298 @@
+"""Alignment of a recording: every row belongs to one episode, every episode starts, goes on and ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
+from tupli_mcap.recording.facts import StepFacts, step_facts
+from tupli_mcap.recording.findings import Findings
+from tupli_mcap.recording.headers import message_headers
+from tupli_mcap.recording.infos import InfoDecoder
+from tupli_mcap.recording.reader import Recording
+
+__all__ = ["verify_episodes"]
+
+Array = np.ndarray[Any, Any]
+
+
+def verify_episodes(recording: Recording, findings: Findings) -> None:
+    """Holds the rows of all channels, the messages of the episodes and the index against each other."""
+    findings.report.episodes = len(recording.index)
+    findings.report.steps = recording.num_steps
+    if not recording.num_envs:
+        return
+    checker = _Checker(recording, findings)
+    for env, channel in enumerate(recording._step_channels):
+        checker.steps(env, channel)
+        checker.images(env, channel)
+    checker.starts()
+    checker.ends()
+    checker.finals()
+    checker.infos()
+
+
+class _Checker:
+    def __init__(self, recording: Recording, findings: Findings) -> None:
+        self._recording = recording
+        self._layout: StepLayout = recording.layout
+        self._store: ChunkStore = recording._store
+        self._topics: dict[str, int] = recording._topics
+        self._findings = findings
+        self._rows: Array = recording.index
+        self._at = {int(number): i for i, number in enumerate(self._rows["episode"])}
+
+    def _error(self, kind: str, message: str, **place: Any) -> None:
+        self._findings.error(kind, message, **place)
+
+    # ---- steps
+
+    def steps(self, env: int, channel: int) -> None:
+        """Every row of a step channel against the episode it lies in."""
+        topic = self._recording._contents.channels[channel].topic
+        mine = self._rows[self._rows["env"] == env]
+        mine = mine[np.argsort(mine["first_row"], kind="stable")]
+        firsts, lengths = mine["first_row"].astype(np.int64), mine["length"].astype(np.int64)
+        total = self._store.count(channel)
+        expected = np.append(0, (firsts + lengths))
+        for i in np.flatnonzero(np.append(firsts, total) != expected).tolist():
+            where = int(expected[i])
+            until = int(np.append(firsts, total)[i])
+            self._error("rows", f"rows {where} to {until} belong to no episode", channel=topic)
+        if (firsts != expected[:-1]).any():
+            return  # what follows would say the same of every episode
+        sums = np.zeros(len(mine))
+        row = 0
+        try:
+            for facts in step_facts(self._store, self._layout, channel, 0, total):
+                self._batch(facts, row, mine, firsts, lengths, sums, topic)
+                row += len(facts.episode)
+        except FormatError as err:
+            self._error("rows", _plain(err, self._recording), channel=topic)
+            return
+        self._returns(mine, sums)
+
+    def _batch(
+        self, facts: StepFacts, row: int, mine: Array, firsts: Array, lengths: Array, sums: Array, topic: str
+    ) -> None:
+        rows = row + np.arange(len(facts.episode))
+        of = np.searchsorted(firsts, rows, side="right") - 1
+        known = (of >= 0) & (rows < firsts[of] + lengths[of]) if len(firsts) else np.zeros(len(rows), bool)
+        for i, why in facts.bad.items():
+            self._error("rows", f"row {row + i} cannot be decoded: {why}", channel=topic)
+            known[i] = False
+        steps = rows - np.where(known, firsts[of] if len(firsts) else 0, 0)
+        last = known & (steps == (lengths[of] if len(firsts) else 0) - 1)
+        checks = {
+            "is not numbered as its episode": known
+            & (facts.episode != (mine["episode"][of] if len(mine) else 0)),
+            "does not count from the one before": known & (facts.step != steps),
+            "has a flag that is neither 0 nor 1": (facts.terminal > 1) | (facts.timeout > 1),
+            "ends its episode before its last step": known & ~last & ((facts.terminal | facts.timeout) != 0),
+            "has other flags than the end of its episode says": last
+            & (_end_of(facts) != (mine["end"][of] if len(mine) else 0)),
+        }
+        for what, wrong in checks.items():
+            for i in np.flatnonzero(wrong)[:3].tolist():
+                place: dict[str, Any] = {"channel": topic}
+                if known[i]:
+                    place.update(episode=int(mine["episode"][of[i]]), step=int(steps[i]))
+                self._error("episode", f"row {row + i} {what}", **place)
+        if known.any():
+            with np.errstate(invalid="ignore", over="ignore"):
+                np.add.at(sums, of[known], facts.reward[known])
+
+    def _returns(self, mine: Array, sums: Array) -> None:
+        with np.errstate(invalid="ignore"):
+            close = np.isclose(sums, mine["return"], rtol=1e-6, atol=1e-6, equal_nan=True)
+        for i in np.flatnonzero(~close).tolist():
+            told, found = float(mine["return"][i]), float(sums[i])
+            if not (math.isfinite(told) and math.isfinite(found)):
+                continue  # the order of summation decides
+            why = f"its return is {told!r}, its rewards sum up to {found!r}"
+            self._error("episode", why, episode=int(mine["episode"][i]))
+
+    def images(self, env: int, channel: int) -> None:
+        """Image channels have a row for each step, and the bytes that never change."""
+        top = self._recording._contents.channels[channel].topic.removesuffix("/step")
+        for leaf in self._layout.images:
+            topic = f"{top}/image/{leaf.name}"
+            number = self._topics.get(topic, 0)
+            steps, found = self._store.count(channel), self._store.count(number)
+            if steps != found:
+                self._error("image", f"expected {steps} images, found {found}", channel=topic)
+            layout = self._layout.image_messages[leaf.name]
+            fixed = np.frombuffer(layout.body[8:], np.uint8)
+            try:
+                for chunk in self._store.chunks(number):
+                    rows = self._store.rows(chunk, layout.dtype, keep=False)
+                    time = rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"]
+                    if (rows["fixed"] != fixed).any() or (time != rows["#log_time"].astype(np.int64)).any():
+                        first = int(self._store.table["first"][chunk])
+                        self._error("image", f"a header in rows from {first} on is damaged", channel=topic)
+            except FormatError as err:
+                self._error("image", _plain(err, self._recording), channel=topic)
+
+    # ---- messages of episodes
+
+    def _messages(self, topic: str) -> Iterator[tuple[int, int, memoryview]]:
+        """(row, log_time, body) of a channel's messages."""
+        channel, row = self._topics.get(topic, 0), 0
+        try:
+            for chunk in self._store.chunks(channel):
+                data = memoryview(self._store.load(chunk, keep=False))
+                for header in message_headers(data):
+                    start = int(header["#offset"])
+                    yield (
+                        row,
+                        int(header["#log_time"]),
+                        data[start + BODY : start + 9 + int(header["#length"])],
+                    )
+                    row += 1
+        except FormatError as err:
+            self._error("rows", _plain(err, self._recording), channel=topic)
+
+    def starts(self) -> None:
+        """Every episode has one start, where the index says, and it says what the index says."""
+        seen: set[int] = set()
+        for row, time, body in self._messages("/episode_start"):
+            place: dict[str, Any] = {"channel": "/episode_start"}
+            try:
+                start = EpisodeStart.decode(body)
+                place["episode"] = start.episode
+                for text in (start.options, start.reset_info):
+                    if text:
+                        jsonvalue.loads(text)
+            except FormatError as err:
+                self._error(
+                    "episode", f"row {row} cannot be decoded: {_plain(err, self._recording)}", **place
+                )
+                continue
+            i = self._at.get(start.episode)
+            if i is None or int(self._rows["start_row"][i]) != row:
+                continue  # a reset without a step
+            seen.add(start.episode)
+            told = self._rows[i]
+            seed = start.seed_number
+            if seed is not None and not -(2**63) <= seed < 2**63:
+                seed = None
+            facts = (start.env, start.first_row, time, seed)
+            index = (
+                int(told["env"]), int(told["first_row"]), int(told["start_time"]),
+                int(told["seed"]) if told["has_seed"] else None,
+            )  # fmt: skip
+            if facts != index or bytes(body[16:18]) not in (b"\0\0", b"\1\0", b"\0\1", b"\1\1"):
+                self._error("episode", f"its start and the index differ: {facts} and {index}", **place)
+        for number in sorted(self._at.keys() - seen):
+            self._error("episode", "it has no start", episode=number, channel="/episode_start")
+
+    def ends(self) -> None:
+        """Every episode has one end, and it says what the index says."""
+        seen: set[int] = set()
+        for row, time, body in self._messages("/episode_end"):
+            place: dict[str, Any] = {"channel": "/episode_end"}
+            try:
+                end = EpisodeEnd.decode(body)
+                place["episode"] = end.episode
+                if not isinstance(jsonvalue.loads(end.metadata), dict):
+                    raise FormatError("expected metadata as a JSON object")
+            except FormatError as err:
+                self._error(
+                    "episode", f"row {row} cannot be decoded: {_plain(err, self._recording)}", **place
+                )
+                continue
+            i = self._at.get(end.episode)
+            if i is None:
+                if self._recording.complete:
+                    self._error("episode", "an end of an episode that is not in the index", **place)
+                continue
+            if end.episode in seen:
+                self._error("episode", "it ends twice", **place)
+            seen.add(end.episode)
+            told = self._rows[i]
+            facts = (end.env, end.first_row, end.length, end.end, end.has_final_state, time, row)
+            index = (
+                int(told["env"]), int(told["first_row"]), int(told["length"]), int(told["end"]),
+                int(told["final_row"]) >= 0, int(told["end_time"]), int(told["end_row"]),
+            )  # fmt: skip
+            same = np.float64(end.episode_return).tobytes() == told["return"].tobytes()
+            if facts != index or not same or body[33] > 1:
+                self._error("episode", f"its end and the index differ: {facts} and {index}", **place)
+            if end.metadata != self._recording._contents.index.metadata_text(i):
+                self._error("episode", "its metadata differ between its end and the index", **place)
+        for number in sorted(self._at.keys() - seen):
+            self._error("episode", "it has no end", episode=number, channel="/episode_end")
+
+    def finals(self) -> None:
+        """Final states are those of episodes that say they have one."""
+        layout, topic = self._layout, "/final_state"
+        rows = {int(row["final_row"]): row for row in self._rows if row["final_row"] >= 0}
+        constant = all(leaf.kind != "variable" for leaf in layout.final_leaves)
+        size = layout.final_message.body_size if constant else 0
+        decoder = MessageDecoder(layout)
+        for row, _, body in self._messages(topic):
+            number = int.from_bytes(body[:4], "little")
+            place = {"channel": topic, "episode": number}
+            told = rows.pop(row, None)
+            if (
+                told is None
+                or int(told["episode"]) != number
+                or int(told["env"]) != int.from_bytes(body[4:8], "little")
+            ):
+                if self._recording.complete or number in self._at:
+                    self._error("final_state", f"row {row} is the final state of no episode", **place)
+                continue
+            if constant and len(body) != size:
+                self._error("final_state", f"expected {size} bytes, found {len(body)}", **place)
+            elif not constant:
+                try:
+                    decoder.final(body)
+                except FormatError as err:
+                    self._error(
+                        "final_state", f"it cannot be decoded: {_plain(err, self._recording)}", **place
+                    )
+        for told in rows.values():
+            self._error("final_state", "it is missing", episode=int(told["episode"]), channel=topic)
+
+    def infos(self) -> None:
+        """Infos are those of steps that are there, at most one each."""
+        channel = self._topics.get("/info")
+        if channel is None:
+            return
+        decoder = InfoDecoder(self._recording._contents.channels[channel].metadata)
+        last: dict[int, int] = {}
+        for row, _, body in self._messages("/info"):
+            place: dict[str, Any] = {"channel": "/info"}
+            try:
+                number, step, _ = decoder.decode(body)
+            except FormatError as err:
+                self._error("info", f"row {row} cannot be decoded: {_plain(err, self._recording)}", **place)
+                continue
+            place.update(episode=number, step=step)
+            i = self._at.get(number)
+            if i is None or step >= int(self._rows["length"][i]):
+                if self._recording.complete:
+                    self._error("info", f"row {row} is the info of no step", **place)
+            elif step <= last.get(number, -1):
+                self._error("info", f"row {row} is the second info of its step, or out of order", **place)
+            last[number] = step
+
+
+def _end_of(facts: StepFacts) -> Array:
+    """What the flags of each row say an episode's end would be (0 terminal, 1 timeout, 2 interrupted)."""
+    return np.where(facts.terminal != 0, 0, np.where(facts.timeout != 0, 1, 2))
+
+
+def _plain(err: FormatError, recording: Recording) -> str:
+    """An error's text without the name of the file."""
+    return str(err).removeprefix(f"{recording.name}: ")

@@ -1,0 +1,299 @@
+"""Structure of a file: every record, every CRC, the order of records, and the summary against the data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import CDR_HEADER
+from tupli_mcap.recording.checksums import check_crc
+from tupli_mcap.recording.container import CHUNK_ROWS, COMPRESSIONS, MAGIC, PROFILE
+from tupli_mcap.recording.contents import CHANNEL_KEYS, RECORDING_KEYS, RECORDING_METADATA, is_ours
+from tupli_mcap.recording.findings import Findings
+from tupli_mcap.recording.headers import ChunkRecords, chunk_records
+from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.source import Source
+from tupli_mcap.recording.summary import FOOTER_SIZE, parse_record, records
+from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey, message_index
+from tupli_mcap.recording.tail import Tail
+
+__all__ = ["Structure"]
+
+_CDR = int.from_bytes(CDR_HEADER, "little")
+_KINDS = {
+    Opcode.CHUNK: "chunk", Opcode.ATTACHMENT: "attachment", Opcode.MESSAGE_INDEX: "message_index",
+    Opcode.METADATA: "metadata",
+}  # fmt: skip
+
+
+class _Waiting(NamedTuple):
+    """A chunk whose message index comes next."""
+
+    offset: int
+    records: ChunkRecords
+
+
+class Structure:
+    """Walks the data section of a recording, then holds the summary and the index against it."""
+
+    def __init__(self, source: Source, tail: Tail, findings: Findings) -> None:
+        self._source = source
+        self._tail = tail
+        self._findings = findings
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._table: list[tuple[int, ...]] = []
+        self._chunk_indexes: list[ChunkIndex] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._counts: dict[int, int] = {}
+        self._latest: dict[int, int] = {}
+        self._waiting: _Waiting | None = None
+        self._started: set[int] = set()
+        self._records = 0
+        self._ended = False
+        self._torn: Damage | None = None
+
+    # ---- the data section
+
+    def run(self) -> None:
+        """Everything that can be said without knowing the layout."""
+        if self._source.read(0, min(len(MAGIC), self._source.size)) != MAGIC:
+            self._findings.error("file", "expected the magic of MCAP at the start", offset=0)
+        survey = Survey(self._source, known=self._tail.known_chunks(), end=self._tail.data_end)
+        for item in survey:
+            self._records += 1
+            if isinstance(item, Damage):
+                self._damaged(item)
+            else:
+                self._take(item)
+        self._finish()
+
+    def _damaged(self, damage: Damage) -> None:
+        self._waiting = None
+        if not self._tail.finished and damage.end == self._source.size:
+            self._torn = damage  # a killed writer's last write
+            return
+        kind = _KINDS.get(Opcode(damage.opcode), "record") if 0 < damage.opcode < 16 else "record"
+        size = damage.end - damage.offset
+        self._findings.error(kind, f"{damage.why}; {size} bytes are damaged", offset=damage.offset)
+
+    def _take(self, found: Found) -> None:
+        if self._ended:
+            self._findings.error(
+                "record", "expected the summary after the end of the data", offset=found.offset
+            )
+        waiting, self._waiting = self._waiting, None
+        if waiting is not None and found.opcode != Opcode.MESSAGE_INDEX:
+            self._findings.error(
+                "message_index", "expected the message index of the chunk", offset=waiting.offset
+            )
+        if (self._records == 1) != (found.opcode == Opcode.HEADER):
+            self._findings.error("record", "expected one header, as the first record", offset=found.offset)
+        if found.chunk is not None:
+            self._chunk(found, found.chunk)
+        elif found.attachment is not None:
+            self._attachments.append(found.attachment)
+        elif found.opcode == Opcode.MESSAGE_INDEX:
+            self._message_index(found, waiting)
+        elif found.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._define(
+                parse_record(found.opcode, found.body, found.offset, self._source.name), found.offset
+            )
+        elif found.opcode == Opcode.DATA_END:
+            self._ended = True
+            if bytes(found.body) != bytes(4):
+                self._findings.error(
+                    "record", "expected 0 as the CRC of the data section", offset=found.offset
+                )
+        else:
+            self._named(found)
+
+    def _named(self, found: Found) -> None:
+        """Header and metadata."""
+        if found.opcode == Opcode.HEADER:
+            header = parse_record(found.opcode, found.body, found.offset, self._source.name)
+            if header.profile != PROFILE:
+                why = f"expected the profile {PROFILE!r}, found {header.profile!r:.40}"
+                self._findings.error("record", why, offset=found.offset)
+        elif found.opcode == Opcode.METADATA:
+            record = parse_record(found.opcode, found.body, found.offset, self._source.name)
+            self._metadata.append(MetadataIndex(found.offset, found.length, record.name))
+            if record.name == RECORDING_METADATA:
+                self._crc(record.metadata, RECORDING_KEYS, "metadata", found.offset)
+            elif self._records == 2:
+                self._findings.error(
+                    "metadata", f"expected {RECORDING_METADATA!r} first", offset=found.offset
+                )
+
+    def _crc(self, values: dict[str, str], known: Sequence[str], kind: str, offset: int) -> None:
+        try:
+            check_crc(values, known, "the metadata")
+        except FormatError as err:
+            self._findings.error(kind, str(err), offset=offset)
+
+    def _define(self, record: Schema | Channel, offset: int) -> None:
+        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        kind = "schema" if isinstance(record, Schema) else "channel"
+        if record.id in known:
+            if known[record.id] != record:
+                self._findings.error("layout", f"{kind} {record.id} is defined in two ways", offset=offset)
+            return
+        known[record.id] = record
+        if isinstance(record, Channel) and is_ours(record.topic):
+            self._crc(record.metadata, CHANNEL_KEYS, "layout", offset)
+
+    def _chunk(self, found: Found, chunk: Chunk) -> None:
+        self._findings.report.chunks += 1
+        if found.repaired:
+            self._findings.error("chunk", found.repaired, offset=found.offset)
+        try:
+            content = chunk_records(chunk.data, "the chunk")
+        except FormatError as err:
+            self._findings.error("chunk", str(err), offset=found.offset)
+            return
+        for schema in content.schemas:
+            self._define(schema, found.offset)
+        for channel in content.channels:
+            self._define(channel, found.offset)
+        self._waiting = _Waiting(found.offset, content)
+        self._rows(found, chunk, content)
+        number, headers = content.channel, content.headers
+        compression = COMPRESSIONS.index(chunk.compression or "none")
+        self._table.append(
+            (found.offset, found.length, len(chunk.data), content.first, len(headers), content.skip, chunk.crc,
+             number, compression, 0)
+        )  # fmt: skip
+        at = found.offset + found.length
+        self._chunk_indexes.append(
+            ChunkIndex(
+                chunk_length=found.length,
+                chunk_start_offset=found.offset,
+                compression=chunk.compression,
+                compressed_size=chunk.packed,
+                message_end_time=int(headers["#log_time"][-1]),
+                message_index_length=15 + 16 * len(headers),
+                message_index_offsets={number: at},
+                message_start_time=int(headers["#log_time"][0]),
+                uncompressed_size=len(chunk.data),
+            )
+        )
+
+    def _rows(self, found: Found, chunk: Chunk, content: ChunkRecords) -> None:
+        """The rows of a chunk: in order, without gap, with the times its header says."""
+        headers, number = content.headers, content.channel
+        topic = self.channels[number].topic if number in self.channels else f"{number}"
+        place = {"offset": found.offset, "channel": topic}
+        expected = self._counts.get(number, 0)
+        if content.first != expected:
+            self._findings.error("rows", f"expected row {expected}, found row {content.first}", **place)
+        if (number in self._started) == bool(content.skip):
+            self._findings.error(
+                "chunk", "expected definitions in the first chunk of a channel only", **place
+            )
+        self._started.add(number)
+        self._counts[number] = content.first + len(headers)
+        self._findings.report.messages += len(headers)
+        times = headers["#log_time"]
+        if (times[1:] < times[:-1]).any() or int(times[0]) < self._latest.get(number, 0):
+            self._findings.error("rows", "expected times that do not decrease", **place)
+        self._latest[number] = int(times[-1])
+        if (headers["#publish_time"] != times).any():
+            self._findings.error("rows", "expected publish times equal to log times", **place)
+        if (headers["#cdr"] != _CDR).any():
+            self._findings.error("rows", "expected plain little-endian CDR", **place)
+        if (chunk.start_time, chunk.end_time) != (int(times[0]), int(times[-1])):
+            self._findings.error("chunk", "its header says other times than its messages", **place)
+
+    def _message_index(self, found: Found, waiting: _Waiting | None) -> None:
+        if waiting is None:
+            self._findings.error("message_index", "expected it behind a good chunk only", offset=found.offset)
+            return
+        number, entries = message_index(found.body)
+        content = waiting.records
+        if number != content.channel or not np.array_equal(entries, content.index_entries()):
+            why = "it says other times or offsets than its chunk has"
+            self._findings.error("message_index", why, offset=found.offset)
+
+    # ---- the summary
+
+    def _finish(self) -> None:
+        for why in self._tail.why:
+            self._findings.error("summary", why)
+        if not self._tail.finished:
+            return
+        if self._waiting is not None:
+            why = "expected the message index of the chunk"
+            self._findings.error("message_index", why, offset=self._waiting.offset)
+        if not self._ended:
+            self._findings.error("record", "expected the end of the data section, found none")
+        if not self._attachments or self._attachments[-1].name != INDEX_NAME:
+            self._findings.error("index", f"expected {INDEX_NAME!r} as the last attachment")
+        if self._tail.index is not None:
+            table = np.array(self._table, CHUNK_ROWS)
+            if not np.array_equal(table, self._tail.index.chunks):
+                self._findings.error("index", "the episode index lists other chunks than there are")
+        if self._tail.summary is None:
+            if not self._tail.why:
+                self._findings.error("summary", "the footer is damaged or cut off", offset=self._source.size)
+            return
+        self._summary(self._tail.summary.start)
+
+    def _summary(self, start: int) -> None:
+        end = self._source.size - len(MAGIC) - FOOTER_SIZE
+        data = self._source.read(start, end - start)
+        found: dict[int, list[Any]] = {}
+        groups: dict[int, list[int]] = {}
+        for opcode, offset, body in records(data, start, self._source.name):
+            if opcode == Opcode.SUMMARY_OFFSET:
+                self._offsets(body, groups, offset)
+                continue
+            found.setdefault(opcode, []).append(parse_record(opcode, body, offset, self._source.name))
+            group = groups.setdefault(opcode, [offset, offset])
+            if group[1] != offset:
+                self._findings.error(
+                    "summary", f"records with opcode {opcode} are not together", offset=offset
+                )
+            group[1] = offset + 9 + len(body)
+        for opcode, wanted in (
+            (Opcode.SCHEMA, list(self.schemas.values())),
+            (Opcode.CHANNEL, list(self.channels.values())),
+            (Opcode.CHUNK_INDEX, self._chunk_indexes),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
+            (Opcode.METADATA_INDEX, self._metadata),
+            (Opcode.STATISTICS, [self._statistics()]),
+        ):
+            here = found.get(opcode, [])
+            if _ordered(opcode, here) != _ordered(opcode, wanted):
+                what = Opcode(opcode).name.lower().replace("_", " ")
+                why = f"its {len(here)} {what} records say other than the data, where there are {len(wanted)}"
+                self._findings.error("summary", why, offset=groups.get(opcode, [start])[0])
+
+    def _offsets(self, body: memoryview, groups: dict[int, list[int]], offset: int) -> None:
+        start, length = int.from_bytes(body[1:9], "little"), int.from_bytes(body[9:17], "little")
+        if groups.get(body[0]) != [start, start + length]:
+            self._findings.error("summary", "a summary offset points elsewhere", offset=offset)
+
+    def _statistics(self) -> Statistics:
+        times = [(c.message_start_time, c.message_end_time) for c in self._chunk_indexes]
+        return Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self.channels),
+            channel_message_counts={number: count for number, count in self._counts.items() if count},
+            chunk_count=len(self._chunk_indexes),
+            message_count=self._findings.report.messages,
+            message_end_time=max((end for _, end in times), default=0),
+            message_start_time=min((start for start, _ in times), default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(self.schemas),
+        )
+
+
+def _ordered(opcode: int, found: list[Any]) -> list[Any]:
+    """Definitions by id: the summary may have them in another order."""
+    return sorted(found, key=lambda r: r.id) if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else found

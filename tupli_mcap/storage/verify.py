@@ -1,0 +1,278 @@
+"""Verifying many files: recordings of directories, and of a storage what else it holds. Nothing is written."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tupli_mcap.errors import NotFoundError, TupliError
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.findings import Findings, VerifyReport
+from tupli_mcap.recording.journal import journal_path
+from tupli_mcap.recording.lock import is_locked
+from tupli_mcap.recording.verify import verify_recording
+from tupli_mcap.storage import bundles
+from tupli_mcap.storage.artifacts import ArtifactFiles
+from tupli_mcap.storage.atomic import Lock
+from tupli_mcap.storage.benchmarks import BenchmarkFiles
+from tupli_mcap.storage.common import is_hash
+from tupli_mcap.storage.files import FileStorage
+from tupli_mcap.storage.scan import scan, stamp_of
+from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
+
+__all__ = ["StorageReport", "verify_paths", "verify_storage"]
+
+_PIECE = 1 << 20
+_TEMPORARY = re.compile(r"\..*\.tmp|.*\.journal\.tmp")
+_PARTS = ("benchmarks", "artifacts", "recordings", "catalog.sqlite", "storage.json")
+
+
+@dataclass
+class StorageReport:
+    """What was verified: a report for each recording, and one (kind "storage") for each storage's other files."""
+
+    files: list[VerifyReport] = field(default_factory=list)
+
+    @property
+    def damaged(self) -> list[VerifyReport]:
+        """The reports of what is damaged."""
+        return [report for report in self.files if not report.ok]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is damaged."""
+        return not self.damaged
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as JSON has it."""
+        return {
+            "ok": self.ok,
+            "files": len(self.files),
+            "damaged": len(self.damaged),
+            "reports": [report.to_json() for report in self.files],
+        }
+
+
+def verify_storage(storage: FileStorage | Path) -> StorageReport:
+    """Verifies all recordings of a storage (or any directory), its artifacts, benchmarks, notes and catalog."""
+    root = storage.root if isinstance(storage, FileStorage) else storage
+    return StorageReport(list(verify_paths([root])))
+
+
+def verify_paths(paths: Iterable[Path]) -> Iterator[VerifyReport]:
+    """Verifies files and directories, one after another; a bad one stops nothing.
+
+    A path that does not exist is a report with a problem.
+    """
+    for path in paths:
+        if path.is_dir():
+            for item in sorted(scan(path)):
+                yield _recording(path / item.relative)
+            yield from _directory(path)
+        else:
+            yield _recording(path)
+
+
+def _recording(path: Path) -> VerifyReport:
+    report = VerifyReport(str(path))
+    try:
+        report = verify_recording(path)
+        findings = Findings(report)
+        if report.kind == "recording" and report.ok:
+            _sidecar(path, findings)
+            _benchmark(path, findings)
+    except (TupliError, OSError) as err:
+        what = str(err).removeprefix(f"{path}: ").removeprefix(f"{path} ")
+        Findings(report).error("file", what, advice="give a recording (.mcap) or a directory of them")
+    return report
+
+
+def _sidecar(path: Path, findings: Findings) -> None:
+    """What is noted beside a recording is about episodes it has."""
+    try:
+        sidecar = Sidecar.read(path)
+    except TupliError as err:
+        findings.error(
+            "sidecar", str(err), advice=f"delete {sidecar_path(path).name}: deletions are then undone"
+        )
+        return
+    if not (sidecar.deleted or sidecar.published_in):
+        return
+    with Recording(path) as recording:
+        numbers = {int(number) for number in recording.index["episode"]}
+    strange = sorted((sidecar.deleted | sidecar.published_in.keys()) - numbers)
+    if strange:
+        what = f"{sidecar_path(path).name} notes episodes that are not in the recording: {strange[:10]}"
+        findings.note("sidecar", what, "nothing to be done; compacting the storage removes such notes")
+
+
+def _benchmark(path: Path, findings: Findings) -> None:
+    """The id of a benchmark that a recording carries is the hash of its contents."""
+    with Recording(path) as recording:
+        if "benchmark.json" not in recording.attachments:
+            return
+        if "id" not in (recording.benchmark.record.benchmark or {}):
+            return
+        try:
+            bundles.incoming(recording, path)
+        except TupliError as err:
+            findings.error("benchmark", str(err).removeprefix(f"{path}: "))
+
+
+# ---- what else is in a directory
+
+
+def _directory(root: Path) -> Iterator[VerifyReport]:
+    """A report on the files beside the recordings, if there are any to speak of."""
+    report = VerifyReport(str(root), kind="storage")
+    findings = Findings(report)
+    is_storage = any((root / part).exists() for part in _PARTS)
+    for check in (_leftovers, *((_artifacts, _benchmarks, _catalog) if is_storage else ())):
+        _guarded(check, root, findings)
+    if is_storage or report.problems:
+        yield report
+
+
+def _guarded(check: Callable[[Path, Findings], None], root: Path, findings: Findings) -> None:
+    try:
+        check(root, findings)
+    except (OSError, TupliError) as err:
+        findings.error("storage", str(err), advice="check the directory's permissions")
+
+
+def _leftovers(root: Path, findings: Findings) -> None:
+    """Files that belong to nothing: of processes that were killed, or of recordings that are gone."""
+    for path in sorted(root.rglob("*")):
+        name, relative = path.name, str(path.relative_to(root))
+        if _TEMPORARY.fullmatch(name):
+            findings.note("leftover", f"{relative} was left by a process that was killed", "delete it")
+        elif name.endswith(".mcap.journal") and not path.with_name(name.removesuffix(".journal")).exists():
+            what = f"{relative} is the journal of a recording that is not here"
+            findings.note(
+                "leftover", what, "bring its recording back beside it; it holds that one's last steps"
+            )
+        elif name.endswith(".mcap.journal"):
+            _finished_journal(path, relative, findings)
+        elif name.endswith(".mcap.json") and not path.with_name(name.removesuffix(".json")).exists():
+            findings.note("leftover", f"{relative} is about a recording that is not here", "delete it")
+
+
+def _finished_journal(path: Path, relative: str, findings: Findings) -> None:
+    recording = path.with_name(path.name.removesuffix(".journal"))
+    if is_locked(recording) or journal_path(recording).name != path.name:
+        return
+    try:
+        with Recording(recording) as opened:
+            complete = opened.complete
+    except TupliError:
+        return
+    if complete:
+        findings.note("leftover", f"{relative} lies beside a finished recording", "delete it")
+
+
+def _artifacts(root: Path, findings: Findings) -> None:
+    """Bytes by their SHA-256, and what is known of them."""
+    directory = root / "artifacts"
+    if not directory.is_dir():
+        return
+    files = ArtifactFiles(directory, Lock(root / ".lock"))
+    for path in sorted(directory.iterdir()):
+        if path.name.endswith(".json") and is_hash(path.stem) and not path.with_suffix("").exists():
+            findings.error(
+                "artifact",
+                f"artifact {path.stem} has no bytes",
+                advice="store it again, or import its bundle",
+            )
+        if not is_hash(path.name):
+            continue
+        found = _digest(path)
+        findings.report.attachments += 1
+        if found != path.name:
+            what = f"artifact {path.name} has bytes with SHA-256 {found}"
+            findings.error("artifact", what, advice="store it again, or import its bundle")
+        try:
+            files.item(path.name)
+        except (TupliError, FileNotFoundError) as err:
+            findings.error("artifact", str(err), advice="store it again with its metadata")
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+def _benchmarks(root: Path, findings: Findings) -> None:
+    """Benchmarks by the hash of their contents, and their artifacts."""
+    directory = root / "benchmarks"
+    if not directory.is_dir():
+        return
+    files = BenchmarkFiles(directory, Lock(root / ".lock"))
+    for path in sorted(directory.glob("*.json")):
+        if not is_hash(path.stem):
+            continue
+        try:
+            files.load(path.stem)
+            for artifact in files.artifacts(path.stem):
+                if not (root / "artifacts" / artifact).is_file():
+                    what = f"benchmark {path.stem} lacks its artifact {artifact}"
+                    findings.error("benchmark", what, advice="store the artifact again, or import its bundle")
+        except (NotFoundError, TupliError) as err:
+            findings.error("benchmark", str(err), advice="store it again, or import its bundle")
+
+
+def _catalog(root: Path, findings: Findings) -> None:
+    """The catalog against the files. It is only an index: what is wrong with it is a note."""
+    path = root / "catalog.sqlite"
+    if not path.exists():
+        return
+    advice = "the next query brings it up to date; tupli-mcap reindex makes it anew"
+    try:
+        rows = _catalogued(path)
+    except (sqlite3.Error, OSError) as err:
+        findings.note("catalog", f"the catalog cannot be read: {err}", advice)
+        return
+    here = {item.relative: item.stamp for item in scan(root)}
+    gone = sorted(set(rows) - set(here))
+    if gone:
+        findings.note("catalog", f"it lists recordings that are gone: {', '.join(gone[:5])}", advice)
+    for relative in sorted(set(rows) & set(here)):
+        stamp, episodes, steps = rows[relative]
+        if stamp != tuple(stamp_of(root / relative)):
+            continue  # changed since; noticed by the next query
+        found = _count(root / relative)
+        if found is not None and found != (episodes, steps):
+            what = f"it lists {episodes} episodes, {steps} steps of {relative}, where there are {found[0]}, {found[1]}"
+            findings.error("catalog", what, advice="make it anew with tupli-mcap reindex")
+
+
+def _catalogued(path: Path) -> dict[str, tuple[tuple[int, int, int], int, int]]:
+    """Stamp, episodes and steps of each recording in a catalog."""
+    connection = sqlite3.connect(f"file:{path.as_posix()}?mode=ro", uri=True)
+    try:
+        found = connection.execute(
+            "SELECT path, size, mtime_ns, sidecar_mtime_ns, COUNT(e.id), COALESCE(SUM(n_tuples), 0) FROM recording r "
+            "LEFT JOIN episode e ON e.recording_id = r.id GROUP BY r.id"
+        )
+        return {row[0]: (tuple(row[1:4]), row[4], row[5]) for row in found}
+    finally:
+        connection.close()
+
+
+def _count(path: Path) -> tuple[int, int] | None:
+    """Episodes and steps of a recording without the deleted ones; None if it cannot be read."""
+    try:
+        deleted = list(Sidecar.read(path).deleted)
+        with Recording(path) as recording:
+            rows = recording.index
+            rows = rows[[int(number) not in deleted for number in rows["episode"]]] if deleted else rows
+            return len(rows), int(rows["length"].sum())
+    except (TupliError, OSError):
+        return None
