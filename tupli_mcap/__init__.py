@@ -25,9 +25,11 @@ if TYPE_CHECKING:
         Recording,
         RecoveryReport,
         Step,
+        VerifyReport,
         journal_path,
         recover_recording,
         rewrite_recording,
+        verify_recording,
         write_recording,
     )
     from tupli_mcap.schema import (
@@ -70,7 +72,9 @@ _HOMES = {
         "Step",
         "journal_path",
         "recover_recording",
+        "VerifyReport",
         "rewrite_recording",
+        "verify_recording",
         "write_recording",
     ],
     "schema": [
@@ -124,9 +128,11 @@ __all__ = [
     "TupliError",
     "TupliStorage",
     "UntrustedError",
+    "VerifyReport",
     "journal_path",
     "recover_recording",
     "rewrite_recording",
+    "verify_recording",
     "write_recording",
 ]
 

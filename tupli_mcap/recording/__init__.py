@@ -7,18 +7,22 @@ from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.recording.reader import RecordedBenchmark, Recording
 from tupli_mcap.recording.repair import RecoveryReport, recover_recording
 from tupli_mcap.recording.rewrite import rewrite_recording
+from tupli_mcap.recording.verify import Problem, VerifyReport, verify_recording
 
 __all__ = [
     "Columns",
     "Episode",
     "EpisodeData",
     "Episodes",
+    "Problem",
     "RecordedBenchmark",
     "Recording",
     "RecoveryReport",
     "Step",
+    "VerifyReport",
     "journal_path",
     "recover_recording",
     "rewrite_recording",
+    "verify_recording",
     "write_recording",
 ]

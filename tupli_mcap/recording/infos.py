@@ -20,7 +20,7 @@ from tupli_mcap.recording.events import read_strings
 if TYPE_CHECKING:
     from tupli_mcap.recording.writer import RecordingWriter
 
-__all__ = ["InfoDecoder", "InfoRecorder", "RecordInfo"]
+__all__ = ["InfoDecoder", "InfoRecorder", "RecordInfo", "info_schema"]
 
 RecordInfo = bool | Sequence[str] | Callable[[dict[str, Any]], Mapping[str, Any]]
 _HEAD = struct.Struct("<II")
@@ -75,6 +75,11 @@ class InfoRecorder:
         return b"".join([*parts, struct.pack("<I", len(text) + 1), text, b"\0"])
 
 
+def info_schema(metadata: Mapping[str, str]) -> str:
+    """The ros2msg text of `/info` that its channel's metadata ask for; FormatError if they are damaged."""
+    return InfoRecorder(InfoDecoder(metadata).names).schema()[0]
+
+
 class InfoDecoder:
     """Decodes `/info` messages by their channel's metadata."""
 
@@ -83,6 +88,11 @@ class InfoDecoder:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise FormatError(f"/info: expected a list of names in its metadata, found {names!r:.100}")
         self._names: list[str] = names
+
+    @property
+    def names(self) -> list[str]:
+        """The entries that have typed fields."""
+        return self._names
 
     def decode(self, body: memoryview) -> tuple[int, int, dict[str, Any]]:
         """(episode, step, info)."""

@@ -254,11 +254,13 @@ def _recover_ours(
         notes=[*gathered.tail.why, *gathered.notes],
     )
     writer = RepairWriter(container, gathered)
-    writer.begin()
-    if known is not None:
+    if known is None:
+        writer.begin(None)
+    else:
         layout, channels = known
         store = gathered.store()
         plan = make_plan(gathered, store, layout, channels)
+        writer.begin(plan.next_episode)
         writer.steps(layout, channels, plan, store)
         _report_plan(report, plan)
         report.infos_lost = _infos_lost(gathered, channels)

@@ -11,9 +11,10 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Metadata, Schema
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.checksums import check_crc, mended
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.container import CHUNK_ROWS, MAGIC, PROFILE
-from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.contents import CHANNEL_KEYS, RECORDING_KEYS, RECORDING_METADATA, is_ours
 from tupli_mcap.recording.headers import ChunkRecords, chunk_records
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.source import Source
@@ -193,13 +194,38 @@ def _take(gathered: Gathered, found: Found) -> None:
     elif found.opcode == Opcode.METADATA:
         record: Metadata = parse_record(found.opcode, found.body, found.offset, name)
         if record.name == RECORDING_METADATA and gathered.metadata is None:
-            gathered.metadata = record.metadata
+            _take_metadata(gathered, record.metadata, found)
     elif found.opcode == Opcode.SCHEMA:
         schema: Schema = parse_record(found.opcode, found.body, found.offset, name)
         gathered.schemas.setdefault(schema.id, schema)
     elif found.opcode == Opcode.CHANNEL:
         channel: Channel = parse_record(found.opcode, found.body, found.offset, name)
-        gathered.channels.setdefault(channel.id, channel)
+        if _is_whole(gathered, channel, found):
+            gathered.channels.setdefault(channel.id, channel)
+
+
+def _take_metadata(gathered: Gathered, values: dict[str, str], found: Found) -> None:
+    try:
+        gathered.metadata = check_crc(values, RECORDING_KEYS, "the recording's metadata")
+        return
+    except FormatError as err:
+        end = found.offset + found.length
+        gathered.damages.append(Damage(found.offset, end, str(err), Opcode.METADATA))
+    gathered.metadata = mended(values) if "crc" in values else None
+    if gathered.metadata is not None:
+        gathered.notes.append("one character of the recording's metadata was put right by their checksum")
+
+
+def _is_whole(gathered: Gathered, channel: Channel, found: Found) -> bool:
+    """Whether a channel's metadata have the checksum they say."""
+    try:
+        if is_ours(channel.topic):
+            check_crc(channel.metadata, CHANNEL_KEYS, f"the metadata of channel {channel.topic!r:.80}")
+    except FormatError as err:
+        end = found.offset + found.length
+        gathered.damages.append(Damage(found.offset, end, str(err), Opcode.CHANNEL))
+        return False
+    return True
 
 
 def _take_chunk(gathered: Gathered, found: Found, chunk: Chunk) -> None:

@@ -123,6 +123,7 @@ class Plan:
     lost_ends: list[int] = field(default_factory=list)
     lost_finals: list[int] = field(default_factory=list)
     lost_rows: int = 0
+    next_episode: int = 0
 
 
 def intersection(a: Ranges, b: Ranges) -> Ranges:
@@ -285,7 +286,8 @@ class _Planner:
         self._found = found
         self._plan = Plan()
         known = [s.episode for s in found] + list(told.starts) + list(told.ends) + list(told.index)
-        self._next = max(known, default=-1) + 1
+        told_next = (gathered.metadata or {}).get("next_episode", "")
+        self._next = max([*known, int(told_next) - 1 if told_next.isdecimal() else -1]) + 1
         self._taken: set[int] = set()
         self._here: dict[int, Ranges] = {}  # rows that are kept, by sub-environment
         for segment in found:
@@ -304,6 +306,7 @@ class _Planner:
             self._plan.lost_rows += self._total(env, channels) - sum(
                 b - a for a, b in self._here.get(env, [])
             )
+        self._plan.next_episode = self._next
         return self._plan
 
     def _total(self, env: int, channels: Channels) -> int:

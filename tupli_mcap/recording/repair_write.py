@@ -53,11 +53,14 @@ class RepairWriter:
         self.metadata_lost: list[str] = []
         self.finals_kept = 0
 
-    def begin(self) -> None:
-        """Magic, header, metadata and the attachments that are good."""
+    def begin(self, next_episode: int | None) -> None:
+        """Magic, header, metadata and the attachments that are good. No later episode gets a number that was lost."""
         container, found = self._container, self._gathered
         container.start(f"tupli-mcap {version('tupli-mcap')}")
-        container.add_metadata(RECORDING_METADATA, self._metadata_of_recording())
+        metadata = self._metadata_of_recording()
+        if next_episode is not None:
+            metadata["next_episode"] = str(next_episode)
+        container.add_metadata(RECORDING_METADATA, metadata)
         for attachment in found.attachments.values():
             offset = container.position
             for at in range(attachment.offset, attachment.offset + attachment.length, _COPY):

@@ -136,9 +136,19 @@ def records(data: bytes | memoryview, base: int, name: str) -> Iterator[tuple[in
         position = end
 
 
+class _Exact(io.BytesIO):
+    """Bytes that are not read beyond their end: the package would take what is left for a longer text."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        if size is not None and len(data) < size:
+            raise EOFError(f"expected {size} bytes, found {len(data)}")
+        return data
+
+
 def parse_record(opcode: int, body: memoryview, offset: int, name: str) -> Any:
     """A record parsed by the `mcap` package; every defect is a FormatError."""
-    stream = io.BytesIO(body)
+    stream = _Exact(body)
     try:
         parsed = _PARSERS[opcode].read(ReadDataStream(stream))
     except (

@@ -9,7 +9,10 @@ from pathlib import Path
 
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import FormatError, RecordingError, TupliError
+from tupli_mcap.recording.channels import register_channels
+from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
+from tupli_mcap.recording.infos import info_schema
 from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
@@ -68,8 +71,9 @@ def _verify(source: Source, findings: Findings) -> None:
     if not has_summary(source) and tail.index is None:
         report.state = "recording" if live else "unfinished"
         _note_unfinished(source, findings)
-    Structure(source, tail, findings).run()
-    _contents(source, findings)
+    structure = Structure(source, tail, findings)
+    structure.run()
+    _contents(source, structure, findings)
     if live and report.state == "complete":
         report.state = "recording"
 
@@ -91,7 +95,7 @@ def _note_unfinished(source: Source, findings: Findings) -> None:
         )
 
 
-def _contents(source: Source, findings: Findings) -> None:
+def _contents(source: Source, structure: Structure, findings: Findings) -> None:
     """What a reader sees."""
     damaged = len(findings)
     try:
@@ -104,8 +108,36 @@ def _contents(source: Source, findings: Findings) -> None:
         return
     with recording:
         findings.report.attachments = len(recording.attachments)
+        _layout(recording, structure, findings)
         verify_episodes(recording, findings)
         _carried(recording, findings)
+
+
+def _layout(recording: Recording, structure: Structure, findings: Findings) -> None:
+    """The definitions in the file are those that the spaces give."""
+    if not recording.num_envs:
+        return
+    topics = {channel.topic: channel for channel in recording._contents.channels.values()}
+    info = topics.get("/info")
+    wanted = Container(-1, recording.name, "none")
+    vector = None if "/step" in topics else recording.num_envs
+    try:
+        infos = None if info is None else (info_schema(info.metadata), info.metadata)
+        register_channels(wanted, recording.name, recording.layout, vector, infos)
+    except FormatError as err:
+        findings.error("layout", str(err))
+        return
+    here = {channel.topic: channel for channel in structure.channels.values()}
+    for channel in wanted.channels.values():
+        found = here.get(channel.topic)
+        schema = None if found is None else structure.schemas.get(found.schema_id)
+        if found is None or schema is None:
+            findings.error("layout", "the channel is not defined in the file", channel=channel.topic)
+            continue
+        expected = wanted.schemas[channel.schema_id]
+        same = (schema.name, schema.encoding, schema.data) == (expected.name, "ros2msg", expected.data)
+        if not same or found.message_encoding != "cdr":
+            findings.error("layout", "its schema is not the one its spaces have", channel=channel.topic)
 
 
 def _carried(recording: Recording, findings: Findings) -> None:

@@ -56,8 +56,9 @@ class Structure:
         self._waiting: _Waiting | None = None
         self._started: set[int] = set()
         self._records = 0
+        self._missing = False  # damage that rows may have been lost with
         self._ended = False
-        self._torn: Damage | None = None
+        self._outside: set[tuple[type[Any], int]] = set()  # definitions outside chunks
 
     # ---- the data section
 
@@ -76,12 +77,19 @@ class Structure:
 
     def _damaged(self, damage: Damage) -> None:
         self._waiting = None
-        if not self._tail.finished and damage.end == self._source.size:
-            self._torn = damage  # a killed writer's last write
-            return
+        if not self._tail.finished and damage.end == self._source.size and self._is_cut(damage):
+            what = f"the last record is cut off, {damage.end - damage.offset} bytes are left of it"
+            self._findings.note("record", what, "nothing to be done", offset=damage.offset)
+            return  # a killed writer's last write
+        self._missing = True
         kind = _KINDS.get(Opcode(damage.opcode), "record") if 0 < damage.opcode < 16 else "record"
         size = damage.end - damage.offset
         self._findings.error(kind, f"{damage.why}; {size} bytes are damaged", offset=damage.offset)
+
+    def _is_cut(self, damage: Damage) -> bool:
+        """Whether a record goes on beyond the end of the file."""
+        head = self._source.read(damage.offset, min(9, damage.end - damage.offset))
+        return len(head) < 9 or damage.offset + 9 + int.from_bytes(head[1:], "little") > self._source.size
 
     def _take(self, found: Found) -> None:
         if self._ended:
@@ -102,17 +110,21 @@ class Structure:
         elif found.opcode == Opcode.MESSAGE_INDEX:
             self._message_index(found, waiting)
         elif found.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self._define(
-                parse_record(found.opcode, found.body, found.offset, self._source.name), found.offset
-            )
+            record = parse_record(found.opcode, found.body, found.offset, self._source.name)
+            self._outside.add((type(record), record.id))
+            self._define(record, found.offset)
         elif found.opcode == Opcode.DATA_END:
             self._ended = True
             if bytes(found.body) != bytes(4):
                 self._findings.error(
                     "record", "expected 0 as the CRC of the data section", offset=found.offset
                 )
-        else:
+        elif found.opcode in (Opcode.HEADER, Opcode.METADATA):
             self._named(found)
+        else:
+            self._findings.error(
+                "record", f"a record with opcode {found.opcode} is unknown", offset=found.offset
+            )
 
     def _named(self, found: Found) -> None:
         """Header and metadata."""
@@ -190,9 +202,9 @@ class Structure:
         topic = self.channels[number].topic if number in self.channels else f"{number}"
         place = {"offset": found.offset, "channel": topic}
         expected = self._counts.get(number, 0)
-        if content.first != expected:
+        if content.first != expected and not (self._missing and content.first > expected):
             self._findings.error("rows", f"expected row {expected}, found row {content.first}", **place)
-        if (number in self._started) == bool(content.skip):
+        if (number in self._started) == bool(content.skip) and not (self._missing and not content.skip):
             self._findings.error(
                 "chunk", "expected definitions in the first chunk of a channel only", **place
             )
@@ -225,6 +237,11 @@ class Structure:
     def _finish(self) -> None:
         for why in self._tail.why:
             self._findings.error("summary", why)
+        known = {(Schema, number) for number in self.schemas} | {
+            (Channel, number) for number in self.channels
+        }
+        for kind, number in sorted((kind.__name__.lower(), number) for kind, number in known - self._outside):
+            self._findings.error("layout", f"{kind} {number} is not defined outside of the chunks")
         if not self._tail.finished:
             return
         if self._waiting is not None:

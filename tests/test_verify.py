@@ -1,0 +1,399 @@
+"""`verify_recording` and `verify_paths`: good files are good, and every damage is found, named and placed."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from environments import Sampler, roll
+from gymnasium import spaces
+from mcap.opcode import Opcode
+from test_golden import GOLDEN, NAMES, UNFINISHED, place
+from test_repair import BOX, chunks, flip, foreign, hit, places, record
+from typer.testing import CliRunner
+
+from tupli_mcap import (
+    FileStorage,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    journal_path,
+    recover_recording,
+    verify_recording,
+)
+from tupli_mcap.cli.app import app
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.recording import VerifyReport, rewrite
+from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
+from tupli_mcap.recording.index import EpisodeRow, IndexBuilder
+from tupli_mcap.schema import ArtifactMetadata
+from tupli_mcap.storage.verify import verify_paths, verify_storage
+
+DO_NOT_CARE = (Opcode.HEADER,)  # the text that says which library wrote it
+
+
+def kinds(report: VerifyReport) -> set[str]:
+    return {problem.kind for problem in report.errors}
+
+
+def said(report: VerifyReport) -> str:
+    return "\n".join(f"{problem.place}: {problem.message}" for problem in report.problems)
+
+
+# ---- good files
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_golden_recordings_are_good(name: str, tmp_path: Path) -> None:
+    path = place(name, tmp_path)
+    before = path.read_bytes()
+    report = verify_recording(path)
+    assert report.errors == []
+    assert report.ok
+    assert report.state == ("unfinished" if name in UNFINISHED else "complete")
+    with Recording(path) as recording:
+        assert (report.episodes, report.steps) == (len(recording), recording.num_steps)
+    assert path.read_bytes() == before
+    assert [problem.severity for problem in report.problems] == ["note"] * (name in UNFINISHED)
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (GOLDEN / "before_crc").glob("*.mcap")))
+def test_recordings_of_earlier_writers_are_good(name: str, tmp_path: Path) -> None:
+    path = Path(shutil.copy(GOLDEN / "before_crc" / name, tmp_path))
+    assert verify_recording(path).errors == []
+
+
+@pytest.mark.parametrize("position", range(6))
+def test_a_recovered_recording_is_good(position: int, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", length=200)
+    everything = [item for item in places(path) if item.chunk is not None]
+    hit(path, everything[position % len(everything)])
+    assert not verify_recording(path).ok
+    target = recover_recording(path).target
+    assert verify_recording(target or "").problems == []
+
+
+def test_a_live_recording_is_said_to_be_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(Sampler(BOX, spaces.Discrete(3)), path) as env:
+        roll(env, 20)
+        report = verify_recording(path)
+        assert (report.state, report.ok) == ("recording", True)
+        assert "a writer is at work" in said(report)
+    assert verify_recording(path).problems == []
+
+
+def test_an_unfinished_recording_is_no_damage(tmp_path: Path) -> None:
+    path = place("unfinished", tmp_path)
+    journal_path(path).unlink()
+    report = verify_recording(path)
+    assert report.ok
+    assert "there is no journal beside it" in said(report)
+    assert any("tupli-mcap recover" in problem.advice for problem in report.problems)
+
+
+# ---- damage
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["constant_none", "constant_zstd", "dict_with_images", "infos", "variable", "vector_same_step", "bundle"],
+)
+def test_every_flipped_byte_is_found(name: str, tmp_path: Path) -> None:
+    path = place(name, tmp_path)
+    data = path.read_bytes()
+    ignored = [item for item in places(path) if item.opcode in DO_NOT_CARE]
+    assert [item.length for item in ignored] == [39]
+    rng = random.Random(name)
+    for _ in range(60):
+        position = rng.randrange(len(data))
+        bad = bytearray(data)
+        bad[position] ^= 1 << rng.randrange(8)
+        path.write_bytes(bad)
+        report = verify_recording(path)
+        library = any(item.offset + 27 <= position < item.offset + item.length for item in ignored)
+        assert not report.ok or library or _same_records(path, data, tmp_path), position
+
+
+def _same_records(path: Path, data: bytes, directory: Path) -> bool:
+    """Whether a flip changed nothing: bits in a zstd frame that decoders ignore."""
+    original = directory / "original.mcap"
+    original.write_bytes(data)
+    ours = [(item.opcode, bytes(item.body), item.chunk and bytes(item.chunk.data)) for item in places(path)]
+    theirs = [
+        (item.opcode, bytes(item.body), item.chunk and bytes(item.chunk.data)) for item in places(original)
+    ]
+    return ours == theirs
+
+
+@pytest.mark.parametrize("topic", ["/step", "/episode_start", "/episode_end", "/final_state"])
+def test_a_damaged_chunk_is_placed(topic: str, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    chunk = chunks(path, topic)[0]
+    hit(path, chunk)
+    report = verify_recording(path)
+    assert [(p.kind, p.offset) for p in report.errors if p.kind == "chunk"] == [("chunk", chunk.offset)]
+    assert all("recover" in problem.advice for problem in report.errors)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_recording(share: float, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    os.truncate(path, int(path.stat().st_size * share))
+    report = verify_recording(path)
+    assert report.state == "unfinished" or not report.ok
+    assert report.problems
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense" * 100, b"\x89MCAP0\r\n", bytes(5000)])
+def test_what_is_no_recording(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    assert not verify_recording(path).ok
+    with pytest.raises(RecordingError, match="does not exist"):
+        verify_recording(tmp_path / "none.mcap")
+
+
+def test_other_files(tmp_path: Path) -> None:
+    path = foreign(tmp_path / "f.mcap")
+    report = verify_recording(path)
+    assert (report.kind, report.ok, report.messages, report.attachments) == ("mcap", True, 600, 1)
+    assert "no recording of tupli-mcap" in said(report)
+    chunk = next(item for item in places(path) if item.chunk is not None)
+    hit(path, chunk)
+    report = verify_recording(path)
+    assert chunk.offset in [problem.offset for problem in report.errors]
+    os.truncate(path, path.stat().st_size - 50)
+    assert "cut off" in said(verify_recording(path))
+
+
+# ---- contents that are consistent, but wrong
+
+
+class Forger(rewrite._Rewriter):
+    """Rewrites a recording with a mistake, as a faulty writer would: CRCs and summary are right."""
+
+    mistake = ""
+
+    def run(self, *args: Any) -> None:
+        container, index = self._container, self._index
+        add_chunk, add = container.add_chunk, index.add
+
+        def chunk(rows: Any) -> None:
+            topic = container.channels[rows.channel].topic
+            add_chunk(self.changed(topic, rows))
+
+        def row(values: EpisodeRow, metadata: str) -> None:
+            add(self.changed_row(values), metadata)
+
+        container.add_chunk = chunk  # type: ignore[method-assign]
+        index.add = row  # type: ignore[method-assign]
+        super().run(*args)
+
+    def changed(self, topic: str, rows: Any) -> Any:
+        data = bytearray(rows.data)
+        size = int(rows.offsets[1]) if len(rows.offsets) > 1 else len(data)
+        if topic == "/step" and rows.first == 0:
+            if self.mistake == "step":
+                data[size * 3 + BODY + 4] += 1
+            elif self.mistake == "episode":
+                data[size * 3 + BODY] += 1
+            elif self.mistake == "flag":
+                data[size * 3 - 1] = 1
+            elif self.mistake == "bool":
+                data[size * 3 - 1] = 2
+            elif self.mistake == "publish_time":
+                data[size * 3 + 23] ^= 1
+            elif self.mistake == "cdr":
+                data[size * 3 + 31] ^= 1
+            elif self.mistake == "reward":
+                data[size * 4 - 4] ^= 0x30
+            elif self.mistake == "sequence":
+                data[size * 3 + 11] ^= 1
+        if topic == "/episode_end" and self.mistake == "end":
+            body = memoryview(data)[BODY:size]
+            told = EpisodeEnd.decode(body)
+            data[BODY:size] = told._replace(length=told.length + 1).encode()
+        if topic == "/episode_start" and self.mistake == "start":
+            start = EpisodeStart.decode(memoryview(data)[BODY:size])
+            data[BODY:size] = start._replace(first_row=start.first_row + 1).encode()
+        if topic == "/final_state" and self.mistake == "final":
+            data[BODY] ^= 1
+        return rows._replace(data=bytes(data))
+
+    def changed_row(self, row: EpisodeRow) -> EpisodeRow:
+        if row.episode == 1:
+            return {
+                "length": row._replace(length=row.length - 1),
+                "index_return": row._replace(episode_return=row.episode_return + 1),
+                "index_seed": row._replace(seed=99),
+                "index_end": row._replace(end=2 if row.end != 2 else 0),
+                "index_final": row._replace(final_row=-1),
+                "index_time": row._replace(end_time=row.end_time + 1),
+            }.get(self.mistake, row)
+        return row
+
+
+MISTAKES = {
+    "step": "does not count from the one before",
+    "episode": "is not numbered as its episode",
+    "flag": "ends its episode before its last step",
+    "bool": "neither 0 nor 1",
+    "publish_time": "publish times equal to log times",
+    "cdr": "plain little-endian CDR",
+    "reward": "its rewards sum up to",
+    "sequence": "expected consecutive rows",
+    "end": "its end and the index differ",
+    "start": "its start and the index differ",
+    "final": "is the final state of no episode",
+    "length": "belong to no episode",
+    "index_return": "its end and the index differ",
+    "index_seed": "its start and the index differ",
+    "index_end": "other flags than the end",
+    "index_final": "its end and the index differ",
+    "index_time": "its end and the index differ",
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_faulty_writer_is_found_out(mistake: str, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", steps=60, length=20)
+    target = tmp_path / "b.mcap"
+    fd = os.open(target, os.O_RDWR | os.O_CREAT)
+    with Recording(path) as recording:
+        forger = Forger(recording, Container(fd, str(target), "zstd"))
+        forger.mistake = mistake
+        forger.run(None, {}, None)
+    os.close(fd)
+    report = verify_recording(target)
+    assert not report.ok
+    assert MISTAKES[mistake] in said(report)
+
+
+@pytest.mark.parametrize("mistake", ["none"])
+def test_a_rewriter_without_a_mistake_is_not(mistake: str, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", steps=60, length=20)
+    fd = os.open(tmp_path / "b.mcap", os.O_RDWR | os.O_CREAT)
+    with Recording(path) as recording:
+        forger = Forger(recording, Container(fd, "b.mcap", "zstd"))
+        forger.mistake = mistake
+        forger.run(None, {}, None)
+    os.close(fd)
+    assert verify_recording(tmp_path / "b.mcap").problems == []
+    assert IndexBuilder().count == 0
+
+
+def test_a_wrong_artifact_is_found(tmp_path: Path) -> None:
+    name = "artifacts/" + "0" * 64
+    path = record(tmp_path / "a.mcap", attachments={name: ("application/octet-stream", b"x")})
+    report = verify_recording(path)
+    assert kinds(report) == {"attachment"}
+    assert "has the SHA-256 2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881" in said(report)
+
+
+# ---- directories and storages
+
+
+def storage_at(root: Path) -> FileStorage:
+    storage = FileStorage(root)
+    for name in ("one", "two"):
+        target = root / "recordings" / f"{name}.mcap"
+        target.parent.mkdir(exist_ok=True, parents=True)
+        record(target, steps=50)
+    storage.store_artifact(b"data", ArtifactMetadata(name="n", description="d"))
+    assert len(storage.list_episodes()) == 4
+    return storage
+
+
+def test_a_storage(tmp_path: Path) -> None:
+    with storage_at(tmp_path / "lab") as storage:
+        report = verify_storage(storage)
+    assert report.ok
+    assert [item.problems for item in report.files] == [[], [], []]
+    assert [item.kind for item in report.files] == ["recording", "recording", "storage"]
+
+
+def test_a_storage_with_damage_goes_on_and_sums_up(tmp_path: Path) -> None:
+    root = tmp_path / "lab"
+    with storage_at(root) as storage:
+        artifact = next(path for path in (root / "artifacts").iterdir() if len(path.name) == 64)
+        artifact.write_bytes(b"other")
+        flip(root / "recordings" / "one.mcap", 2000)
+        (root / "recordings" / "gone.mcap.journal").write_bytes(b"x")
+        (root / "recordings" / ".x.tmp").write_bytes(b"x")
+        (root / "recordings" / "two.mcap.json").write_text('{"version": 1, "deleted": [77]}')
+        report = verify_storage(storage)
+        (root / "recordings" / "two.mcap.json").write_text("nonsense")
+        again = verify_storage(storage)
+    one, two, other = report.files
+    assert [item.ok for item in report.files] == [False, True, False]
+    assert one.path.endswith("one.mcap")
+    assert "notes episodes that are not in the recording: [77]" in said(two)
+    assert {problem.kind for problem in other.problems} == {"artifact", "leftover"}
+    assert "has bytes with SHA-256" in said(other)
+    assert "gone.mcap.journal is the journal of a recording that is not here" in said(other)
+    assert "was left by a process that was killed" in said(other)
+    assert kinds(again.files[1]) == {"sidecar"}
+
+
+def test_a_catalog_that_says_other_than_the_files(tmp_path: Path) -> None:
+    import sqlite3
+
+    root = tmp_path / "lab"
+    storage_at(root).close()
+    with sqlite3.connect(root / "catalog.sqlite") as connection:
+        connection.execute("DELETE FROM episode WHERE id = (SELECT MIN(id) FROM episode)")
+    connection.close()
+    report = verify_storage(root)
+    assert "the next thing" not in said(report.files[-1])
+    assert kinds(report.files[-1]) == {"catalog"}
+    assert "1 episodes" in said(report.files[-1])
+
+
+def test_a_plain_directory_and_several_paths(tmp_path: Path) -> None:
+    record(tmp_path / "x" / "a.mcap") if (tmp_path / "x").mkdir() is None else None
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"no")
+    found = list(verify_paths([bad, tmp_path / "x", tmp_path / "none.mcap"]))
+    assert [report.ok for report in found] == [False, True, False]
+    assert "does not exist" in said(found[2])
+
+
+def test_the_command(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    good = CliRunner().invoke(app, ["verify", str(path)])
+    assert (good.exit_code, good.output.strip()) == (0, f"{path}: ok (8 episodes, 300 steps)")
+    hit(path, chunks(path, "/step")[1])
+    other = record(tmp_path / "b.mcap", steps=20)
+    both = CliRunner().invoke(app, ["verify", str(path), str(other)])
+    assert both.exit_code == 1
+    assert f"{other}: ok" in both.output
+    assert "2 verified, 1 damaged" in both.output
+    assert "save what is good with tupli-mcap recover" in both.output
+    report = json.loads(CliRunner().invoke(app, ["verify", str(path), "--json"]).output)
+    assert (report["ok"], report["damaged"]) == (False, 1)
+    assert report["reports"][0]["problems"][0]["kind"] == "chunk"
+    assert CliRunner().invoke(app, ["verify"]).exit_code == 2
+
+
+def test_memory_is_that_of_a_few_chunks(tmp_path: Path) -> None:
+    import tracemalloc
+
+    path = tmp_path / "a.mcap"
+    wide = spaces.Box(-1.0, 1.0, (512,), np.float64)
+    with RecordEpisodes(Sampler(wide, spaces.Discrete(3), length=50), path) as env:
+        roll(env, 4000)
+    assert path.stat().st_size > 12_000_000
+    tracemalloc.start()
+    assert verify_recording(path).ok
+    recover_recording(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 8_000_000 + (64 << 20) * 0.2
