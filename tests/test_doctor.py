@@ -514,12 +514,25 @@ def test_duplicate_episodes_across_recordings(tmp_path: Path) -> None:
     assert examine([first, third]).of("duplicate-episodes") == ()
 
 
-def test_duplicates_by_chance_are_no_warning(tmp_path: Path) -> None:
-    def observe(n: int) -> Any:
-        return n % 4
-
-    for length, severity in ((5, INFO), (60, WARNING)):
-        path = scripted(tmp_path / f"{length}.mcap", observe, spaces.Discrete(4), length=length)
+@pytest.mark.parametrize(
+    ("space", "observe", "by_chance"),
+    [
+        (spaces.Discrete(4), lambda n: n % 4, True),
+        (spaces.Text(1), lambda n: "abcd"[n % 4], True),
+        (spaces.Box(0, 9, (2,), np.int64), lambda n: np.array([n % 4, 0]), True),
+        (spaces.Sequence(spaces.Discrete(4)), lambda n: (n % 4,), True),
+        (UNIT, still, False),
+        (spaces.Tuple((spaces.Discrete(4), UNIT)), lambda n: (n % 4, still(n)), False),
+        (spaces.Sequence(UNIT), lambda n: (still(n),), False),
+        (spaces.OneOf((spaces.Discrete(4), UNIT)), lambda n: (0, n % 4), False),
+    ],
+    ids=["discrete", "text", "integers", "sequence", "floats", "tuple", "sequence of floats", "oneof"],
+)
+def test_duplicates_by_chance_are_no_warning(
+    tmp_path: Path, space: gym.Space[Any], observe: Observe, by_chance: bool
+) -> None:
+    for length, severity in ((5, INFO if by_chance else WARNING), (60, WARNING)):
+        path = scripted(tmp_path / f"{length}.mcap", observe, space, length=length)
         finding = found(examine(path), "duplicate-episodes")
         assert (finding.severity, finding.count, finding.total) == (severity, 2, 3)
         assert places(finding) == [(0, None), (1, None), (2, None)]
@@ -785,6 +798,21 @@ def test_every_kind_of_source(tmp_path: Path) -> None:
     assert examine(chosen).steps == sum(wanted)
     storage.delete_episode(headers[0].id)
     assert examine(path).episodes == len(headers) - 1
+
+
+def test_nothing_of_a_file_is_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = record(tmp_path / "a.mcap", Sampler(UNIT, spaces.Discrete(3)), 50)
+    with Recording(path) as recording:
+        assert "env.cloudpickle" in recording.attachments
+    before = {item: item.stat() for item in tmp_path.iterdir()}
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("code from a file")
+
+    for target in ("pickle.loads", "pickle.load", "cloudpickle.loads", "gymnasium.make", "builtins.exec"):
+        monkeypatch.setattr(target, refuse)
+    assert examine(path).steps == 50
+    assert {item: item.stat() for item in tmp_path.iterdir()} == before
 
 
 def test_what_cannot_be_examined(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ def examine(
     Args:
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
             `TupliDataset` (its episodes, whole: tuple filters are for steps), a storage, or several of those.
-            Episodes that a storage has deleted are left out.
+            Episodes that a storage has deleted are left out, except of an open `Recording`.
         checks: ids of the checks to run (see `CHECKS`); all by default. skip: those to leave out.
         thresholds: for the id of a check, values of its thresholds (see `CHECKS[id].thresholds`).
         episode_filter: examine only episodes that it is true of.

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
@@ -21,7 +23,7 @@ __all__ = ["Contents", "duplicate_episodes", "repeated_seed"]
 class Contents:
     """What stays of a chart to compare recordings: arrays of one entry an episode.
 
-    choices: how many discrete actions there are; 0 where chance makes no equal episodes (states of floats, or actions).
+    choices: how many actions there are; 0 where chance makes no equal episodes (states or actions of floats).
     """
 
     path: str
@@ -88,9 +90,9 @@ def duplicate_episodes(recordings: Sequence[Contents], *, rarity: float = 1000) 
 
 
 def _choices(chart: Chart) -> int:
-    for leaf in chart.leaves("state"):
-        if leaf.kind == "variable" or (leaf.dtype is not None and leaf.dtype.kind == "f" and leaf.size):
-            return 0
+    """How many actions there are; 0 where states or actions are continuous, and chance makes no equal episodes."""
+    if any(_is_continuous(leaf.space) for leaf in chart.leaves("state")):
+        return 0
     total = 1
     for leaf in chart.leaves("action"):
         if isinstance(leaf.space, spaces.Discrete):
@@ -102,6 +104,21 @@ def _choices(chart: Chart) -> int:
         else:
             return 0
     return min(total, 1 << 60)
+
+
+def _is_continuous(space: gym.Space[Any] | None) -> bool:
+    """Whether there are floats in it, at any depth."""
+    if isinstance(space, spaces.Box):
+        return space.dtype.kind == "f" and space.low.size > 0
+    if isinstance(space, spaces.Dict):
+        return any(_is_continuous(part) for part in space.values())
+    if isinstance(space, spaces.Tuple | spaces.OneOf):
+        return any(_is_continuous(part) for part in space.spaces)
+    if isinstance(space, spaces.Sequence):
+        return _is_continuous(space.feature_space)
+    if isinstance(space, spaces.Graph):
+        return _is_continuous(space.node_space) or _is_continuous(space.edge_space)
+    return False
 
 
 def repeated_seed(chart: Chart, *, least: int = 3, part: float = 0.5) -> Iterator[Finding]:
