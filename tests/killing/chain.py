@@ -32,6 +32,7 @@ class Death(NamedTuple):
     steps: int
     problems: list[str]
     killed: bool
+    appended: bool = False
 
 
 def moments_of(kind: str, *, appends: bool) -> list[str]:
@@ -71,6 +72,7 @@ class _Chain:
     def run(self, moments: Sequence[str]) -> list[Death]:
         deaths = []
         for moment in moments:
+            appended = bool(self._known)
             told = self._die(moment)
             try:
                 steps, problems = self._check(told)
@@ -78,7 +80,7 @@ class _Chain:
                 steps, problems = 0, [f"{type(err).__name__}: {err}"]
             if told.trouble:
                 problems.insert(0, told.trouble)
-            deaths.append(Death(self._name, moment, steps, problems, told.killed))
+            deaths.append(Death(self._name, moment, steps, problems, told.killed, appended))
             if problems:
                 return deaths
         try:

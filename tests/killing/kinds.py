@@ -41,11 +41,13 @@ _BOX = spaces.Box(-1, 1, (4,), np.float32)
 _WIDE = spaces.Box(-1, 1, (250,), np.float64)
 _IMAGE = spaces.Dict({"camera": spaces.Box(0, 255, (8, 8, 3), np.uint8), "x": spaces.Box(-1, 1, (1,))})
 _TEXT = spaces.Dict({"note": spaces.Text(30), "x": spaces.Discrete(5)})
+_LONG = spaces.Dict({"note": spaces.Text(1500), "x": spaces.Discrete(5)})
 _SEEN = spaces.Dict({"note": spaces.Text(20), "camera": spaces.Box(0, 255, (6, 5, 1), np.uint8)})
 _NESTED = spaces.Dict(
     {
         "zero": spaces.Box(-1, 1, (0,), np.float32),
         "arm": spaces.Tuple((spaces.Box(-1, 1, (2, 3), np.float16), spaces.MultiBinary(3))),
+        "wide": spaces.Box(-1, 1, (60,), np.float64),
         "Scalar!": spaces.Box(-1, 1, (), np.float64),
         "deep": spaces.Dict({"n": spaces.Discrete(7, start=-3), "m": spaces.MultiDiscrete([3, 4])}),
     }
@@ -89,8 +91,8 @@ KINDS = {
     "vector image same": Kind(_IMAGE, (700, 2000), vector=_SAME),
     "vector image disabled": Kind(_IMAGE, (700, 2000), vector=_DISABLED, options={"record_info": True}),
     "vector frames": Kind(spaces.Box(0, 255, (80, 80, 3), np.uint8), vector=_NEXT, threaded=True),
-    "vector text": Kind(_TEXT, vector=_NEXT, variable=True, options={"record_info": True}),
-    "vector text same": Kind(_TEXT, vector=_SAME, variable=True),
+    "vector text": Kind(_LONG, vector=_NEXT, variable=True, options={"record_info": True}),
+    "vector text same": Kind(_LONG, vector=_SAME, variable=True),
     "vector text disabled": Kind(_SEEN, vector=_DISABLED, variable=True),
     "vector growing": Kind(
         spaces.Dict({"note": spaces.Text(200_000)}), vector=_NEXT, variable=True, large=200_000
