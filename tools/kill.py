@@ -102,8 +102,10 @@ def kill(options: argparse.Namespace, console: Console) -> Iterator[tuple[Chain,
                 running[pool.submit(live, chain, options.breakage, options.keep)] = chain
             for done in wait(running, return_when=FIRST_COMPLETED).done:
                 deaths = done.result()
-                killed += sum(death.killed for death in deaths)
+                before, killed = killed, killed + sum(death.killed for death in deaths)
                 status.update(f"{killed} of {options.kills} kills")
+                if not console.is_terminal and killed // 100 > before // 100:
+                    console.print(f"{killed} kills")
                 yield running.pop(done), deaths
 
 
@@ -163,7 +165,7 @@ def main() -> int:
     console, began = Console(stderr=True), time.monotonic()
     pairs: dict[tuple[str, str], Pair] = collections.defaultdict(Pair)
     groups: dict[str, dict[str, Pair]] = {
-        name: collections.defaultdict(Pair) for name in ("kind", "moment", "in")
+        name: collections.defaultdict(Pair) for name in ("kind", "moment", "place")
     }
     total, longest = Pair(), 0
     for chain, deaths in kill(options, console):
@@ -172,7 +174,7 @@ def main() -> int:
             where = "a recording that goes on" if death.appended else "a new recording"
             for pair in (
                 total, pairs[death.kind, death.moment], groups["kind"][death.kind],
-                groups["moment"][death.moment], groups["in"][where],
+                groups["moment"][death.moment], groups["place"][where],
             ):  # fmt: skip
                 pair.add(death)
             if death.problems:
@@ -189,9 +191,7 @@ def main() -> int:
         out = Console(width=None if sys.stdout.isatty() else 160)
         order = {name: i for i, name in enumerate([*KINDS, *MOMENTS])}
         for name, rows in groups.items():
-            out.print(
-                table(f"killed, by {name}", dict(sorted(rows.items(), key=lambda row: order.get(row[0], 0))))
-            )
+            out.print(table(f"by {name}", dict(sorted(rows.items(), key=lambda row: order.get(row[0], 0)))))
         out.print(matrix(pairs))
         out.print(
             f"{total.kills} kills, up to {longest} of one recording; {total.steps:,} finished steps looked for, "

@@ -27,6 +27,7 @@ class Found:
     reset_info: dict[str, Any]
     steps: list[tuple[Any, ...]]
     final: Any
+    metadata: dict[str, Any]
     times: tuple[int, int]
 
 
@@ -35,19 +36,24 @@ def found_in(recording: Recording) -> list[Found]:
     return [
         Found(
             e.env, e.number, e.end, e.return_, e.seed, e.options, e.reset_info, [tuple(step) for step in e],
-            e.final_state, (e.start_time, e.end_time),
+            e.final_state, e.metadata, (e.start_time, e.end_time),
         )
         for e in recording.episodes
     ]  # fmt: skip
 
 
-@dataclass
+@dataclass(eq=False)
 class _Told:
     """An episode as it was told: `certain` of its steps were finished."""
 
     reset: tuple[Any, ...]
     steps: list[tuple[Any, ...]] = field(default_factory=list)
     certain: int = 0
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the callback has made of all steps."""
+        return {"steps": len(self.steps), "total": sum(step[2] for step in self.steps)}
 
 
 def _told_episodes(reports: Sequence[tuple[str, Any]]) -> dict[int, list[_Told]]:
@@ -65,7 +71,12 @@ def _told_episodes(reports: Sequence[tuple[str, Any]]) -> dict[int, list[_Told]]
 
 
 def check_recording(
-    found: Sequence[Found], reports: Sequence[tuple[str, Any]], *, vector: bool, infos: Any
+    found: Sequence[Found],
+    reports: Sequence[tuple[str, Any]],
+    *,
+    vector: bool,
+    infos: Any,
+    metadata: bool = False,
 ) -> tuple[int, list[str]]:
     """(finished steps told of, what is wrong with the episodes that one process recorded)."""
     told, problems, steps = _told_episodes(reports), [], 0
@@ -81,6 +92,10 @@ def check_recording(
         if len(mine) != len(expected):
             problems.append(f"env {env}: {len(expected)} episodes were told of, {len(mine)} are there")
         for a, b in zip(mine, expected, strict=False):
+            following = expected[expected.index(b) + 1 :]
+            ended = (len(b.steps) == b.certain and any(b.steps[-1][3:5])) or any(e.certain for e in following)
+            if metadata and a.metadata != b.metadata and (ended or a.metadata):
+                problems.append(f"env {env}, episode {a.number}: its metadata are {a.metadata}")
             problems += [
                 f"env {env}, episode {a.number}: {problem}"
                 for problem in problems_of(a, b.reset, b.steps, b.certain, vector=vector, infos=infos)

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
+from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 __all__ = ["KINDS", "Kind", "Tell", "open_recorder"]
@@ -34,6 +35,7 @@ class Kind:
     threaded: bool = False
     reuse: bool = False  # the environment returns the same array, with other values, again and again
     reward: gym.Space[Any] | None = None
+    plain: bool = False  # states of one value each, for they are large
     large: int = 0  # every episode's texts are longer than the last one's, up to here
 
 
@@ -78,6 +80,8 @@ KINDS = {
     ),
     "info": Kind(_BOX, options={"record_info": True}),
     "info and text": Kind(_TEXT, _SMALL, options={"record_info": ["t"]}, variable=True),
+    "metadata": Kind(_BOX, options={"metadata_callback": True}),
+    "huge": Kind(spaces.Box(0, 255, (420, 420, 3), np.uint8), threaded=True, plain=True),
     "lz4": Kind(_BOX, options={"compression": "lz4"}),
     "uncompressed": Kind(_IMAGE, (700, 2000), options={"compression": "none"}),
     "elsewhere": Kind(_BOX, elsewhere=True),
@@ -91,6 +95,8 @@ KINDS = {
     "vector image same": Kind(_IMAGE, (700, 2000), vector=_SAME),
     "vector image disabled": Kind(_IMAGE, (700, 2000), vector=_DISABLED, options={"record_info": True}),
     "vector frames": Kind(spaces.Box(0, 255, (80, 80, 3), np.uint8), vector=_NEXT, threaded=True),
+    "vector metadata": Kind(_WIDE, vector=_SAME, options={"metadata_callback": True, "record_info": True}),
+    "vector huge": Kind(spaces.Box(0, 255, (420, 420, 3), np.uint8), vector=_SAME, threaded=True, plain=True),
     "vector text": Kind(_LONG, vector=_NEXT, variable=True, options={"record_info": True}),
     "vector text same": Kind(_LONG, vector=_SAME, variable=True),
     "vector text disabled": Kind(_SEEN, vector=_DISABLED, variable=True),
@@ -99,6 +105,20 @@ KINDS = {
     ),
 }
 SUB_ENVIRONMENTS = 3
+
+
+class Counter(EpisodeMetadataCallback):
+    """Metadata of an episode: its steps, and their rewards."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self._steps, self._total = 0, 0.0
+
+    def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+        self._steps, self._total = self._steps + 1, self._total + float(tuple.reward)
+        return {"steps": self._steps, "total": self._total}
 
 
 class Teller(gym.Env[Any, Any]):
@@ -130,7 +150,10 @@ class Teller(gym.Env[Any, Any]):
         reward: Any = float(self._random.normal())
         if self._kind.reward is not None:
             reward = self._random.normal(size=2).astype(np.float32)
-        info = {"t": self._steps * 0.1, "note": f"step {self._steps}"}
+        note = "y" * int(
+            self._random.choice([0, 9, 900])
+        )  # some do not fit into what the journal has for them
+        info = {"t": self._steps * 0.1, "note": f"step {self._steps}{note}"}
         result = (state, reward, how in (0, 2), how in (1, 2), info)
         self._tell("step", (self._number, action, *result))
         return result
@@ -139,6 +162,9 @@ class Teller(gym.Env[Any, Any]):
         if self._kind.large:
             n = int(self._random.integers(1, min(self._kind.large, 20 * 2**self._episodes)))
             return {"note": "".join(chr(97 + (i * 7 + self._steps) % 26) for i in range(n % 26)) + "x" * n}
+        if self._kind.plain:
+            space = self.observation_space
+            return np.full(space.shape, self._random.integers(256), space.dtype)
         state = self.observation_space.sample()
         if not self._kind.reuse:
             return state
@@ -160,6 +186,8 @@ def open_recorder(
         storage = FileStorage(path)
         return TupliEnvWrapper(Teller(kind, 0, seed, tell), storage, benchmark_id, chunk_size=chunk)
     options: dict[str, Any] = {"mode": mode, "chunk_size": chunk, "attachments": {}, **kind.options}
+    if "metadata_callback" in options:
+        options["metadata_callback"] = Counter()
     if kind.elsewhere:
         options["journal_dir"] = path.parent / "journals"
     if kind.reward is not None:
