@@ -267,3 +267,23 @@ def test_finishing_removes_the_journal_of_the_killed(tmp_path: Path) -> None:
     cart_pole(path, mode="a").close()
     assert not journal_path(path).exists()
     assert (Recording(path).complete, Recording(path).num_steps) == (True, 5)
+
+
+def test_a_recording_that_names_any_file_as_its_journal_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, precious = tmp_path / "r.mcap", tmp_path / "precious.txt"
+    with monkeypatch.context() as forged:
+        forged.setattr("tupli_mcap.recording.writer.journal_in", lambda *_: precious)
+        with cart_pole(path, journal_dir=tmp_path) as env:
+            roll(env, 5)
+        abandon(tmp_path / "killed.mcap", lambda p: cart_pole(p, journal_dir=tmp_path), 100)
+    precious.write_text("precious")
+    with pytest.raises(FormatError, match=r"expected its journal at an absolute path that ends in .*journal"):
+        cart_pole(path, mode="a")
+    with pytest.warns(UserWarning, match="expected its journal at an absolute path"):
+        assert Recording(tmp_path / "killed.mcap").num_steps > 0
+    with pytest.raises(FormatError, match="recover it into a new file"):
+        cart_pole(tmp_path / "killed.mcap", mode="a")
+    assert precious.read_text() == "precious"
+    assert Recording(path).num_steps == 5

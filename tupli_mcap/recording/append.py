@@ -17,7 +17,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import COMPRESSIONS, Container
 from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.durability import sync_file
-from tupli_mcap.recording.journal import journal_info, journal_path
+from tupli_mcap.recording.journal import journal_info, journal_path, recorded_journal
 from tupli_mcap.recording.recover import belongs, head, misplaced_journal
 from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.summary import check_magic, has_summary
@@ -134,7 +134,7 @@ def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:
             f"{given}; leave journal_dir out when appending"
         )
     if recorded is not None:
-        writer.journal_place = Path(recorded)
+        writer.journal_place = recorded_journal(writer.path, contents.metadata)
 
 
 def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> None:

@@ -36,6 +36,7 @@ __all__ = [
     "journal_info",
     "journal_path",
     "read_journal",
+    "recorded_journal",
 ]
 
 MAGIC = b"TMCAPJ1\0"
@@ -54,6 +55,23 @@ def journal_path(path: str | os.PathLike[str]) -> Path:
 def journal_in(directory: str | os.PathLike[str], path: Path, uuid: str) -> Path:
     """A place for the journal of a recording in a directory that recordings of the same name may share."""
     return Path(directory) / f"{path.name}.{uuid}.journal"
+
+
+def recorded_journal(path: Path, metadata: Mapping[str, str]) -> Path:
+    """Where the journal of a recording with this metadata lies: beside it, or where it says.
+
+    Raises:
+        FormatError: it says a place that no writer chooses: somebody else's recording must not name any file.
+    """
+    if "journal" not in metadata:
+        return journal_path(path)
+    place, ending = Path(metadata["journal"]), f".{metadata.get('uuid')}.journal"
+    if not place.is_absolute() or not place.name.endswith(ending) or "\0" in str(place):
+        raise FormatError(
+            f"{path}: expected its journal at an absolute path that ends in {ending}, found {str(place)!r:.200}; "
+            "recover it into a new file"
+        )
+    return place
 
 
 class RowArea(NamedTuple):

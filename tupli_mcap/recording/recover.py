@@ -30,8 +30,8 @@ from tupli_mcap.recording.journal import (
     LogArea,
     RowArea,
     journal_info,
-    journal_path,
     read_journal,
+    recorded_journal,
 )
 from tupli_mcap.recording.salvage import (
     Salvage,
@@ -135,8 +135,8 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
     if source.path is None:
         return None
     metadata = head(source)
-    path = _journal_of(source.path, metadata)
     try:
+        path = recorded_journal(source.path, metadata)
         return read_journal(path)
     except (FileNotFoundError, FormatError) as err:
         return err
@@ -144,10 +144,6 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
         raise RecordingError(
             f"{source.name} was not finished, and its journal {path.name} cannot be read: {refused(err)}"
         ) from err
-
-
-def _journal_of(path: Path, metadata: Mapping[str, str]) -> Path:
-    return Path(metadata["journal"]) if "journal" in metadata else journal_path(path)
 
 
 def belongs(info: Mapping[str, Any], metadata: Mapping[str, str]) -> bool:
@@ -163,7 +159,7 @@ def misplaced_journal(path: Path, metadata: Mapping[str, str]) -> Path | None:
 
     None if it is in its place, or not to be found.
     """
-    expected = _journal_of(path, metadata)
+    expected = recorded_journal(path, metadata)
     for candidate in (expected, *sorted(Path(os.path.realpath(path)).parent.glob("*.journal"))):
         with contextlib.suppress(OSError, FormatError):
             if belongs(journal_info(candidate), metadata):
@@ -189,7 +185,7 @@ def _missing(source: Source, metadata: Mapping[str, str], err: Exception) -> str
 
 
 def _foreign_journal(source: Source, metadata: Mapping[str, str]) -> str:
-    found = None if source.path is None else _journal_of(source.path, metadata)
+    found = None if source.path is None else recorded_journal(source.path, metadata)
     return (
         f"{source.name} was not finished, and {found} is the journal of another recording: it is left alone, and "
         "steps not yet in a chunk cannot be recovered"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.events import EpisodeStart
-from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, journal_path, read_journal
+from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, read_journal, recorded_journal
 from tupli_mcap.recording.recover import belongs, define, misplaced_journal
 from tupli_mcap.recording.repair_gather import Gathered, Piece
 from tupli_mcap.recording.repair_plan import Channels, messages
@@ -28,10 +27,9 @@ def add_journal(gathered: Gathered) -> None:
     """Reads the journal of an unfinished recording, and takes the rows that the file does not have."""
     if gathered.tail.finished or gathered.source.path is None:
         return
-    path = journal_path(gathered.source.path)
-    if gathered.metadata is not None and "journal" in gathered.metadata:
-        path = Path(gathered.metadata["journal"])
+    path = gathered.source.path
     try:
+        path = recorded_journal(path, gathered.metadata or {})
         journal = read_journal(path)
     except FileNotFoundError:
         gathered.journal = "missing"
