@@ -42,9 +42,11 @@ def moments_of(kind: str, *, appends: bool) -> list[str]:
     for moment in MOMENTS.values():
         if moment.appends and (not appends or about.storage):
             continue
-        if (moment.variable and not about.variable) or (moment.threaded and not about.threaded):
+        if moment.threaded and not about.threaded:
             continue
-        if moment.name == "growth" and not about.large:
+        if moment.syncs and "durability" not in about.options:
+            continue
+        if moment.grows and not about.large:
             continue
         names.append(moment.name)
     return names

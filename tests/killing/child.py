@@ -132,7 +132,7 @@ class _Recorder:
         lay_trap(moment, rng, job.length, self._tell)
         env = open_recorder(self._kind, job.path, job.mode, job.chunk, job.seed, self._tell, job.benchmark_id)
         env.action_space.seed(job.seed)
-        steps = rng.choice([0, 1, rng.randint(2, 60), rng.randint(2, 60)]) if moment.closes else 400
+        steps = rng.choice([1, rng.randint(2, 60), rng.randint(2, 60)]) if moment.closes else 400
         if moment.name == "any time":
             steps = 100_000
         if steps:

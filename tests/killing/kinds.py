@@ -31,7 +31,6 @@ class Kind:
     options: dict[str, Any] = field(default_factory=dict)
     elsewhere: bool = False  # the journal has a directory of its own
     storage: bool = False  # recorded by TupliEnvWrapper
-    variable: bool = False
     threaded: bool = False
     reuse: bool = False  # the environment returns the same array, with other values, again and again
     reward: gym.Space[Any] | None = None
@@ -62,47 +61,47 @@ KINDS = {
     "discrete": Kind(spaces.Discrete(500), reward=spaces.Box(-9, 9, (2,), np.float32)),
     "nested": Kind(_NESTED),
     "large": Kind(spaces.Dict({"x": spaces.Discrete(5), "y": spaces.Box(-1, 1, (600,))}), reuse=True),
-    "text": Kind(_TEXT, _SMALL, variable=True),
+    "text": Kind(_TEXT, _SMALL),
     "sequence": Kind(
         spaces.Tuple((spaces.Sequence(_BOX), spaces.OneOf((spaces.Discrete(3), spaces.Text(9))))),
         _SMALL,
-        variable=True,
     ),
-    "growing": Kind(spaces.Dict({"note": spaces.Text(50_000)}), _SMALL, variable=True, large=50_000),
+    "growing": Kind(spaces.Dict({"note": spaces.Text(50_000)}), _SMALL, large=50_000),
     "image": Kind(_IMAGE, (700, 2000, 20_000)),
-    "image and text": Kind(_SEEN, (200, 2000), variable=True),
+    "image and text": Kind(_SEEN, (200, 2000)),
     "frames": Kind(spaces.Box(0, 255, (80, 80, 3), np.uint8), (20_000, 60_000), threaded=True),
     "frames and text": Kind(
         spaces.Dict({"see": spaces.Box(0, 255, (80, 80, 3), np.uint8), "note": spaces.Text(20)}),
         (300, 60_000),
-        variable=True,
         threaded=True,
     ),
     "info": Kind(_BOX, options={"record_info": True}),
-    "info and text": Kind(_TEXT, _SMALL, options={"record_info": ["t"]}, variable=True),
+    "info and text": Kind(_TEXT, _SMALL, options={"record_info": ["t"]}),
     "metadata": Kind(_BOX, options={"metadata_callback": True}),
     "huge": Kind(spaces.Box(0, 255, (420, 420, 3), np.uint8), threaded=True, plain=True),
     "lz4": Kind(_BOX, options={"compression": "lz4"}),
     "uncompressed": Kind(_IMAGE, (700, 2000), options={"compression": "none"}),
     "elsewhere": Kind(_BOX, elsewhere=True),
     "by time": Kind(_BOX, options={"flush_seconds": 0.002}),
+    "synced steps": Kind(_BOX, options={"durability": "step"}),
+    "synced images": Kind(_IMAGE, (700, 2000), options={"durability": "chunk", "record_info": True}),
+    "synced texts": Kind(_TEXT, _SMALL, options={"durability": "step"}),
     "storage": Kind(_BOX, storage=True),
     "vector": Kind(_WIDE, vector=_NEXT, reuse=True),
     "vector same": Kind(_WIDE, vector=_SAME),
     "vector disabled": Kind(_WIDE, vector=_DISABLED),
     "vector nested": Kind(_NESTED, vector=_SAME, options={"record_info": True}),
+    "vector synced": Kind(_WIDE, vector=_SAME, options={"durability": "step"}),
     "vector image": Kind(_IMAGE, (700, 2000), vector=_NEXT),
     "vector image same": Kind(_IMAGE, (700, 2000), vector=_SAME),
     "vector image disabled": Kind(_IMAGE, (700, 2000), vector=_DISABLED, options={"record_info": True}),
     "vector frames": Kind(spaces.Box(0, 255, (80, 80, 3), np.uint8), vector=_NEXT, threaded=True),
     "vector metadata": Kind(_WIDE, vector=_SAME, options={"metadata_callback": True, "record_info": True}),
     "vector huge": Kind(spaces.Box(0, 255, (420, 420, 3), np.uint8), vector=_SAME, threaded=True, plain=True),
-    "vector text": Kind(_LONG, vector=_NEXT, variable=True, options={"record_info": True}),
-    "vector text same": Kind(_LONG, vector=_SAME, variable=True),
-    "vector text disabled": Kind(_SEEN, vector=_DISABLED, variable=True),
-    "vector growing": Kind(
-        spaces.Dict({"note": spaces.Text(200_000)}), vector=_NEXT, variable=True, large=200_000
-    ),
+    "vector text": Kind(_LONG, vector=_NEXT, options={"record_info": True}),
+    "vector text same": Kind(_LONG, vector=_SAME),
+    "vector text disabled": Kind(_SEEN, vector=_DISABLED),
+    "vector growing": Kind(spaces.Dict({"note": spaces.Text(200_000)}), vector=_NEXT, large=200_000),
 }
 SUB_ENVIRONMENTS = 3
 

@@ -23,7 +23,6 @@ from tupli_mcap.recording.container import Container
 __all__ = ["MOMENTS", "Moment", "die", "lay_trap"]
 
 ENCODER = "<tupli_mcap row encoder>"
-_write = os.write  # a trap may wrap it
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,9 @@ class Moment:
     times: int = 1
     closes: bool = False  # the process closes its recording, to get there
     appends: bool = False  # only where a recording goes on
-    variable: bool = False  # only with a layout of variable size
+    grows: bool = False  # only where steps become larger than the journal
     threaded: bool = False  # only where a thread writes the chunks
+    syncs: bool = False  # only where file and journal are synced
     flushes: bool = False  # the process flushes now and then
 
 
@@ -69,22 +69,23 @@ MOMENTS = {
         Moment("chunk", ("Container.add_chunk",), times=8, flushes=True),
         Moment("after chunk", ("Container.add_chunk",), after=True, times=8, flushes=True),
         Moment("compression", times=6, flushes=True),
-        Moment("torn chunk", call="write", starts=(_CHUNK,), times=6, flushes=True),
+        Moment("torn chunk", call="pwrite", starts=(_CHUNK,), times=6, flushes=True),
         Moment("chunk thread", ("ChunkWorker.submit.<locals>.write",), times=4, threaded=True),
+        Moment("sync", call="fdatasync", times=12, syncs=True),
         Moment("opening", ("RecordingWriter._open",)),
-        Moment("torn opening", call="write", starts=(b"\x89", b"\x0c", b"\x03"), times=4),
+        Moment("torn opening", call="pwrite", starts=(b"\x89", b"\x0c", b"\x03"), times=3),
         Moment("journal", ("RecordingWriter.begin",)),
         Moment("reserve", call="posix_fallocate"),
         Moment("rename", call="replace"),
-        Moment("growth", ("RecordingWriter._grow",), times=3, variable=True),
-        Moment("renamed growth", call="replace", times=3, variable=True),
+        Moment("growth", ("RecordingWriter._grow",), times=3, grows=True),
+        Moment("renamed growth", call="replace", times=3, grows=True),
         Moment("close", ("RecordingWriter.close",), closes=True),
-        Moment("torn index", call="write", starts=(_ATTACHMENT,), closes=True),
-        Moment("torn summary", call="write", starts=(_DATA_END,), closes=True),
+        Moment("torn index", call="pwrite", starts=(_ATTACHMENT,), closes=True),
+        Moment("torn summary", call="pwrite", starts=(_DATA_END,), closes=True),
         Moment("unlink", call="unlink", closes=True),
         Moment("resume", ("resume",), appends=True),
         Moment("truncate", call="ftruncate", appends=True),
-        Moment("torn resume", call="write", starts=(_CHUNK,), appends=True),
+        Moment("torn resume", call="pwrite", starts=(_CHUNK,), appends=True),
     )
 }
 
@@ -108,7 +109,7 @@ def lay_trap(
         _Instructions(moment, 0, int(10 ** rng.uniform(0, 4.5)), tell, lines=True).set()
     elif moment.name == "compression":
         _trap_compression(occurrence, rng)
-    elif moment.call == "write":
+    elif moment.call == "pwrite":
         _trap_write(moment, occurrence, rng)
     elif moment.call:
         _trap_call(moment.call, occurrence, rng)
@@ -192,9 +193,9 @@ class _Instructions:
 
 def _trap_write(moment: Moment, occurrence: int, rng: random.Random) -> None:
     """At a write of certain bytes: none, some or all of them get into the file."""
-    left = occurrence
+    left, pwrite = occurrence, os.pwrite
 
-    def write(fd: int, data: Any) -> int:
+    def write(fd: int, data: Any, offset: int) -> int:
         nonlocal left
         head = bytes(data[:100])
         if head.startswith(moment.starts) and (head[:1] != _ATTACHMENT or b"episodes.index" in head):
@@ -202,11 +203,11 @@ def _trap_write(moment: Moment, occurrence: int, rng: random.Random) -> None:
             if left == 0:
                 part = rng.choice([0, 1, len(data), rng.randint(0, len(data)), rng.randint(0, len(data))])
                 if part:
-                    _write(fd, data[:part])
+                    pwrite(fd, data[:part], offset)
                 die()
-        return _write(fd, data)
+        return pwrite(fd, data, offset)
 
-    os.write = write
+    os.pwrite = write
 
 
 def _trap_call(name: str, occurrence: int, rng: random.Random) -> None:
