@@ -547,3 +547,44 @@ def test_a_recording_without_episodes(tmp_path: Path) -> None:
     certificate = certify(tmp_path / "a.mcap", env=env)
     assert not certificate.agrees and not certificate.complete
     assert certificate.recorded.episodes == 0
+
+
+class Choosy(gym.Env[Any, Any]):
+    """Takes Python's integers only."""
+
+    observation_space = gym.spaces.Discrete(100)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.total = 0
+        return self.total, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if type(action) is not int:
+            raise TypeError(f"expected an int, found {action!r}")
+        self.total += action
+        return self.total, 0.0, False, False, {}
+
+
+def test_actions_may_have_been_pythons_numbers(tmp_path: Path) -> None:
+    with RecordEpisodes(Choosy(), tmp_path / "a.mcap") as env:
+        for seed in (1, None, 2):
+            env.reset(seed=seed)
+            for action in (0, 1, 1):
+                env.step(action)
+    check_complete(certify(tmp_path / "a.mcap"))
+
+
+def test_several_episodes_may_differ(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 300)
+
+    def change(i: int, episode: EpisodeData) -> EpisodeData:
+        if i in (2, 5, 8):
+            episode.rewards[1] = 2.0
+        return episode
+
+    certificate = certify(forge(path, tmp_path / "b.mcap", change))
+    assert [divergence.episode for divergence in certificate.divergences] == [2, 5, 8]
+    assert certificate.agreed.episodes == certificate.recorded.episodes - 3
+    assert str(certificate.first) == "episode 2 diverges at step 1: reward is 2.0 recorded, 1.0 replayed"

@@ -99,7 +99,7 @@ def print_json(value: Any) -> None:
 
 
 @contextlib.contextmanager
-def step_progress(total: int) -> Iterator[Callable[[int], None] | None]:
+def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int], None] | None]:
     """Gives a function to be told of the steps done; None where stderr is no terminal."""
     if not sys.stderr.isatty():
         yield None
@@ -108,7 +108,7 @@ def step_progress(total: int) -> Iterator[Callable[[int], None] | None]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     shown = (BarColumn(), MofNCompleteColumn(), TextColumn("steps"), TimeRemainingColumn())
-    with Progress(TextColumn("recording"), *shown, console=Console(stderr=True), transient=True) as progress:
+    with Progress(TextColumn(what), *shown, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("steps", total=total)
         yield lambda done: progress.update(task, completed=min(done, total))
 

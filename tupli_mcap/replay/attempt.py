@@ -35,14 +35,15 @@ class Attempt(NamedTuple):
 class _Actions:
     """The actions of the block that is at work."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, *, plain: bool) -> None:
         self._recording = recording
+        self._plain = plain
         self._get: Any = None
         self._block: Block | None = None
 
     def bind(self, block: Block) -> None:
         self._block = block
-        self._get = recorded_actions(self._recording, block.columns.actions)
+        self._get = recorded_actions(self._recording, block.columns.actions, plain=self._plain)
 
     def __iter__(self) -> Iterator[Any]:
         step = 0
@@ -56,7 +57,7 @@ def attempt(
 ) -> Attempt:
     """Takes an episode again and compares it, up to its end or the environment's."""
     tally = Tally()
-    actions = _Actions(recording)
+    actions = _Actions(recording, plain=replayer.plain)
     moments = replayer.moments(plan, actions)
     try:
         moment = next(moments)
@@ -88,7 +89,7 @@ def repeats_itself(
 def _prints(
     recording: Recording, plan: EpisodePlan, values: RecordedValues, replayer: Replayer
 ) -> Iterator[bytes]:
-    actions = _Actions(recording)
+    actions = _Actions(recording, plain=replayer.plain)
     moments = replayer.moments(plan, actions)
     try:
         yield _print(recording.layout, next(moments))

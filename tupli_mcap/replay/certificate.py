@@ -44,6 +44,19 @@ class Divergence(_Model):
     length: int = Field(ge=1)
     hint: str = ""
 
+    def __str__(self) -> str:
+        """The divergence in one line."""
+        of = f" of sub-environment {self.env}" if self.env else ""
+        where = f"episode {self.episode}{of}"
+        if self.kind == "error":
+            return f"{where}: the environment fails at {_place(self.step, self.length)} with {self.found}"
+        place = _place(self.step, self.length)
+        return f"{where} diverges at {place}: {self.path} is {self.expected} recorded, {self.found} replayed"
+
+
+def _place(step: int, length: int) -> str:
+    return "its reset" if step < 0 else "its final state" if step == length else f"step {step}"
+
 
 class Skipped(_Model):
     """Episodes that could not be checked, for one reason."""

@@ -81,6 +81,8 @@ class _Certifier:
         self._versions: dict[str, str] | None = None
         self._outcomes: dict[int, Divergence | SkipKind | None] = {}  # by position
         self._done = 0
+        self._plain = False  # Python's numbers in actions
+        self._settled = False  # which of the two it is
         self._deterministic: bool | None = None
 
     def run(self) -> Certificate:
@@ -102,8 +104,8 @@ class _Certifier:
             self._versions = versions_of(env)
         return env
 
-    def _replayer(self) -> Replayer:
-        return Replayer(self._make, owned=self._given is None)
+    def _replayer(self, *, plain: bool = False) -> Replayer:
+        return Replayer(self._make, owned=self._given is None, plain=plain)
 
     def _sub_environment(self, plans: list[EpisodePlan]) -> None:
         """The chosen episodes of one sub-environment, and what they go on from; everything before them too if a wrapper
@@ -118,7 +120,7 @@ class _Certifier:
 
     def _replay(self, plans: list[EpisodePlan]) -> None:
         """Episodes in order, on one environment."""
-        replayer = self._replayer()
+        replayer = self._replayer(plain=self._plain)
         doubt: SkipKind | None = "unseeded"
         try:
             values = recorded_values(self._recording, [plan.position for plan in plans])
@@ -126,7 +128,9 @@ class _Certifier:
                 doubt = self._doubt(plan, doubt)
                 found, replayer = self._attempt(plan, recorded, replayer)
                 outcome: Divergence | SkipKind | None = None
-                if not found.agrees:
+                if found.agrees:
+                    doubt = None if doubt == "after_divergence" else doubt
+                else:
                     outcome = doubt or self._divergence(plan, recorded, found)
                     doubt = doubt or "after_divergence"
                 self._outcomes[plan.position] = outcome
@@ -148,16 +152,24 @@ class _Certifier:
         self, plan: EpisodePlan, values: RecordedValues, replayer: Replayer
     ) -> tuple[Attempt, Replayer]:
         """The episode on the environment that took those before it, or else on a new one: a recording may have
-        been continued in another process."""
+        been continued in another process, and its policy may have given Python's numbers."""
         used = replayer.used
         found = attempt(self._recording, replayer, plan, values, self._checker)
-        if found.agrees or not used or not plan.starts_chain or self._given is not None:
+        if found.agrees:
+            self._settled = True
+        if found.agrees or not plan.starts_chain or self._given is not None:
             return found, replayer
-        fresh = self._replayer()
-        again = attempt(self._recording, fresh, plan, values, self._checker)
-        kept, dropped = (fresh, replayer) if again.agrees else (replayer, fresh)
-        dropped.close()
-        return (again if again.agrees else found), kept
+        others = [self._replayer(plain=self._plain)] if used else []
+        if not self._settled and any(leaf.is_scalar for leaf in self._recording.layout.action):
+            others.append(self._replayer(plain=True))
+        for other in others:
+            again = attempt(self._recording, other, plan, values, self._checker)
+            if again.agrees:
+                replayer.close()
+                self._settled, self._plain = True, other.plain
+                return again, other
+            other.close()
+        return found, replayer
 
     # ---- what is said of a difference
 

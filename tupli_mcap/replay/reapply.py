@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 
 from tupli_mcap.errors import TupliError
 from tupli_mcap.messages import jsonvalue
@@ -47,14 +48,18 @@ class Replayer:
     """Takes the episodes of one sub-environment again, in the order in which it is asked to.
 
     make: builds the environment; owned: it is closed when it is not needed any more, otherwise it is the caller's.
+    plain: numbers in actions are Python's, not NumPy's; a recording does not tell which ones the policy gave.
 
     One environment serves all episodes, since wrappers may carry state from one to the next, until an episode says
     that it began in a new one.
     """
 
-    def __init__(self, make: Callable[[], gym.Env[Any, Any]], *, owned: bool = True) -> None:
+    def __init__(
+        self, make: Callable[[], gym.Env[Any, Any]], *, owned: bool = True, plain: bool = False
+    ) -> None:
         self._make = make
         self._owned = owned
+        self.plain = plain
         self._env: gym.Env[Any, Any] | None = None
         self._resets_itself = False
         self._used = False
@@ -128,10 +133,19 @@ class Replayer:
                 env.close()
 
 
-def recorded_actions(recording: Recording, columns: Any) -> Callable[[int], Any]:
-    """From a step's index to its action, of the type that the action space's own samples have."""
+def recorded_actions(recording: Recording, columns: Any, *, plain: bool = False) -> Callable[[int], Any]:
+    """From a step's index to its action, of the type that the action space's own samples have, or with `plain` Python's
+    numbers in place of NumPy's."""
     get: Callable[[int], Any] = item_getter(recording.action_space, columns)
-    return get
+    return (lambda step: _plain(get(step))) if plain else get
+
+
+def _plain(action: Any) -> Any:
+    if isinstance(action, dict):
+        return {key: _plain(item) for key, item in action.items()}
+    if type(action) is tuple:
+        return tuple(_plain(item) for item in action)
+    return action.item() if isinstance(action, np.generic) else action
 
 
 def brief(err: BaseException, limit: int = 200) -> str:
