@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from environments import Sampler
 from sample_spaces import SPACES, space_id
+from typer.testing import CliRunner
 
 from tupli_mcap import (
     EpisodeData,
@@ -29,6 +30,7 @@ from tupli_mcap import (
     rewrite_recording,
     write_recording,
 )
+from tupli_mcap.cli.app import app
 from tupli_mcap.recording.attach import add_attachments
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.replay import (
@@ -588,3 +590,80 @@ def test_several_episodes_may_differ(tmp_path: Path) -> None:
     assert [divergence.episode for divergence in certificate.divergences] == [2, 5, 8]
     assert certificate.agreed.episodes == certificate.recorded.episodes - 3
     assert str(certificate.first) == "episode 2 diverges at step 1: reward is 2.0 recorded, 1.0 replayed"
+
+
+# --- the command line ---
+
+
+def run(*args: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, [str(arg) for arg in args])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_verify_replay(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 100)
+    before = path.read_bytes()
+    code, out, err = run("verify", "--replay", path)
+    with Recording(path) as recording:
+        episodes = len(recording)
+    assert (code, err) == (0, "")
+    assert f"{path}: all {episodes} episodes (100 steps) agree bit for bit\n  replayed in" in out
+    assert path.read_bytes() == before
+    code, out, err = run("verify", "--replay", "--write-certificate", "--json", path)
+    assert (code, err) == (0, "")
+    document = json.loads(out)
+    with Recording(path) as recording:
+        certificate = read_certificate(recording)
+    assert certificate is not None
+    (told,) = document["replays"]
+    assert told == {"path": str(path), "agrees": True, **json.loads(certificate.to_json())}
+    assert run("verify", path)[0] == 0
+    code, out, _ = run("info", path)
+    assert f"certificate  says that all {episodes} episodes (100 steps) agree bit for bit" in out
+    record(path, gym.make("CartPole-v1"), 10, mode="a")
+    assert "of other episodes than are in the file now" in run("info", path)[1]
+    assert json.loads(run("info", path, "--json")[1])["certificate"]["covers"] is False
+    assert run("verify", path)[0] == 0
+
+
+def test_verify_replay_of_what_differs_or_cannot_be_replayed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 100)
+
+    def change(i: int, episode: EpisodeData) -> EpisodeData:
+        if i == 1:
+            episode.rewards[0] = 7.0
+        return episode
+
+    changed = forge(path, tmp_path / "b.mcap", change)
+    code, out, err = run("verify", "--replay", changed)
+    assert (code, err) == (1, "")
+    assert f"{changed}: episode 1 diverges at step 0: reward is 7.0 recorded, 1.0 replayed" in out
+    assert "of reward by at most 6, at step 0" in out
+    assert run("verify", "--replay", "--episodes", "0,2-3", changed)[0] == 0
+    pickled = record(tmp_path / "c.mcap", Drifting(gym.make("CartPole-v1")), 30)
+    monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "stranger"))
+    code, out, err = run("verify", "--replay", pickled)
+    assert code == 1
+    assert "pickled Python code" in err and err.count("\n") == 1
+    assert run("verify", "--replay", "--trust", pickled)[0] == 0
+
+
+@pytest.mark.parametrize(
+    "args", [["--trust"], ["--write-certificate"], ["--episodes", "1"], ["--replay", "--episodes", "1-x"]]
+)
+def test_options_that_make_no_sense(tmp_path: Path, args: list[str]) -> None:
+    code, out, err = run("verify", *args, tmp_path / "a.mcap")
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+
+
+def test_an_unreadable_certificate_does_not_hide_the_rest(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 20)
+    add_attachments(path, {CERTIFICATE_NAME: ("application/json", b"[]")})
+    code, out, _ = run("info", path)
+    assert code == 0
+    assert "certificate  unreadable:" in out and "CartPole-v1" in out

@@ -24,6 +24,7 @@ from tupli_mcap.cli.output import (
     time_of,
     when,
 )
+from tupli_mcap.cli.replaying import carried_certificate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -180,11 +181,13 @@ def _info(
 
     with Recording(file) as recording:
         description = describe(recording)
+        replayed = carried_certificate(recording)
     if as_json:
         channels = [channel._asdict() for channel in description.channels]
-        print_json({**asdict(description), "channels": channels, **_spreads(description)})
+        certificate = {} if replayed is None else {"certificate": replayed._asdict()}
+        print_json({**asdict(description), "channels": channels, **_spreads(description), **certificate})
         return
-    print_facts(_facts(description))
+    print_facts([*_facts(description), *([] if replayed is None else [("certificate", str(replayed))])])
     if description.channels:
         print()
         _print_channels(description)

@@ -9,6 +9,7 @@ import typer
 
 from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import Column, bytes_of, number, print_json, print_table
+from tupli_mcap.cli.replaying import Replays, episode_numbers
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.findings import VerifyReport
@@ -31,13 +32,31 @@ def _verify(
         list[Path],
         typer.Argument(metavar="PATH...", help="Recordings, other MCAP files, directories, storages."),
     ],
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Also replay recordings and compare, bit for bit.")
+    ] = False,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="With --replay: run the code that the files carry.")
+    ] = False,
+    write: Annotated[
+        bool, typer.Option("--write-certificate", help="With --replay: write the result into the file.")
+    ] = False,
+    episodes: Annotated[
+        str | None, typer.Option(metavar="NUMBERS", help="With --replay: only these, such as 0,4,10-19.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Check files for damage: structure, CRCs, indexes, layouts, alignment, digests.
 
     Every episode has to start, go on and end, without a gap or a step twice. Of a storage, artifacts, benchmarks
     and the catalog are checked too. Nothing is executed, nothing is written. Exit code 1 if something is damaged.
+
+    --replay rebuilds the environment of each recording, takes every episode again with its seed, options and
+    actions, and says where something differs. Exit code 1 if something does, or nothing could be checked.
     """
+    replays = Replays(trust, episode_numbers(episodes), write) if replay else None
+    if replays is None and (trust or write or episodes is not None):
+        raise typer.BadParameter("--trust, --write-certificate and --episodes go with --replay")
     from tupli_mcap.storage.verify import StorageReport, verify_paths
 
     found = StorageReport()
@@ -45,11 +64,13 @@ def _verify(
         found.files.append(report)
         if not as_json:
             _print_verified(report)
+        if replays is not None and report.kind == "recording" and report.ok:
+            replays.add(Path(report.path), quiet=as_json)
     if as_json:
-        print_json(found.to_json())
+        print_json({**found.to_json(), **({} if replays is None else {"replays": replays.to_json()})})
     elif len(found.files) > 1:
         print(f"{number(len(found.files))} verified, {number(len(found.damaged))} damaged")
-    if not found.ok:
+    if not found.ok or (replays is not None and not replays.ok):
         raise typer.Exit(1)
 
 

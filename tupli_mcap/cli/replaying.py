@@ -1,20 +1,24 @@
-"""What `verify --replay` prints."""
+"""What `verify --replay` prints, and `info` of a certificate."""
 
 from __future__ import annotations
 
+import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
-from tupli_mcap.cli.output import number, step_progress
+from tupli_mcap.cli.output import number, step_progress, terminal_width, time_of, visible
+from tupli_mcap.errors import FormatError, TupliError
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording import Recording
     from tupli_mcap.replay import Certificate
 
-__all__ = ["episode_numbers", "print_replay", "replay"]
+__all__ = ["Replays", "carried_certificate", "episode_numbers"]
 
 _SHOWN = 5  # diverging episodes beside the first; what is beyond is in --json
 _MAX_NUMBERS = 10_000_000
@@ -36,29 +40,90 @@ def episode_numbers(text: str | None) -> list[int] | None:
     return numbers
 
 
-def replay(
-    path: Path, *, trust: bool, episodes: Sequence[int] | None, write: bool
-) -> tuple[Certificate, float]:
-    """The certificate of a recording, written into it if asked, and the seconds it took."""
-    from tupli_mcap.recording import Recording
-    from tupli_mcap.replay import certify, write_certificate
+class Replays:
+    """Recordings replayed one after another; one that cannot be stops nothing."""
 
-    began = time.perf_counter()
-    with Recording(path) as recording, step_progress(recording.num_steps, "replaying") as progress:
-        certificate = certify(recording, trust=trust, episodes=episodes, progress=progress)
-    seconds = time.perf_counter() - began
-    if write:
-        write_certificate(path, certificate)
-    return certificate, seconds
+    def __init__(self, trust: bool, episodes: Sequence[int] | None, write: bool) -> None:
+        self._trust = trust
+        self._episodes = episodes
+        self._write = write
+        self._found: list[tuple[Path, Certificate | None, str]] = []
+
+    @property
+    def ok(self) -> bool:
+        """True if something was replayed, and all of it agrees."""
+        certificates = [certificate for _, certificate, _ in self._found]
+        return bool(certificates) and all(found is not None and found.agrees for found in certificates)
+
+    def add(self, path: Path, *, quiet: bool) -> None:
+        """Replays a recording; says the outcome unless `quiet`."""
+        from tupli_mcap.recording import Recording
+        from tupli_mcap.replay import certify, write_certificate
+
+        began = time.perf_counter()
+        try:
+            with Recording(path) as recording, step_progress(recording.num_steps, "replaying") as progress:
+                found = certify(recording, trust=self._trust, episodes=self._episodes, progress=progress)
+            seconds = time.perf_counter() - began
+            if self._write:
+                write_certificate(path, found)
+        except TupliError as err:
+            self._found.append((path, None, str(err)))
+            if not quiet:
+                print(f"error: {' '.join(str(err).split())}", file=sys.stderr)
+            return
+        self._found.append((path, found, ""))
+        if not quiet:
+            _print_lines(f"{path}: {_outcome(found)}", _lines(found, seconds, written=self._write))
+
+    def to_json(self) -> list[dict[str, Any]]:
+        return [
+            {"path": str(path)}
+            | ({"error": error} if found is None else {"agrees": found.agrees, **found.model_dump()})
+            for path, found, error in self._found
+        ]
 
 
-def print_replay(path: Path, certificate: Certificate, seconds: float, *, written: bool) -> None:
-    """A line on the outcome, then what there is to say about it."""
-    print(f"{path}: {_outcome(certificate)}")
-    for line in _lines(certificate, seconds):
-        print(f"  {line}")
-    if written:
-        print("  the certificate is in the file")
+class CarriedCertificate(NamedTuple):
+    """What a file says of its replaying; `error` where that cannot be read."""
+
+    agrees: bool
+    complete: bool
+    covers: bool
+    created_ns: int
+    text: str
+    error: str = ""
+
+    def __str__(self) -> str:
+        if self.error:
+            return f"unreadable: {self.error}"
+        stale = "" if self.covers else "; of other episodes than are in the file now"
+        return f"says that {self.text}, {time_of(self.created_ns)}{stale}; verify --replay checks it"
+
+
+def carried_certificate(recording: Recording) -> CarriedCertificate | None:
+    """The certificate of a recording, None if it carries none."""
+    from tupli_mcap.replay import CERTIFICATE_NAME, covers, read_certificate
+
+    if CERTIFICATE_NAME not in recording.attachments:
+        return None
+    try:
+        found = read_certificate(recording)
+    except FormatError as err:
+        return CarriedCertificate(False, False, False, 0, "", str(err))
+    if found is None:
+        return None
+    known = covers(found, recording)
+    return CarriedCertificate(found.agrees, found.complete, known, found.created_ns, _outcome(found)[:200])
+
+
+def _print_lines(head: str, lines: Sequence[str]) -> None:
+    width = terminal_width()
+    print(visible(head))
+    for line in map(visible, lines):
+        parts = [line] if width is None else textwrap.wrap(line, max(40, width - 4), break_on_hyphens=False)
+        for i, part in enumerate(parts):
+            print(f"{'  ' if i == 0 else '    '}{part}")
 
 
 def _outcome(c: Certificate) -> str:
@@ -74,7 +139,7 @@ def _outcome(c: Certificate) -> str:
     )
 
 
-def _lines(c: Certificate, seconds: float) -> list[str]:
+def _lines(c: Certificate, seconds: float, *, written: bool) -> list[str]:
     lines = []
     first = c.first
     if first is not None:
@@ -97,7 +162,7 @@ def _lines(c: Certificate, seconds: float) -> list[str]:
     versions = ", ".join(f"{name} {version}" for name, version in c.versions.items())
     machine = " ".join(c.platform.get(name, "") for name in ("system", "machine")).strip()
     lines.append(f"replayed in {seconds:.1f} s on {c.environment} with {versions}, {machine}")
-    return lines
+    return [*lines, "the certificate is in the file"] if written else lines
 
 
 def _spread(first: Any) -> list[str]:

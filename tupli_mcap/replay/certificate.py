@@ -93,7 +93,7 @@ class Certificate(_Model):
     environment: str
     environment_digest: str
     content_sha256: str = Field(pattern=_HEX_DIGEST)
-    created_ns: int = Field(ge=0)
+    created_ns: int = Field(ge=0, lt=1 << 63)
     recorded: Counts
     chosen: Counts
     agreed: Counts

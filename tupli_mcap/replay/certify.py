@@ -203,10 +203,15 @@ class _Certifier:
         tally = found.tally
         if tally.ended is not None:
             hints.append(_ended(tally.ended, values.length))
-        if plan.starts_chain and found.error is None and self._repeats_itself(plan, values) is False:
+        repeats = self._repeats_itself(plan, values) if plan.starts_chain and found.error is None else None
+        if repeats is False:
             hints.append(
                 "The environment is not deterministic: replayed twice with the same seed it differs from itself "
                 "(it may draw from np.random, random or an unseeded space)."
+            )
+        elif repeats:
+            hints.append(
+                "The environment repeats itself: its code, its libraries or the recorded values are others than then."
             )
         if plan.env > 0:
             hints.append("The file carries the first sub-environment; this one may have been made otherwise.")
