@@ -131,6 +131,10 @@ def crash(story: Story, at: int, place: Path, rng: random.Random) -> list[int]:
     """Writes a possible disk after a power loss at moment `at`; returns the steps that must be there."""
     moments = story.moments
     synced_file, synced_journal = story.synced_file[at], story.synced_journal[at]
+    if (
+        story.durability == "os" and rng.random() < 0.8
+    ):  # the system wrote everything at some moment, each by itself
+        synced_file, synced_journal = rng.randrange(at + 1), rng.randrange(at + 1)
     place.write_bytes(_mixed([m.file for m in moments[max(0, synced_file) : at + 1]], rng, synced_file >= 0))
     held = [m.journal for m in moments[max(0, synced_journal) : at + 1] if m.journal is not None]
     target = journal_path(place)
