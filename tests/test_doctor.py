@@ -29,6 +29,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli import app
 from tupli_mcap.doctor import CHECKS, Diagnosis, Finding, Place, Severity, examine
+from tupli_mcap.doctor.gather.bounded import Extremes, Sample
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
@@ -665,6 +666,26 @@ def test_continuous_actions_at_bounds_and_in_a_corner(tmp_path: Path) -> None:
     finding = found(diagnosis, "action-range")
     assert (finding.severity, finding.dimensions) == (INFO, ((2,),))
     assert "use 1% of their range" in finding.message
+
+
+@pytest.mark.parametrize("pieces", [1, 7, 100, 5000])
+def test_samples_are_every_nth_value(pieces: int) -> None:
+    sample = Sample(capacity=50)
+    values = np.arange(5000)
+    for piece in np.array_split(values, pieces):
+        sample.put(piece)
+    stride = int(np.diff(sample.values)[0])
+    assert sample.seen == 5000 and 25 <= len(sample.values) <= 51
+    assert np.array_equal(sample.values, values[::stride])
+
+
+def test_extremes_are_the_largest_with_their_places() -> None:
+    values = np.random.default_rng(0).integers(0, 300, 5000).astype(float)
+    extremes = Extremes(k=10)
+    for start in range(0, 5000, 123):
+        extremes.put(values[start : start + 123], lambda i, start=start: (0, start + i))
+    order = np.lexsort((np.arange(5000), -values))[:10]
+    assert extremes.largest == [(values[i], (0, int(i))) for i in order]
 
 
 # --- clocks ---

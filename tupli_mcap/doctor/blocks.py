@@ -69,12 +69,12 @@ class Block:
         return int(self.rows["episode"][at]), int(step - self.starts[at]) + self.first_step
 
 
-def blocks(recording: Recording, positions: Array, *, block_bytes: int = BLOCK_BYTES) -> Iterator[Block]:
-    """The steps of the episodes at some positions, in this order, about `block_bytes` at a time."""
+def blocks(recording: Recording, positions: Array) -> Iterator[Block]:
+    """The steps of the episodes at some positions, in this order, about `BLOCK_BYTES` at a time."""
     if not len(positions):
         return
     layout = recording.layout
-    limit = max(1, block_bytes // _step_bytes(layout))
+    limit = max(1, BLOCK_BYTES // _step_bytes(layout))
     lengths = recording.index["length"][positions].astype(np.int64)
     ends = np.cumsum(lengths)
     start = 0
