@@ -39,6 +39,7 @@ from tupli_mcap.replay import (
     certify,
     covers,
     read_certificate,
+    values,
     write_certificate,
 )
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
@@ -667,3 +668,33 @@ def test_an_unreadable_certificate_does_not_hide_the_rest(tmp_path: Path) -> Non
     code, out, _ = run("info", path)
     assert code == 0
     assert "certificate  unreadable:" in out and "CartPole-v1" in out
+
+
+@pytest.mark.parametrize("block", [1, 500, 5000])
+def test_long_episodes_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int) -> None:
+    monkeypatch.setattr(values, "_BLOCK", block)
+    path = record(tmp_path / "a.mcap", gym.make("Pendulum-v1"), 250)
+    check_complete(certify(path))
+
+    def change(i: int, episode: EpisodeData) -> EpisodeData:
+        if i == 0:
+            episode.states[150, 1] = 0.5
+        return episode
+
+    first = certify(forge(path, tmp_path / "b.mcap", change)).first
+    assert first is not None
+    assert (first.step, first.path, first.expected) == (150, "state[1]", "0.5")
+
+
+def test_kept_resets_are_nothing_that_verify_minds(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    for seed in (1, None):  # the second session goes on from an unknown random state
+        inner = gym.make("Blackjack-v1")
+        inner.reset(seed=9)
+        with RecordEpisodes(inner, path, mode="a" if path.exists() else "x") as env:
+            env.reset(seed=seed)
+            roll(env, 10, seed=None)
+    write_certificate(path, certify(path))
+    code, out, err = run("verify", path)
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{path}: ok")
