@@ -744,7 +744,7 @@ class TestSharing:
         assert run("trust", path, "--remove", "--json").json["trusted"] is False
         assert not trust.is_trusted(shown["digest"])
         assert fails("trust", path, "--show", "--remove", code=2).startswith(
-            "Invalid value: --show, --remove and --list exclude each other"
+            "Invalid value: --show, --remove, --list and --key exclude each other"
         )
 
     def test_trust_is_not_needed_for_a_registered_environment(self, here: Path, cartpole: Path) -> None:
@@ -775,7 +775,7 @@ class TestSharing:
         monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(Path("config").resolve()))
         assert ok("trust", "--list") == "nothing is trusted\n"
         digest = run("trust", path, "--json").json["digest"]
-        assert ok("trust", "--list") == f"{digest}\n"
+        assert ok("trust", "--list") == f"environment  {digest}\n"
         for what in (path, digest, digest[:8]):
             ok("trust", path)
             assert run("untrust", what, "--json").json == {"digest": digest, "was_trusted": True}
@@ -783,7 +783,7 @@ class TestSharing:
         assert run("trust", "--list", "--json").json["digests"] == []
         assert fails("untrust", digest[:8]).startswith("no trusted environments have a digest that starts")
         assert fails("untrust", "no.mcap").startswith("no.mcap does not exist")
-        assert fails("trust", code=2).startswith("Invalid value: expected a FILE, or --list")
+        assert fails("trust", code=2).startswith("Invalid value: expected a FILE, --list or --key")
 
     def test_import_may_trust(self, lab: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch) -> None:
         ok("bundle", lab[2], "-o", "b.mcap", "--storage", "lab")

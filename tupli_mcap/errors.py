@@ -11,6 +11,7 @@ __all__ = [
     "MissingExtraError",
     "NotFoundError",
     "RecordingError",
+    "SignatureError",
     "SpaceError",
     "StepError",
     "StorageError",
@@ -56,6 +57,10 @@ class FilterError(TupliError, ValueError):
 
 class UntrustedError(TupliError):
     """Code from a file would run, and nobody on this machine has trusted it."""
+
+
+class SignatureError(TupliError):
+    """A signature or a key is missing, of an unknown signer, or does not fit what it should have signed."""
 
 
 class MissingExtraError(TupliError, ImportError):

@@ -1,12 +1,14 @@
-"""Which environments this user's machine may rebuild by running code from a file.
+"""Which environments this user's machine may rebuild by running code from a file, and whose keys it believes.
 
 A digest (the SHA-256 of an environment, see `tupli_mcap.environment`) is trusted when the user's own
 configuration directory holds a signature of it, made with a secret key that never leaves that directory. A
-file cannot bring its own trust along: copying a recording copies no signature.
+file cannot bring its own trust along: copying a recording copies no signature. The user may also trust other
+people's public keys: what such a key has signed is trusted for as long as the key is.
 
 The directory is `$TUPLI_MCAP_CONFIG_DIR`, else the platform's user configuration directory. It holds `key`
-(32 random bytes, mode 0600) and `trusted/<digest>` (one signature each). Every write is one atomic rename or
-link, so any number of processes may sign at once.
+(32 random bytes, mode 0600), `trusted/<digest>` (one signature each), `keys/<public key>` (a signature and the
+key's name) and `vouched/<digest>.<public key>`. Every write is one atomic rename or link, so any number of
+processes may sign at once.
 """
 
 from __future__ import annotations
@@ -20,17 +22,40 @@ import secrets
 import stat
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import platformdirs
 
 from tupli_mcap.errors import TupliError
 
-__all__ = ["config_dir", "is_trusted", "sign", "trust", "trusted_digests", "untrust"]
+__all__ = [
+    "TrustedKey",
+    "config_dir",
+    "is_trusted",
+    "sign",
+    "trust",
+    "trust_key",
+    "trusted_digests",
+    "trusted_keys",
+    "untrust",
+    "untrust_key",
+    "vouch",
+]
 
 _KEY_BYTES = 32
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 # Names what is signed, so that the key can never be made to sign something else that looks like a digest.
 _PURPOSE = b"tupli_mcap environment v1\0"
+_PURPOSE_OF_KEYS = b"tupli_mcap public key v1\0"
+_PURPOSE_OF_VOUCHERS = b"tupli_mcap voucher v1\0"
+_MAX_FILE = 4096
+
+
+class TrustedKey(NamedTuple):
+    """Somebody's Ed25519 key: 64 hex digits, and the name this user gave it."""
+
+    public_key: str
+    name: str
 
 
 def config_dir() -> Path:
@@ -46,7 +71,8 @@ def sign(digest: str) -> str:
         TupliError: The digest is not 64 hex digits, or the key cannot be made, read, or is open to other
         users.
     """
-    return _signature(_key(create=True), digest)
+    _check_digest(digest)
+    return _signed(_key(create=True), _PURPOSE + digest.encode("ascii"))
 
 
 def trust(digest: str) -> None:
@@ -55,52 +81,148 @@ def trust(digest: str) -> None:
     Raises:
         TupliError: As `sign`, or the signature cannot be written.
     """
-    signature = sign(digest)
-    path = config_dir() / "trusted" / digest
-    try:
-        _make_private_dir(path.parent)
-        _write(path, signature.encode("ascii"), replace=True)
-    except OSError as err:
-        raise TupliError(f"the signature {str(path)!r} cannot be written: {err}") from err
+    _store(f"trusted/{digest}", sign(digest))
 
 
 def untrust(digest: str) -> bool:
-    """Forget a digest; returns whether it was trusted until now.
+    """Forget a digest, also as vouched for by keys; returns whether it was trusted until now.
 
     Raises:
         TupliError: The digest is not 64 hex digits, or the signature cannot be removed.
     """
     known = is_trusted(digest)
-    path = config_dir() / "trusted" / digest
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as err:
-        raise TupliError(f"the signature {str(path)!r} cannot be removed: {err}") from err
+    for path in (config_dir() / "trusted" / digest, *_vouchers(digest)):
+        _remove(path)
     return known
 
 
 def is_trusted(digest: str) -> bool:
-    """Whether this user signed that digest. A missing key or signature, or one that does not fit, means no.
+    """Whether this user signed that digest, or a trusted key vouched for it. A missing key or signature, or one
+    that does not fit, means no.
 
     Raises:
         TupliError: The digest is not 64 hex digits, or the key is open to other users.
     """
     _check_digest(digest)
-    try:
-        found = (config_dir() / "trusted" / digest).read_bytes()
-    except OSError:
-        return False
-    key = _key(create=False)
-    return key is not None and hmac.compare_digest(found, _signature(key, digest).encode("ascii"))
+    if _fits(config_dir() / "trusted" / digest, _PURPOSE + digest.encode("ascii")):
+        return True
+    believed = {key.public_key for key in trusted_keys()}
+    return any(
+        path.suffix[1:] in believed and _fits(path, _voucher(digest, path.suffix[1:]))
+        for path in _vouchers(digest)
+    )
 
 
 def trusted_digests() -> list[str]:
-    """Every digest this user trusts, sorted."""
+    """Every digest this user trusts, sorted; those that keys vouched for when they were imported too."""
+    names = {path.name for path in _listed("trusted")} | {path.stem for path in _listed("vouched")}
+    return sorted(name for name in names if _DIGEST.match(name) and is_trusted(name))
+
+
+# --- other people's keys ---
+
+
+def trust_key(public_key: str, name: str) -> None:
+    """Trust whatever that Ed25519 key (64 hex digits) signs; a second name replaces the first.
+
+    Raises:
+        TupliError: It is no key, or cannot be noted.
+    """
+    _check_digest(public_key)
+    text = " ".join(name.split())[:200]
+    signature = _signed(_key(create=True), _PURPOSE_OF_KEYS + public_key.encode("ascii") + text.encode())
+    _store(f"keys/{public_key}", f"{signature} {text}")
+
+
+def untrust_key(public_key: str) -> bool:
+    """Trust a key no longer, and with it nothing that only the key vouched for; returns whether it was trusted.
+
+    Raises:
+        TupliError: It is no key, or cannot be removed.
+    """
+    _check_digest(public_key)
+    known = any(key.public_key == public_key for key in trusted_keys())
+    _remove(config_dir() / "keys" / public_key)
+    for path in _listed("vouched"):
+        if path.suffix[1:] == public_key:
+            _remove(path)
+    return known
+
+
+def trusted_keys() -> list[TrustedKey]:
+    """The keys this user trusts, by name."""
+    found = []
+    for path in _listed("keys"):
+        if not _DIGEST.match(path.name):
+            continue
+        signature, _, name = _content(path).decode("utf-8", "replace").partition(" ")
+        if _is_signature(signature, _PURPOSE_OF_KEYS + path.name.encode("ascii") + name.encode()):
+            found.append(TrustedKey(path.name, name))
+    return sorted(found, key=lambda key: (key.name, key.public_key))
+
+
+def vouch(digest: str, public_key: str) -> None:
+    """Trust a digest for as long as that key is trusted: the caller has checked the key's signature of it.
+
+    Raises:
+        TupliError: As `trust`.
+    """
+    _check_digest(digest)
+    _check_digest(public_key)
+    _store(f"vouched/{digest}.{public_key}", _signed(_key(create=True), _voucher(digest, public_key)))
+
+
+def _voucher(digest: str, public_key: str) -> bytes:
+    return _PURPOSE_OF_VOUCHERS + digest.encode("ascii") + public_key.encode("ascii")
+
+
+def _vouchers(digest: str) -> list[Path]:
+    return [path for path in _listed("vouched") if path.stem == digest and _DIGEST.match(path.suffix[1:])]
+
+
+# --- files ---
+
+
+def _listed(directory: str) -> list[Path]:
     try:
-        names = [path.name for path in (config_dir() / "trusted").iterdir()]
+        return list((config_dir() / directory).iterdir())
     except OSError:
         return []
-    return sorted(name for name in names if _DIGEST.match(name) and is_trusted(name))
+
+
+def _content(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(_MAX_FILE)
+    except OSError:
+        return b""
+
+
+def _fits(path: Path, message: bytes) -> bool:
+    return _is_signature(_content(path).decode("ascii", "replace"), message)
+
+
+def _is_signature(text: str, message: bytes) -> bool:
+    if not text:
+        return False
+    key = _key(create=False)
+    return key is not None and hmac.compare_digest(text.encode(), _signed(key, message).encode("ascii"))
+
+
+def _store(name: str, text: str) -> None:
+    path = config_dir() / name
+    try:
+        _make_private_dir(path.parent)
+        _write(path, text.encode(), replace=True)
+    except OSError as err:
+        raise TupliError(f"the signature {str(path)!r} cannot be written: {err}") from err
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as err:
+        raise TupliError(f"the signature {str(path)!r} cannot be removed: {err}") from err
 
 
 def _check_digest(digest: str) -> None:
@@ -109,11 +231,10 @@ def _check_digest(digest: str) -> None:
         raise TupliError(f"expected a digest of 64 hex digits, found {str(digest)[:80]!r}")
 
 
-def _signature(key: bytes | None, digest: str) -> str:
-    _check_digest(digest)
+def _signed(key: bytes | None, message: bytes) -> str:
     if key is None:
         raise TupliError(f"there is no key in {str(config_dir())!r}")
-    return hmac.new(key, _PURPOSE + digest.encode("ascii"), hashlib.sha256).hexdigest()
+    return hmac.new(key, message, hashlib.sha256).hexdigest()
 
 
 def _key(*, create: bool) -> bytes | None:
@@ -136,7 +257,9 @@ def _key(*, create: bool) -> bytes | None:
 
 
 def _read_key(path: Path) -> bytes:
-    with path.open("rb") as file:
+    _check_private(path.parent)
+    # A link could lead to a file whose content somebody else knows.
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | getattr(os, "O_NOFOLLOW", 0)), "rb") as file:
         status = os.fstat(file.fileno())
         if os.name == "posix" and (status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077):
             raise TupliError(
@@ -151,9 +274,22 @@ def _read_key(path: Path) -> bytes:
     return key
 
 
+def _check_private(directory: Path) -> None:
+    """Who may write into the directory could put a key of their own there."""
+    status = directory.stat()
+    if os.name == "posix" and (status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o022):
+        raise TupliError(
+            f"the directory {str(directory)!r} must be writable by you alone: found mode "
+            f"{stat.S_IMODE(status.st_mode):04o} of user {status.st_uid}; chmod it to 0700, or set "
+            "TUPLI_MCAP_CONFIG_DIR"
+        )
+
+
 def _make_private_dir(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.mkdir(mode=0o700, exist_ok=True)
+    if path != config_dir() and stat.S_IMODE(path.stat().st_mode) & 0o077:
+        path.chmod(0o700)
 
 
 def _write(path: Path, data: bytes, *, replace: bool) -> None:

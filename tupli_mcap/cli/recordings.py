@@ -289,6 +289,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         *([("rollouts", f"{time_of(d.start_ns)} to {time_of(d.end_ns)}")] if d.episodes else []),
         ("environment", f"{environment}, {d.num_envs} sub-environments" if d.num_envs > 1 else environment),
         ("benchmark", d.benchmark_id or "none"),
+        *([("signed by", f"{d.signed_by} (not checked)")] if d.signed_by else []),
         ("observation", d.observation_space or "not known before the first step"),
         ("action", d.action_space or "not known before the first step"),
         ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,9 @@ from tupli_mcap.cli.options import (
     open_storage,
 )
 from tupli_mcap.cli.output import bytes_of, number, print_facts, print_json
+
+if TYPE_CHECKING:
+    from tupli_mcap.signing import SigningKey
 
 __all__ = ["register"]
 
@@ -39,6 +42,10 @@ def _bundle(
     output: Output,
     storage_path: StoragePath = DEFAULT_STORAGE,
     filter_text: FilterText = None,
+    sign: Annotated[
+        Path | None,
+        typer.Option("--sign", metavar="KEY", help="Sign it with this private Ed25519 key (OpenSSH or PEM)."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Write a benchmark with all it needs to a file.
@@ -46,7 +53,11 @@ def _bundle(
     The file carries the benchmark, its artifacts and its episodes: nothing else is needed to use it.
     A benchmark id takes all its episodes (or those of the filter) from the storage. FILE takes the
     episodes of that recording, and what it lacks from the storage.
+
+    --sign takes a key that `ssh-keygen -t ed25519` makes; its passphrase is asked for, or is in
+    TUPLI_MCAP_KEY_PASSPHRASE.
     """
+    key = None if sign is None else _signing_key(sign)
     path = Path(source)
     if path.suffix == ".mcap" or path.is_file():
         if filter_text is not None:
@@ -54,10 +65,10 @@ def _bundle(
         from tupli_mcap.storage import bundles
 
         with open_storage(storage_path) if storage_path.is_dir() else nullcontext() as known:
-            bundles.from_recording(path, output, known)
+            bundles.from_recording(path, output, known, key)
     else:
         with open_storage(storage_path) as storage:
-            storage.bundle(full_id(storage, source), output, filter_of(filter_text))
+            storage.bundle(full_id(storage, source), output, filter_of(filter_text), sign=key)
     _print_written(output, as_json)
 
 
@@ -81,17 +92,33 @@ def _import(
     file: Source,
     storage_path: StoragePath = DEFAULT_STORAGE,
     trust: Annotated[bool, typer.Option("--trust", help="Also trust its environment's code.")] = False,
+    require_signature: Annotated[
+        bool, typer.Option("--require-signature", help="Refuse it unless a key you trust has signed it.")
+    ] = False,
+    signers: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--from", metavar="KEY", help="The signer: a name, fingerprint or .pub file. Repeatable."
+        ),
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only check it and say what is new.")] = False,
     as_json: Json = False,
 ) -> None:
     """Take a bundle into a storage.
 
     The storage is made if it is missing. Importing a file again changes nothing. Nothing in the file is
-    executed.
+    executed. Where a key that you trust has signed it, its environment may be rebuilt afterwards.
     """
+    from tupli_mcap.recording import Recording
+    from tupli_mcap.signing import find_key
     from tupli_mcap.storage import bundles
 
     create = not dry_run
+    required = require_signature or bool(signers)
+    keys = [find_key(text).public_key for text in signers or ()]
+    if required:  # before a storage is made
+        with Recording(file) as recording:
+            bundles.checked_signature(recording, required, keys)
     with (
         open_storage(storage_path, create=create)
         if create or storage_path.is_dir()
@@ -99,7 +126,7 @@ def _import(
     ):
         preview = bundles.preview(storage, file)
         if storage is not None and not dry_run:
-            storage.import_bundle(file, trust=trust)
+            storage.import_bundle(file, trust=trust, require_signature=required, signers=keys)
     if as_json:
         print_json({"dry_run": dry_run, **preview._asdict()})
         return
@@ -109,6 +136,22 @@ def _import(
         f"{number(preview.new_artifacts)} of {number(preview.artifacts)} artifacts"
     )
     print_facts([("benchmark", preview.benchmark_id), ("name", preview.name)])
+
+
+def _signing_key(path: Path) -> SigningKey:
+    """The private key in a file; asks for its passphrase where it needs one and somebody is there."""
+    import os
+    import sys
+
+    from tupli_mcap.signing import PassphraseNeededError, SigningKey
+
+    passphrase = os.environ.get("TUPLI_MCAP_KEY_PASSPHRASE")
+    try:
+        return SigningKey(path, passphrase)
+    except PassphraseNeededError:
+        if passphrase is not None or not sys.stdin.isatty():
+            raise
+    return SigningKey(path, typer.prompt(f"Passphrase of {path}", hide_input=True, err=True))
 
 
 def _print_written(path: Path, as_json: bool) -> None:

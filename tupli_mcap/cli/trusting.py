@@ -29,6 +29,11 @@ def _trust(
     file: Annotated[Path | None, typer.Argument(metavar="[FILE]", help="A recording.")] = None,
     show: Annotated[bool, typer.Option("--show", help="Only show what would run.")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Trust it no longer.")] = False,
+    key: Annotated[
+        str | None,
+        typer.Option("--key", metavar="KEY", help="Trust what this public key signs (a .pub file)."),
+    ] = None,
+    name: Annotated[str | None, typer.Option("--name", help="What to call the key.")] = None,
     listed: Annotated[bool, typer.Option("--list", help="Only list what is trusted.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -37,16 +42,21 @@ def _trust(
     Rebuilding it may run code that came with the file, as this user, on this machine. --show tells what,
     without running it: a pickle is followed instruction by instruction. It cannot tell that code is harmless.
     Reading the episodes of a file needs no trust. Only this user's processes trust it from then on; one
-    changed byte of the environment ends that.
+    changed byte of the environment ends that. --key trusts every environment that somebody signs, see
+    bundle --sign.
     """
     from tupli_mcap.recording.carried import carried_code, set_trust
 
-    if sum((show, remove, listed)) > 1:
-        raise typer.BadParameter("--show, --remove and --list exclude each other")
-    if listed != (file is None):
-        raise typer.BadParameter("--list takes no FILE" if listed else "expected a FILE, or --list")
+    if sum((show, remove, listed, key is not None)) > 1:
+        raise typer.BadParameter("--show, --remove, --list and --key exclude each other")
+    if (listed or key is not None) != (file is None):
+        raise typer.BadParameter(
+            "expected a FILE, --list or --key" if file is None else "--list and --key take no FILE"
+        )
+    if name is not None and key is None:
+        raise typer.BadParameter("--name goes with --key")
     if file is None:
-        _list(as_json=as_json)
+        _list(as_json=as_json) if key is None else _trust_key(key, name, as_json=as_json)
         return
     code = carried_code(file) if show else set_trust(file, trusted=not remove)
     if as_json:
@@ -55,33 +65,64 @@ def _trust(
         print_facts(_facts_of_code(code))
 
 
+def _trust_key(text: str, name: str | None, *, as_json: bool) -> None:
+    from tupli_mcap import trust
+    from tupli_mcap.signing import find_key, fingerprint
+
+    key = find_key(text)
+    trust.trust_key(key.public_key, name or key.name)
+    if as_json:
+        print_json({"fingerprint": fingerprint(key.public_key), "name": name or key.name})
+    else:
+        print(f"what {fingerprint(key.public_key)} {name or key.name} signs is trusted")
+
+
 def _untrust(
     what: Annotated[
-        str, typer.Argument(metavar="FILE|DIGEST", help="A recording, or a digest (8 digits may do).")
-    ],
+        str | None,
+        typer.Argument(metavar="[FILE|DIGEST]", help="A recording, or a digest (8 digits may do)."),
+    ] = None,
+    key: Annotated[
+        str | None, typer.Option("--key", metavar="KEY", help="A key: its name, fingerprint or .pub file.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Trust an environment no longer.
+    """Trust an environment or a key no longer.
 
-    FILE takes the environment in a recording, DIGEST one that `trust --list` shows.
+    FILE takes the environment in a recording, DIGEST one that `trust --list` shows. Without a key, all that
+    only it has signed is not trusted either.
     """
+    from tupli_mcap import trust
     from tupli_mcap.recording.carried import untrust
+    from tupli_mcap.signing import find_key, fingerprint
 
-    digest, was_trusted = untrust(what)
-    if as_json:
-        print_json({"digest": digest, "was_trusted": was_trusted})
+    if (what is None) == (key is None):
+        raise typer.BadParameter("expected either a FILE or DIGEST, or --key")
+    if key is not None:
+        found = find_key(key)
+        label, shown = "fingerprint", fingerprint(found.public_key)
+        was_trusted = trust.untrust_key(found.public_key)
     else:
-        print(f"{digest} {'is trusted no longer' if was_trusted else 'was not trusted'}")
+        label = "digest"
+        shown, was_trusted = untrust(what or "")
+    if as_json:
+        print_json({label: shown, "was_trusted": was_trusted})
+    else:
+        print(f"{shown} {'is trusted no longer' if was_trusted else 'was not trusted'}")
 
 
 def _list(*, as_json: bool) -> None:
     from tupli_mcap import trust
+    from tupli_mcap.signing import fingerprint
 
     digests = trust.trusted_digests()
+    keys = [{"fingerprint": fingerprint(key.public_key), "name": key.name} for key in trust.trusted_keys()]
     if as_json:
-        print_json({"config_dir": str(trust.config_dir()), "digests": digests})
-    else:
-        print("\n".join(digests) or "nothing is trusted")
+        print_json({"config_dir": str(trust.config_dir()), "digests": digests, "keys": keys})
+        return
+    lines = [f"environment  {digest}" for digest in digests]
+    lines += [f"key          {key['fingerprint']} {key['name']}" for key in keys]
+    print("\n".join(lines) or "nothing is trusted")
 
 
 def _json_of(code: CarriedCode) -> dict[str, Any]:
@@ -110,8 +151,21 @@ def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
         ("made with", ", ".join(f"{name} {version}" for name, version in code.versions.items())),
         ("digest", code.digest),
         *([("foreign", "; ".join(code.foreign))] if code.foreign and code.kind == "spec" else []),
-        ("trusted", "yes" if code.trusted else "no" if code.needs_trust else "not needed"),
+        *(
+            [("signed by", f"{code.signed_by}{f' ({code.signer})' if code.signer else ''}")]
+            if code.signed_by
+            else []
+        ),
+        ("trusted", _trusted(code)),
     ]
+
+
+def _trusted(code: CarriedCode) -> str:
+    if not code.needs_trust:
+        return "not needed"
+    if code.trusted and code.signer:
+        return f"yes, as long as the key of {code.signer} is"
+    return "yes" if code.trusted else "no"
 
 
 def _registered(name: str, here: str | None) -> str:

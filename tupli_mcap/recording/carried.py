@@ -14,6 +14,7 @@ from tupli_mcap import trust
 from tupli_mcap.environment import PickleScan, reasons_for_distrust, scan_pickle
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.signed import claimed_signer
 
 __all__ = ["CarriedCode", "EntryPoint", "carried_code", "set_trust", "untrust"]
 
@@ -35,7 +36,10 @@ class CarriedCode(NamedTuple):
     kind: "spec" (its JSON text is `spec`, the code it names `entry_points`) or "pickle" (of `size` bytes, what
         loading it would do is `scan`).
     foreign: what would run that this machine does not know; empty if it needs no trust.
-    needs_trust: whether it is built only where somebody trusts it. trusted: whether this user trusts the digest.
+    needs_trust: whether it is built only where somebody trusts it. trusted: whether this user trusts the digest,
+        or the key that signed it.
+    signed_by: the fingerprint of the key that the file says has signed it; None if it is not signed.
+    signer: what this user calls that key, if it is trusted here and has signed this very environment.
     """
 
     name: str
@@ -50,6 +54,8 @@ class CarriedCode(NamedTuple):
     foreign: list[str]
     needs_trust: bool
     trusted: bool
+    signed_by: str | None
+    signer: str | None
 
 
 def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
@@ -60,7 +66,10 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
         FormatError: it is damaged.
     """
     with Recording(path) as recording:
-        record = recording.benchmark.record
+        benchmark = recording.benchmark
+        signed_by = claimed_signer(recording)
+    record = benchmark.record
+    voucher = benchmark.voucher if signed_by is not None else None
     spec: dict[str, Any] | None = None if record.spec is None else dict(record.spec)
     foreign = reasons_for_distrust(record)
     return CarriedCode(
@@ -75,7 +84,9 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
         digest=record.digest,
         foreign=foreign,
         needs_trust=bool(foreign),
-        trusted=trust.is_trusted(record.digest),
+        trusted=trust.is_trusted(record.digest) or voucher is not None,
+        signed_by=signed_by,
+        signer=None if voucher is None else voucher.name or "no name",
     )
 
 
@@ -102,7 +113,7 @@ def set_trust(path: str | os.PathLike[str], *, trusted: bool) -> CarriedCode:
         trust.trust(code.digest)
     else:
         trust.untrust(code.digest)
-    return code._replace(trusted=trusted)
+    return code._replace(trusted=trusted or code.signer is not None)
 
 
 def untrust(what: str) -> tuple[str, bool]:

@@ -12,6 +12,7 @@ from tupli_mcap.recording.chunks import IN_MEMORY
 from tupli_mcap.recording.events import END_NAMES
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.signed import claimed_signer
 
 __all__ = ["ChannelFacts", "RecordingDescription", "Spread", "describe", "describe_space", "state_of"]
 
@@ -44,6 +45,7 @@ class RecordingDescription:
         an episode.
     compression: bytes of messages for one byte of chunks in the file; None without a chunk.
     ends: episodes by how they ended. environment: the name its benchmark says, None if it carries none.
+    signed_by: the fingerprint of the key that its signature names, unchecked; None if it is not signed.
     """
 
     name: str
@@ -56,6 +58,7 @@ class RecordingDescription:
     end_ns: int
     benchmark_id: str
     environment: str | None
+    signed_by: str | None
     num_envs: int
     episodes: int
     steps: int
@@ -92,6 +95,7 @@ def describe(recording: Recording) -> RecordingDescription:
         end_ns=int(rows["end_time"].max()) if len(rows) else 0,
         benchmark_id=recording.benchmark_id,
         environment=recording.benchmark.record.name if carried else None,
+        signed_by=claimed_signer(recording),
         num_envs=recording.num_envs,
         episodes=len(rows),
         steps=recording.num_steps,

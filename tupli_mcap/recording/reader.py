@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from mcap.records import Channel
 
-from tupli_mcap.environment import EnvironmentRecord, build
+from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
@@ -23,8 +23,10 @@ from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.infos import InfoDecoder
+from tupli_mcap.recording.signed import SIGNATURE_NAME, voucher
 from tupli_mcap.recording.source import open_source
 from tupli_mcap.recording.summary import read_attachment
+from tupli_mcap.trust import TrustedKey, is_trusted
 
 __all__ = ["AttachmentInfo", "RecordedBenchmark", "Recording"]
 
@@ -41,18 +43,29 @@ class AttachmentInfo(NamedTuple):
 
 
 class RecordedBenchmark(NamedTuple):
-    """The environment a recording was made with, as data."""
+    """The environment a recording was made with, as data. signature: the attachment of a signed recording."""
 
     id: str
     record: EnvironmentRecord
+    signature: bytes | None = None
 
     def make_env(self, *, trust: bool = False) -> gym.Env[Any, Any]:
         """Rebuilds the environment.
 
         Raises:
-            UntrustedError: code from the file would run, and nobody here has trusted it.
+            UntrustedError: code from the file would run, and neither is it trusted here, nor the key that signed it.
         """
-        return build(self.record, trust=trust)
+        return build(self.record, trust=trust or (self.needs_trust and self.voucher is not None))
+
+    @property
+    def needs_trust(self) -> bool:
+        """Whether rebuilding it runs code that this user has not trusted."""
+        return bool(reasons_for_distrust(self.record)) and not is_trusted(self.record.digest)
+
+    @property
+    def voucher(self) -> TrustedKey | None:
+        """The key, among those this user trusts, that signed the environment; None if none did."""
+        return None if self.signature is None else voucher(self.signature, self.record.digest, self.id)
 
 
 class Recording:
@@ -206,7 +219,8 @@ class Recording:
             pickle = self.read_attachment("env.cloudpickle")
         where = f"{self.name}: benchmark.json"
         record = EnvironmentRecord.from_json(self.read_attachment("benchmark.json"), pickle, where=where)
-        return RecordedBenchmark(self.benchmark_id, record)
+        signature = self.read_attachment(SIGNATURE_NAME) if SIGNATURE_NAME in self.attachments else None
+        return RecordedBenchmark(self.benchmark_id, record, signature)
 
     # ---- episodes
 

@@ -22,6 +22,7 @@ from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow,
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.rows import even_rows
+from tupli_mcap.recording.signed import SIGNATURE_NAME, stays_signed
 
 __all__ = ["rewrite_recording"]
 
@@ -43,6 +44,8 @@ def rewrite_recording(
         episodes: numbers of the episodes to keep (all by default).
         attachments: name -> (media type, bytes), added to the source's or replacing them.
         benchmark_id: replaces the source's.
+
+    A signature stays if nothing it covers is changed, and is left out otherwise.
 
     Raises:
         RecordingError: the target cannot be written.
@@ -94,6 +97,9 @@ class _Rewriter:
         container.add_metadata(RECORDING_METADATA, metadata)
         now = time.time_ns()
         kept = {name: info for name, info in source.attachments.items() if name not in attachments}
+        same = numbers is None and benchmark_id in (None, source.benchmark_id)
+        if not (same and stays_signed(source.attachments, attachments)):
+            kept.pop(SIGNATURE_NAME, None)
         for name, info in kept.items():
             container.add_attachment(name, info.media_type, source.read_attachment(name), now)
         for name, (media_type, data) in attachments.items():

@@ -8,7 +8,7 @@ import warnings
 from pathlib import Path
 
 from tupli_mcap.environment import EnvironmentRecord
-from tupli_mcap.errors import FormatError, RecordingError, TupliError
+from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError, TupliError
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
@@ -17,6 +17,7 @@ from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.repair_gather import may_be_recording
+from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.summary import has_summary
 from tupli_mcap.recording.tail import read_tail
@@ -150,10 +151,22 @@ def _carried(recording: Recording, findings: Findings) -> None:
                     findings.error("attachment", f"the artifact {name!r:.90} has the SHA-256 {found}")
             elif name == "benchmark.json":
                 _benchmark(recording, findings)
+            elif name == SIGNATURE_NAME:
+                _signature(recording, findings)
         except TupliError as err:
             findings.error("benchmark", str(err).removeprefix(f"{recording.name}: "))
     if "env.cloudpickle" in recording.attachments and "benchmark.json" not in recording.attachments:
         findings.error("benchmark", "it carries a pickled environment without 'benchmark.json'")
+
+
+def _signature(recording: Recording, findings: Findings) -> None:
+    try:
+        verify_signature(recording)
+    except MissingExtraError as err:
+        findings.note("signature", "it is signed, which was not checked", str(err))
+    except SignatureError as err:
+        advice = "ask its signer for another copy, or bundle it anew without the signature"
+        findings.error("signature", str(err).removeprefix(f"{recording.name}").lstrip(":, "), advice=advice)
 
 
 def _benchmark(recording: Recording, findings: Findings) -> None:

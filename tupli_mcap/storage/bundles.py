@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import shutil
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,8 +13,9 @@ from pydantic import ValidationError
 
 from tupli_mcap import trust as _trust
 from tupli_mcap.environment import EnvironmentRecord, sha256
-from tupli_mcap.errors import FormatError, NotFoundError, StepError, StorageError
+from tupli_mcap.errors import FormatError, NotFoundError, SignatureError, StepError, StorageError
 from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
+from tupli_mcap.recording.signature import SIGNATURE_NAME, Signature, sign_recording, verify_signature
 from tupli_mcap.schema import (
     ArtifactMetadata,
     BaseFilter,
@@ -42,9 +44,10 @@ from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.storage.tuples import anew
 
 if TYPE_CHECKING:
+    from tupli_mcap.signing import SigningKey
     from tupli_mcap.storage.files import FileStorage
 
-__all__ = ["ImportPreview", "export", "from_recording", "preview", "read", "write"]
+__all__ = ["ImportPreview", "checked_signature", "export", "from_recording", "preview", "read", "write"]
 
 Attachments = dict[str, tuple[str, bytes]]
 
@@ -60,8 +63,16 @@ class ImportPreview(NamedTuple):
     new_artifacts: int
 
 
-def write(storage: FileStorage, benchmark_id: str, target: Path, filter: BaseFilter | None = None) -> Path:
+def write(
+    storage: FileStorage,
+    benchmark_id: str,
+    target: Path,
+    filter: BaseFilter | None = None,
+    sign: SigningKey | None = None,
+) -> Path:
     """Write a benchmark with its artifacts and its episodes (those a filter is true of) into a new file.
+
+    sign: the key to sign it with.
 
     Raises:
         NotFoundError: There is no such benchmark, or one of its artifacts is gone.
@@ -77,6 +88,8 @@ def write(storage: FileStorage, benchmark_id: str, target: Path, filter: BaseFil
         with os_errors("cannot write the bundle", target), fill(target) as temporary:
             temporary.unlink()
             _write_episodes(storage, benchmark_id, headers, temporary, attachments)
+            if sign is not None:
+                sign_recording(temporary, sign)
 
     anew(attempt)
     return target
@@ -103,27 +116,64 @@ def export(storage: FileStorage, target: Path, filter: BaseFilter | None = None)
     return target
 
 
-def read(storage: FileStorage, path: Path, *, trust: bool = False) -> str:
+def read(
+    storage: FileStorage,
+    path: Path,
+    *,
+    trust: bool = False,
+    require_signature: bool = False,
+    signers: Sequence[str] = (),
+) -> str:
     """Take a recording with its benchmark and artifacts into a storage; returns the benchmark's id.
 
     Nothing in the file is executed. Its environment can be rebuilt afterwards if this user made it, if it
-    needs no trust, or with `trust=True`, which signs it. Importing a file twice changes nothing.
+    needs no trust, for as long as this user trusts the key that signed it, or with `trust=True`. Importing a
+    file twice changes nothing.
+
+    require_signature: refuse it unless it is signed, by one of the `signers` if there are any (64 hex digits each),
+        else by a key that this user trusts.
 
     Raises:
+        SignatureError: A signature is required, and missing, not fitting, or of another key.
         FormatError: The file is damaged, or its contents are not what its benchmark says.
         StorageError: It carries no benchmark, or lacks an artifact.
     """
     with Recording(path) as recording:
+        signature = checked_signature(recording, require_signature, signers)
         record, header, query = incoming(recording, path)
         artifacts = _read_artifacts(storage, recording, record, path)
         for data, metadata in artifacts:
             storage.store_artifact(data, metadata)
         if trust:
             _trust.trust(record.digest)
+        elif signature is not None and signature.trusted:
+            _trust.vouch(record.digest, signature.public_key)
         with storage.import_lock:
             storage.store_benchmark(query)
             _copy(storage, recording, path, header.id)
     return header.id
+
+
+def checked_signature(recording: Recording, required: bool, signers: Sequence[str] = ()) -> Signature | None:
+    """The signature of a recording that is to be imported, checked; None if nobody asks or it has none.
+
+    Raises:
+        SignatureError: One is required, and missing, not fitting, or of another key.
+    """
+    if not required:
+        known = _trust.trusted_keys() and SIGNATURE_NAME in recording.attachments
+        try:
+            return verify_signature(recording) if known else None
+        except SignatureError as err:
+            warnings.warn(f"imported as if it were not signed: {err}", stacklevel=3)
+            return None
+    signature = verify_signature(recording)
+    if signature.public_key not in signers if signers else not signature.trusted:
+        wanted = "one of the keys given" if signers else "a key that you trust (tupli-mcap trust --key)"
+        raise SignatureError(
+            f"{recording.name}: expected a signature of {wanted}, found {signature.fingerprint}"
+        )
+    return signature
 
 
 def preview(storage: FileStorage | None, path: Path) -> ImportPreview:
@@ -146,8 +196,12 @@ def preview(storage: FileStorage | None, path: Path) -> ImportPreview:
         )
 
 
-def from_recording(path: Path, target: Path, storage: FileStorage | None = None) -> Path:
+def from_recording(
+    path: Path, target: Path, storage: FileStorage | None = None, sign: SigningKey | None = None
+) -> Path:
     """Write the episodes of one recording into a new file that carries its benchmark and all artifacts.
+
+    sign: the key to sign it with; without it, a signature stays where nothing it covers changes.
 
     storage: has what the recording lacks; None if it lacks nothing, as a bundle or a recording of a plain
     environment does.
@@ -175,7 +229,10 @@ def from_recording(path: Path, target: Path, storage: FileStorage | None = None)
         kept = [int(number) for number in recording.index["episode"] if int(number) not in deleted]
         with os_errors("cannot write the bundle", target), fill(target) as temporary:
             temporary.unlink()
-            rewrite_recording(recording, temporary, episodes=kept, attachments=attachments)
+            chosen = kept if len(kept) < len(recording) else None
+            rewrite_recording(recording, temporary, episodes=chosen, attachments=attachments)
+            if sign is not None:
+                sign_recording(temporary, sign)
     return target
 
 

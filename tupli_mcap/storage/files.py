@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 
@@ -41,6 +41,9 @@ from tupli_mcap.storage.document import declared_spaces, recording_attachments
 from tupli_mcap.storage.handmade import episode_data, episode_spaces
 from tupli_mcap.storage.recordings import RecordingFiles
 from tupli_mcap.storage.tuples import anew, with_tuples
+
+if TYPE_CHECKING:
+    from tupli_mcap.signing import SigningKey
 
 __all__ = ["FileStorage"]
 
@@ -279,18 +282,32 @@ class FileStorage(TupliStorage):
     # --- sharing ---
 
     def bundle(
-        self, benchmark_id: str, target: str | os.PathLike[str], filter: BaseFilter | None = None
+        self,
+        benchmark_id: str,
+        target: str | os.PathLike[str],
+        filter: BaseFilter | None = None,
+        *,
+        sign: SigningKey | None = None,
     ) -> Path:
         """Write one file that holds a benchmark, its artifacts and its episodes, see `bundles.write`."""
-        return bundles.write(self, benchmark_id, Path(target), filter)
+        return bundles.write(self, benchmark_id, Path(target), filter, sign)
 
     def export(self, target: str | os.PathLike[str], filter: BaseFilter | None = None) -> Path:
         """Write episodes of one benchmark, those a filter is true of, into one file; see `bundles.export`."""
         return bundles.export(self, Path(target), filter)
 
-    def import_bundle(self, path: str | os.PathLike[str], *, trust: bool = False) -> str:
+    def import_bundle(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        trust: bool = False,
+        require_signature: bool = False,
+        signers: Sequence[str] = (),
+    ) -> str:
         """Take in what `bundle` wrote, see `bundles.read`; returns the benchmark's id."""
-        return bundles.read(self, Path(path), trust=trust)
+        return bundles.read(
+            self, Path(path), trust=trust, require_signature=require_signature, signers=signers
+        )
 
     def _settings(self) -> _Settings:
         path = self.root / "storage.json"

@@ -1,0 +1,541 @@
+"""Signed bundles: whose key signed what, what a changed byte does, and what trusting a key allows."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from cryptography.hazmat.primitives import serialization as ser
+from cryptography.hazmat.primitives.asymmetric import ed25519, rsa
+from test_cli import fails, ok, run
+from test_environment import Counter
+
+from tupli_mcap import (
+    FileStorage,
+    RecordEpisodes,
+    Recording,
+    TupliEnvWrapper,
+    rewrite_recording,
+    signing,
+    trust,
+)
+from tupli_mcap.environment import capture
+from tupli_mcap.errors import (
+    FormatError,
+    MissingExtraError,
+    NotFoundError,
+    SignatureError,
+    TupliError,
+    UntrustedError,
+)
+from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.recording.signature import check_signature, sign_recording, verify_signature
+from tupli_mcap.recording.signed import SIGNATURE_NAME, Signed
+from tupli_mcap.recording.verify import verify_recording
+from tupli_mcap.schema import ArtifactMetadata
+
+
+def write_key(path: Path, *, format: str = "ssh", passphrase: str | None = None) -> signing.SigningKey:
+    """A new private key, and beside it `<name>.pub` as `ssh-keygen` writes it."""
+    key = ed25519.Ed25519PrivateKey.generate()
+    encryption: Any = ser.NoEncryption()
+    if passphrase is not None:
+        encryption = ser.BestAvailableEncryption(passphrase.encode())
+    kind = ser.PrivateFormat.OpenSSH if format == "ssh" else ser.PrivateFormat.PKCS8
+    path.write_bytes(key.private_bytes(ser.Encoding.PEM, kind, encryption))
+    line = key.public_key().public_bytes(ser.Encoding.OpenSSH, ser.PublicFormat.OpenSSH)
+    path.with_name(f"{path.name}.pub").write_bytes(line + b" " + path.stem.encode() + b"@lab\n")
+    return signing.SigningKey(path, passphrase)
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody else's machine: what `as_author` does is not signed here."""
+    monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "config"))
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def alice(tmp_path: Path) -> signing.SigningKey:
+    return write_key(tmp_path / "alice")
+
+
+@pytest.fixture
+def bundle(tmp_path: Path, alice: signing.SigningKey, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A bundle that Alice made and signed on her machine: a pickled environment, an artifact, three episodes."""
+    with monkeypatch.context() as there:
+        there.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "alices_config"))
+        storage = FileStorage(tmp_path / "alices")
+        artifact = storage.store_artifact(b"wind\n1\n", ArtifactMetadata(name="wind.csv"))
+
+        class WithArtifact(TupliEnvWrapper):
+            def _serialize(self, env: gym.Env[Any, Any]) -> tuple[gym.Env[Any, Any], list[str]]:
+                return env, [artifact.id]
+
+        env = WithArtifact(gym.wrappers.TimeLimit(Counter(2.0), 4), storage)
+        env.store("counting")
+        for seed in range(3):
+            env.reset(seed=seed)
+            while not any(env.step(0)[2:4]):
+                pass
+        env.close()
+        assert env.id is not None
+        target = storage.bundle(env.id, tmp_path / "bundle.mcap", sign=alice)
+        storage.close()
+    return target
+
+
+def verified(path: Path) -> Any:
+    with Recording(path) as recording:
+        return verify_signature(recording)
+
+
+# --- keys ---
+
+
+@pytest.mark.parametrize("format", ["ssh", "pem"])
+@pytest.mark.parametrize("passphrase", [None, "correct horse"])
+def test_private_keys_of_both_formats(tmp_path: Path, format: str, passphrase: str | None) -> None:
+    key = write_key(tmp_path / "bob", format=format, passphrase=passphrase)
+    public = signing.read_public_key((tmp_path / "bob.pub").read_text())
+    assert public == (key.public_key, "bob@lab")
+    assert signing.is_signed(key.public_key, key.sign(b"text"), b"text")
+    assert not signing.is_signed(key.public_key, key.sign(b"text"), b"texts")
+    assert not signing.is_signed(key.public_key, b"short", b"text")
+    assert repr(key) == f"<SigningKey {signing.fingerprint(key.public_key)}>"
+    if passphrase is not None:
+        with pytest.raises(signing.PassphraseNeededError, match="encrypted, and needs a passphrase"):
+            signing.SigningKey(tmp_path / "bob")
+        with pytest.raises(signing.PassphraseNeededError, match="the passphrase does not open this key"):
+            signing.SigningKey(tmp_path / "bob", "wrong")
+    else:
+        assert signing.SigningKey(tmp_path / "bob", "superfluous").public_key == key.public_key
+
+
+@pytest.mark.skipif(shutil.which("ssh-keygen") is None, reason="needs ssh-keygen")
+def test_keys_and_fingerprints_are_those_of_ssh_keygen(tmp_path: Path) -> None:
+    subprocess.run(
+        ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "carol", "-f", str(tmp_path / "id")], check=True
+    )
+    shown = subprocess.run(
+        ["ssh-keygen", "-lf", str(tmp_path / "id.pub")], check=True, capture_output=True, text=True
+    ).stdout
+    key = signing.SigningKey(tmp_path / "id")
+    assert signing.fingerprint(key.public_key) == shown.split()[1]
+    assert signing.find_key(str(tmp_path / "id.pub")) == (key.public_key, "carol")
+
+
+def test_other_keys_are_refused(tmp_path: Path, alice: signing.SigningKey) -> None:
+    other = rsa.generate_private_key(65537, 2048)
+    (tmp_path / "rsa").write_bytes(
+        other.private_bytes(ser.Encoding.PEM, ser.PrivateFormat.PKCS8, ser.NoEncryption())
+    )
+    with pytest.raises(SignatureError, match="expected an Ed25519 key, found RSAPrivateKey"):
+        signing.SigningKey(tmp_path / "rsa")
+    with pytest.raises(SignatureError, match=r"alice\.pub: expected a private Ed25519 key"):
+        signing.SigningKey(tmp_path / "alice.pub")
+    with pytest.raises(SignatureError, match="'none' cannot be read: No such file"):
+        signing.SigningKey("none")
+    with pytest.raises(SignatureError, match="found a private one; give its .pub file"):
+        signing.find_key(str(tmp_path / "alice"))
+    for text in ("ssh-rsa AAAA", "ssh-ed25519 AAAA", "ssh-ed25519 !", "ssh-ed25519 " + "A" * 70):
+        with pytest.raises(SignatureError, match="expected a public Ed25519 key"):
+            signing.find_key(text)
+    with pytest.raises(NotFoundError, match="no trusted key 'bob' and no file of that name"):
+        signing.find_key("bob")
+    pem = ed25519.Ed25519PrivateKey.generate().public_key()
+    text = pem.public_bytes(ser.Encoding.PEM, ser.PublicFormat.SubjectPublicKeyInfo).decode()
+    assert signing.read_public_key(text).public_key == pem.public_bytes_raw().hex()
+
+
+def test_keys_are_found_by_name_and_fingerprint(tmp_path: Path, alice: signing.SigningKey) -> None:
+    key = signing.find_key("alice.pub")
+    trust.trust_key(key.public_key, "alice")
+    for text in ("alice", signing.fingerprint(key.public_key), key.public_key):
+        assert signing.find_key(text) == (key.public_key, "alice")
+    trust.trust_key("00" * 32, "alice")
+    with pytest.raises(NotFoundError, match="2 trusted keys are named 'alice'"):
+        signing.find_key("alice")
+
+
+# --- signatures ---
+
+
+def test_a_signed_bundle(bundle: Path, alice: signing.SigningKey) -> None:
+    signature = verified(bundle)
+    assert signature.public_key == alice.public_key
+    assert (signature.name, signature.trusted, signature.not_covered) == (None, False, ())
+    trust.trust_key(alice.public_key, "Alice")
+    assert verified(bundle).name == "Alice"
+    with Recording(bundle) as recording:
+        assert recording.benchmark.record.digest == signature.environment
+        assert len(recording) == 3
+        assert check_signature(recording) is not None
+
+
+def test_an_unsigned_recording(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "a.mcap") as env:
+        env.reset(seed=0)
+        env.step(0)
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert check_signature(recording) is None
+        with pytest.raises(SignatureError, match=r"a\.mcap is not signed; ask for a bundle"):
+            verify_signature(recording)
+
+
+def test_compression_and_later_attachments_do_not_matter(bundle: Path, tmp_path: Path) -> None:
+    added = {"replay-certificate.json": ("application/json", b"{}")}
+    for compression in ("none", "lz4", "zstd"):
+        target = tmp_path / f"{compression}.mcap"
+        with Recording(bundle) as recording:
+            rewrite_recording(recording, target, attachments=added, compression=compression)
+        assert verified(target).not_covered == ("replay-certificate.json",)
+
+
+def test_a_certificate_is_nobody_s_secret(bundle: Path, alice: signing.SigningKey) -> None:
+    """It may be added and replaced after signing, and is not what was signed."""
+    for text in (b"{}", b'{"a": 1}'):
+        add_attachments(bundle, {"replay-certificate.json": ("application/json", text)})
+        assert verified(bundle).not_covered == ("replay-certificate.json",)
+    sign_recording(bundle, alice)
+    with Recording(bundle) as recording:
+        assert recording.read_attachment("replay-certificate.json") == b'{"a": 1}'
+    add_attachments(bundle, {"env.cloudpickle": ("application/octet-stream", b"")})
+    with pytest.raises(FormatError, match="expected a pickled environment of"):
+        verified(bundle)
+
+
+def test_verify_checks_signatures(bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert verify_recording(bundle).ok
+    report = verify_recording(tampered(bundle, tmp_path / "cut.mcap", episodes=[0]))
+    (problem,) = report.errors
+    assert problem.kind == "signature"
+    assert "was changed after signing" in problem.message
+    for name in [name for name in sys.modules if name.partition(".")[0] == "cryptography"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    report = verify_recording(bundle)
+    assert report.ok
+    assert [problem.message for problem in report.problems] == ["it is signed, which was not checked"]
+
+
+def test_signing_again_replaces_the_signature(bundle: Path, tmp_path: Path) -> None:
+    bob = write_key(tmp_path / "bob")
+    assert sign_recording(bundle, bob).public_key == bob.public_key == verified(bundle).public_key
+
+
+def test_rewriting_drops_a_signature_that_would_not_fit(bundle: Path, tmp_path: Path) -> None:
+    changes: list[dict[str, Any]] = [
+        {"episodes": [0, 2]},
+        {"benchmark_id": "0" * 64},
+        {"attachments": {"benchmark.json": ("application/json", b"{}")}},
+        {"attachments": {"artifacts/" + "0" * 64: ("application/octet-stream", b"")}},
+    ]
+    for change in changes:
+        with Recording(bundle) as recording:
+            rewrite_recording(recording, tmp_path / "other.mcap", **change)
+        with pytest.raises(SignatureError, match="is not signed"):
+            verified(tmp_path / "other.mcap")
+
+
+def tampered(bundle: Path, target: Path, **changes: Any) -> Path:
+    """A rewritten bundle with the signature of the original, all CRCs right."""
+    with Recording(bundle) as recording:
+        signature = recording.read_attachment(SIGNATURE_NAME)
+        attachments = {**changes.pop("attachments", {}), SIGNATURE_NAME: ("application/json", signature)}
+        rewrite_recording(recording, target, attachments=attachments, **changes)
+    return target
+
+
+def _other_document(bundle: Path) -> bytes:
+    with Recording(bundle) as recording:
+        return recording.read_attachment("benchmark.json").replace(b'"counting"', b'"Counting"')
+
+
+def _other_environment(bundle: Path) -> dict[str, tuple[str, bytes]]:
+    record = capture(Counter(666.0))
+    return {
+        "benchmark.json": ("application/json", record.to_json()),
+        "env.cloudpickle": ("application/octet-stream", record.pickle or b""),
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda b: {"episodes": [0, 2]}, "was changed after signing"),
+        (lambda b: {"episodes": []}, "was changed after signing"),
+        (lambda b: {"benchmark_id": "0" * 64}, "its recording was changed: expected .* found"),
+        (lambda b: {"attachments": _other_environment(b)}, "its environment was changed"),
+        (
+            lambda b: {"attachments": {"benchmark.json": ("application/json", _other_document(b))}},
+            "the attachment 'benchmark.json' was changed after signing",
+        ),
+        (
+            lambda b: {"attachments": {"artifacts/" + "0" * 64: ("application/octet-stream", b"")}},
+            "the attachment 'artifacts/0000.*' was added after signing",
+        ),
+    ],
+)
+def test_a_change_is_found_and_named(
+    bundle: Path, tmp_path: Path, change: Callable[[Path], dict[str, Any]], message: str
+) -> None:
+    with pytest.raises(SignatureError, match=message):
+        verified(tampered(bundle, tmp_path / "other.mcap", **change(bundle)))
+
+
+def test_a_changed_step_is_found(bundle: Path, tmp_path: Path) -> None:
+    with Recording(bundle) as recording:
+        signature = recording.read_attachment(SIGNATURE_NAME)
+        store = recording._store
+        (chunk,) = store.chunks(recording._step_channels[0])
+        body = bytearray(store.load(chunk))
+        body[60] ^= 1
+        store._cache[chunk] = bytes(body)  # what a forger would write, with all CRCs and indexes right
+        forged = {SIGNATURE_NAME: ("application/json", signature)}
+        rewrite_recording(recording, tmp_path / "forged.mcap", attachments=forged)
+    with pytest.raises(SignatureError, match="the channel '/step' was changed after signing"):
+        verified(tmp_path / "forged.mcap")
+
+
+def test_appending_to_a_signed_recording_is_found(bundle: Path) -> None:
+    with RecordEpisodes(gym.wrappers.TimeLimit(Counter(2.0), 4), bundle, mode="a") as env:
+        env.reset(seed=9)
+        env.step(1)
+    with pytest.raises(SignatureError, match="was changed after signing"):
+        verified(bundle)
+
+
+@pytest.mark.filterwarnings("ignore:.*was not finished and has no journal")
+def test_every_flipped_byte_is_found_or_changes_nothing(bundle: Path) -> None:
+    """What still verifies gives the same episodes, the same environment, the same artifacts."""
+    data = bundle.read_bytes()
+    with Recording(bundle) as recording:
+        expected = _all_of(recording)
+    found = 0
+    for position in range(3, len(data), 37):
+        changed = bytearray(data)
+        changed[position] ^= 0x20
+        bundle.write_bytes(changed)
+        try:
+            with Recording(bundle) as recording:
+                signature = verify_signature(recording)
+                assert _all_of(recording) == expected, position
+                assert signature.not_covered == ()
+        except (SignatureError, FormatError):
+            found += 1
+    assert found > 0.8 * len(data) / 37
+
+
+def _all_of(recording: Recording) -> Any:
+    attachments = {name: recording.read_attachment(name) for name in recording.attachments}
+    columns = recording.read()
+    facts = [recording.episode_metadata(i) for i in range(len(recording))]
+    return attachments, str(columns.states), str(columns.rewards), facts, dict(recording.metadata)
+
+
+def test_a_signature_of_another_key_or_text_does_not_fit(bundle: Path, tmp_path: Path) -> None:
+    with Recording(bundle) as recording:
+        good = Signed.decode(recording.read_attachment(SIGNATURE_NAME), "x")
+        bob = write_key(tmp_path / "bob")
+        forged = [
+            good._replace(public_key=bob.public_key),
+            good._replace(signature=bob.sign(b"something")),
+            good._replace(manifest={**good.manifest, "environment": "0" * 64}),
+        ]
+        for signed in forged:
+            attachment = {SIGNATURE_NAME: ("application/json", signed.encode())}
+            rewrite_recording(recording, tmp_path / "forged.mcap", attachments=attachment)
+            with pytest.raises(SignatureError, match="its signature was not made by the key SHA256:"):
+                verified(tmp_path / "forged.mcap")
+
+
+def test_a_signature_that_is_none_is_a_format_error(bundle: Path, tmp_path: Path) -> None:
+    with Recording(bundle) as recording:
+        good = json.loads(recording.read_attachment(SIGNATURE_NAME))
+        for bad in (b"", b"[", b"{}", b"[" * 100_000, *(json.dumps({**good, k: 3}).encode() for k in good)):
+            attachment = {SIGNATURE_NAME: ("application/json", bad)}
+            rewrite_recording(recording, tmp_path / "bad.mcap", attachments=attachment)
+            with pytest.raises(FormatError, match=r"bad\.mcap: signature\.ed25519 is no signature"):
+                verified(tmp_path / "bad.mcap")
+            with Recording(tmp_path / "bad.mcap") as damaged, pytest.raises(UntrustedError):
+                damaged.benchmark.make_env()
+
+
+def test_an_unfinished_recording_is_not_signed(tmp_path: Path, alice: signing.SigningKey) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "a.mcap") as env:
+        env.reset(seed=0)
+        env.step(0)
+        shutil.copy(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    with (
+        pytest.warns(UserWarning, match="journal"),
+        pytest.raises(SignatureError, match="only a finished recording can be signed"),
+    ):
+        sign_recording(tmp_path / "b.mcap", alice)
+
+
+def test_the_manifest_is_as_specified(bundle: Path) -> None:
+    import jsonschema
+
+    schema = json.loads((Path(__file__).parents[1] / "schemas/signature.schema.json").read_text())
+    with Recording(bundle) as recording:
+        document = json.loads(recording.read_attachment(SIGNATURE_NAME))
+    jsonschema.validate(document, schema)
+    document["manifest"]["channels"]["1"].pop("sha256")
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(document, schema)
+
+
+# --- trusting keys ---
+
+
+def test_on_the_command_line(
+    bundle: Path, tmp_path: Path, alice: signing.SigningKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark = signing.fingerprint(alice.public_key)
+    line = fails("import", bundle, "--storage", "lab", "--require-signature")
+    assert line.endswith(
+        f"expected a signature of a key that you trust (tupli-mcap trust --key), found {mark}"
+    )
+    assert not Path("lab").exists()
+    assert f"\nsigned by    {mark} (not checked)\n" in ok("info", bundle)
+    assert re.search(rf"signed by +{re.escape(mark)}\ntrusted +no\n$", ok("trust", bundle, "--show"))
+    assert ok("import", bundle, "--storage", "other", "--from", "alice.pub").startswith(
+        "imported 3 of 3 episodes"
+    )
+    assert run("trust", "--key", "alice.pub", "--name", "Alice", "--json").json == {
+        "fingerprint": mark,
+        "name": "Alice",
+    }
+    assert ok("trust", "--list") == f"key          {mark} Alice\n"
+    assert re.search(
+        rf"signed by +{re.escape(mark)} \(Alice\)\ntrusted +yes, as long as the key of Alice is\n$",
+        ok("trust", bundle, "--show"),
+    )
+    told = run("trust", bundle, "--show", "--json").json
+    assert (told["trusted"], told["signed_by"], told["signer"]) == (True, mark, "Alice")
+    ok("import", bundle, "--storage", "lab", "--require-signature")
+    digest = told["digest"]
+    assert ok("trust", "--list") == f"environment  {digest}\nkey          {mark} Alice\n"
+    assert ok("untrust", "--key", "Alice") == f"{mark} is trusted no longer\n"
+    assert ok("trust", "--list") == "nothing is trusted\n"
+    assert fails("untrust", "--key", "Alice").startswith("there is no trusted key 'Alice'")
+    assert fails("untrust", code=2).startswith("Invalid value: expected either a FILE or DIGEST, or --key")
+    assert fails("trust", bundle, "--name", "x", code=2).startswith("Invalid value: --name goes with --key")
+
+    locked = write_key(tmp_path / "bob", passphrase="secret")
+    assert fails("bundle", bundle, "-o", "b.mcap", "--sign", "bob").endswith(
+        "encrypted, and needs a passphrase"
+    )
+    assert not Path("b.mcap").exists()
+    monkeypatch.setenv("TUPLI_MCAP_KEY_PASSPHRASE", "secret")
+    ok("bundle", bundle, "-o", "b.mcap", "--sign", "bob")
+    assert verified(Path("b.mcap")).public_key == locked.public_key
+    benchmark = run("info", bundle, "--json").json["benchmark_id"]
+    ok("bundle", benchmark, "-o", "c.mcap", "--sign", "bob", "--storage", "lab")
+    assert verified(Path("c.mcap")).public_key == locked.public_key
+
+
+def test_what_a_trusted_key_signed_may_be_built(bundle: Path, alice: signing.SigningKey) -> None:
+    with Recording(bundle) as recording:
+        with pytest.raises(UntrustedError, match="pickled Python code"):
+            recording.benchmark.make_env()
+        trust.trust_key(alice.public_key, "alice")
+        assert recording.benchmark.make_env().unwrapped.start == 2.0  # type: ignore[attr-defined]
+        assert trust.trusted_digests() == []  # bound to the key, nothing else
+        trust.untrust_key(alice.public_key)
+        with pytest.raises(UntrustedError, match="pickled Python code"):
+            recording.benchmark.make_env()
+
+
+def test_a_signature_vouches_for_no_other_environment(
+    bundle: Path, tmp_path: Path, alice: signing.SigningKey
+) -> None:
+    trust.trust_key(alice.public_key, "alice")
+    other = tampered(bundle, tmp_path / "other.mcap", attachments=_other_environment(bundle))
+    with Recording(other) as recording, pytest.raises(UntrustedError):
+        recording.benchmark.make_env()
+
+
+def test_importing_takes_the_key_s_word(bundle: Path, tmp_path: Path, alice: signing.SigningKey) -> None:
+    trust.trust_key(alice.public_key, "alice")
+    with FileStorage(tmp_path / "lab") as storage:
+        benchmark = storage.import_bundle(bundle, require_signature=True)
+        TupliEnvWrapper.load(storage, benchmark).close()
+        trust.untrust_key(alice.public_key)
+        with pytest.raises(UntrustedError):
+            TupliEnvWrapper.load(storage, benchmark)
+        trust.trust_key(alice.public_key, "alice")  # what was vouched for before is forgotten
+        with pytest.raises(UntrustedError):
+            TupliEnvWrapper.load(storage, benchmark)
+
+
+def test_importing_without_asking_works_as_before(
+    bundle: Path, tmp_path: Path, alice: signing.SigningKey
+) -> None:
+    with FileStorage(tmp_path / "lab") as storage:
+        benchmark = storage.import_bundle(bundle)
+        with pytest.raises(UntrustedError):
+            TupliEnvWrapper.load(storage, benchmark)
+        trust.trust_key(alice.public_key, "alice")
+        cut = tampered(bundle, tmp_path / "cut.mcap", episodes=[0])
+        with pytest.warns(
+            UserWarning, match="imported as if it were not signed: .* was changed after signing"
+        ):
+            storage.import_bundle(cut)
+        with pytest.raises(UntrustedError):
+            TupliEnvWrapper.load(storage, benchmark)
+
+
+def test_a_required_signature(bundle: Path, tmp_path: Path, alice: signing.SigningKey) -> None:
+    bob = write_key(tmp_path / "bob")
+    with FileStorage(tmp_path / "lab") as storage:
+
+        def refused(path: Path, message: str, *signers: str) -> None:
+            with pytest.raises(SignatureError, match=message):
+                storage.import_bundle(path, require_signature=True, signers=signers)
+            assert storage.list_benchmarks() == [] == storage.list_artifacts()
+
+        refused(bundle, "expected a signature of a key that you trust")
+        trust.trust_key(bob.public_key, "bob")
+        refused(bundle, "expected a signature of a key that you trust")
+        refused(bundle, "expected a signature of one of the keys given", bob.public_key)
+        trust.trust_key(alice.public_key, "alice")
+        refused(tampered(bundle, tmp_path / "cut.mcap", episodes=[0]), "was changed after signing")
+        with Recording(bundle) as recording:
+            rewrite_recording(recording, tmp_path / "unsigned.mcap", episodes=[0])
+        refused(tmp_path / "unsigned.mcap", "is not signed")
+        trust.untrust_key(alice.public_key)
+        storage.import_bundle(bundle, require_signature=True, signers=[alice.public_key])
+        assert storage.count_episodes() == 3
+        assert trust.trusted_digests() == []  # a key that is only named for this import
+
+
+def test_without_the_extra(
+    bundle: Path, tmp_path: Path, alice: signing.SigningKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "cryptography"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'tupli-mcap\[sign\]'"):
+        signing.SigningKey(tmp_path / "alice")
+    with Recording(bundle) as recording:
+        assert len(recording.read().rewards) == 12
+        with pytest.raises(UntrustedError):
+            recording.benchmark.make_env()
+        with pytest.raises(MissingExtraError, match=r"tupli-mcap\[sign\]"):
+            verify_signature(recording)
+    with FileStorage(tmp_path / "lab") as storage:
+        storage.import_bundle(bundle)
+        with pytest.raises(MissingExtraError):
+            storage.import_bundle(bundle, require_signature=True)
+
+
+def test_every_refusal_is_a_tupli_error() -> None:
+    assert issubclass(SignatureError, TupliError)

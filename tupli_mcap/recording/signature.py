@@ -1,0 +1,202 @@
+"""Signing a recording and checking a signature against all that it covers.
+
+The manifest covers what is read from a file, not its bytes: chunks may be compressed anew, and attachments that were
+added since (a replay certificate, a quality card) are named as not covered.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from mcap.opcode import Opcode
+
+from tupli_mcap import signing, trust
+from tupli_mcap.environment import canonical_json, sha256
+from tupli_mcap.errors import FormatError, SignatureError
+from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.recording.container import MAGIC
+from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.signed import (
+    SIGNATURE_MEDIA_TYPE,
+    SIGNATURE_NAME,
+    STATEMENTS,
+    Signed,
+    is_covered_kind,
+)
+
+__all__ = ["SIGNATURE_NAME", "Signature", "check_signature", "sign_recording", "verify_signature"]
+
+_RECORD_HEAD = 9
+# Of the metadata; the other keys are about the file as it happened to be written.
+_IDENTITY = ("uuid", "format_version", "library", "created_ns", "benchmark_id")
+
+
+class Signature(NamedTuple):
+    """A signature that fits its recording.
+
+    public_key: of the signer, 64 hex digits. fingerprint: the same as `ssh-keygen -l` shows it.
+    name: what this user calls the key; None where the key is not trusted here.
+    environment: the digest of the environment that was signed; None if the recording carries none.
+    not_covered: attachments that were added after signing, or that others may replace (a replay certificate).
+    """
+
+    public_key: str
+    fingerprint: str
+    name: str | None
+    environment: str | None
+    not_covered: tuple[str, ...]
+
+    @property
+    def trusted(self) -> bool:
+        """Whether this user trusts the key."""
+        return self.name is not None
+
+
+def sign_recording(path: str | os.PathLike[str], key: signing.SigningKey) -> Signature:
+    """Adds the signature of a key to a finished recording, instead of one that is there; it is replaced in one rename.
+
+    Raises:
+        SignatureError: the recording is not finished.
+        RecordingError, FormatError: it cannot be read or written.
+    """
+    with Recording(path) as recording:
+        if not recording.complete:
+            raise SignatureError(
+                f"{recording.name}: only a finished recording can be signed; recover it first"
+            )
+        signed = Signed.make(_manifest(recording), key)
+    add_attachments(path, {SIGNATURE_NAME: (SIGNATURE_MEDIA_TYPE, signed.encode())})
+    with Recording(path) as written:  # a signature that does not fit is worse than none
+        return verify_signature(written)
+
+
+def check_signature(recording: Recording) -> Signature | None:
+    """As `verify_signature`; None if the recording is not signed."""
+    return verify_signature(recording) if SIGNATURE_NAME in recording.attachments else None
+
+
+def verify_signature(recording: Recording) -> Signature:
+    """Checks the signature of a recording against everything it covers; all chunks are read.
+
+    Raises:
+        SignatureError: there is none, or it does not fit: the message says what was changed.
+        FormatError: the file is damaged.
+        MissingExtraError: the extra `sign` is not installed.
+    """
+    name = recording.name
+    if SIGNATURE_NAME not in recording.attachments:
+        raise SignatureError(f"{name} is not signed; ask for a bundle made with `tupli-mcap bundle --sign`")
+    signed = Signed.decode(recording.read_attachment(SIGNATURE_NAME), name)
+    fingerprint = signing.fingerprint(signed.public_key)
+    if not signed.fits():
+        raise SignatureError(f"{name}: its signature was not made by the key {fingerprint} that it names")
+    if not recording.complete:
+        raise SignatureError(f"{name}: what was signed is finished, this recording is not")
+    _check_records(recording)
+    found = _manifest(recording)
+    _compare(signed.manifest, found, f"{name}, signed by {fingerprint}")
+    names = {key.public_key: key.name for key in trust.trusted_keys()}
+    not_covered = tuple(
+        sorted(recording.attachments.keys() - {*signed.manifest["attachments"], SIGNATURE_NAME})
+    )
+    return Signature(
+        signed.public_key, fingerprint, names.get(signed.public_key), found["environment"], not_covered
+    )
+
+
+def _manifest(recording: Recording) -> dict[str, Any]:
+    """What a signature covers, as it is in the file now."""
+    index = recording._contents.index
+    carried = "benchmark.json" in recording.attachments
+    return {
+        "format": "tupli_mcap.manifest",
+        "version": 1,
+        "recording": {key: recording.metadata[key] for key in _IDENTITY if key in recording.metadata},
+        "environment": recording.benchmark.record.digest if carried else None,
+        "attachments": {
+            name: sha256(recording.read_attachment(name))
+            for name in sorted(recording.attachments)
+            if name not in STATEMENTS
+        },
+        "channels": {
+            str(number): _channel(recording, number) for number in sorted(recording._contents.channels)
+        },
+        "episodes": {
+            "count": len(index.episodes),
+            "sha256": sha256(index.episodes.tobytes() + index.metadata),
+        },
+    }
+
+
+def _channel(recording: Recording, number: int) -> dict[str, Any]:
+    """Of a channel: its topic, and the digest of its definition and of all its message records, in order."""
+    channel = recording._contents.channels[number]
+    schema = recording._contents.schemas.get(channel.schema_id)
+    definition = {
+        "topic": channel.topic,
+        "encoding": channel.message_encoding,
+        "metadata": {key: value for key, value in channel.metadata.items() if key != "crc"},
+        "schema": None if schema is None else [schema.name, schema.encoding, sha256(schema.data)],
+    }
+    digest = hashlib.sha256(canonical_json(definition))
+    store = recording._store
+    for chunk in store.chunks(number):
+        digest.update(store.load(chunk, keep=False))
+    return {"topic": channel.topic, "messages": store.count(number), "sha256": digest.hexdigest()}
+
+
+def _check_records(recording: Recording) -> None:
+    """The chunks in the file must be those of the index, which were hashed: other tools read the file in its order."""
+    contents, source = recording._contents, recording._source
+    listed = sorted(int(offset) for offset in contents.table["offset"])
+    position, found = len(MAGIC), 0
+    for _ in range(8 * len(listed) + 4 * len(contents.channels) + len(contents.attachments) + 1000):
+        if position >= contents.data_end:
+            break
+        head = source.read(position, _RECORD_HEAD)
+        if head[0] == Opcode.CHUNK:
+            if found >= len(listed) or listed[found] != position:
+                break
+            found += 1
+        elif head[0] == Opcode.MESSAGE:
+            break
+        position += _RECORD_HEAD + int.from_bytes(head[1:], "little")
+    if position != contents.data_end or found != len(listed):
+        raise SignatureError(
+            f"{recording.name}: expected the {len(listed)} chunks that were signed and nothing else, found another "
+            f"record at offset {position}"
+        )
+
+
+def _compare(signed: Mapping[str, Any], found: Mapping[str, Any], where: str) -> None:
+    """Raises SignatureError at the first difference; new attachments that nothing is rebuilt from are none."""
+    for part in ("format", "version", "recording", "environment"):
+        if signed.get(part) != found[part]:
+            raise SignatureError(
+                f"{where}: its {part} was changed: expected {signed.get(part)!r:.100}, found {found[part]!r:.100}"
+            )
+    for part, noun in (("attachments", "attachment"), ("channels", "channel")):
+        expected = signed.get(part)
+        if not isinstance(expected, dict):
+            raise FormatError(f"{where}: the manifest lists no {part}")
+        for name, value in expected.items():
+            if name not in found[part]:
+                raise SignatureError(f"{where}: the {noun} {name!r:.100} that was signed is missing")
+            if found[part][name] != value:
+                raise SignatureError(
+                    f"{where}: the {noun} {_named(found[part][name], name)} was changed after signing"
+                )
+        for name in found[part].keys() - expected.keys():
+            if part == "channels" or is_covered_kind(name):
+                raise SignatureError(
+                    f"{where}: the {noun} {_named(found[part][name], name)} was added after signing"
+                )
+    if signed.get("episodes") != found["episodes"]:
+        raise SignatureError(f"{where}: the episode index was changed after signing")
+
+
+def _named(value: Any, name: str) -> str:
+    return repr(value["topic"] if isinstance(value, dict) else name)[:100]

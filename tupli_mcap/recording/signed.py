@@ -1,0 +1,135 @@
+"""The attachment `signature.ed25519`: its form, and what a signature in it is good for without reading a step."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from pydantic import BaseModel, Field, JsonValue, ValidationError
+
+from tupli_mcap import signing, trust
+from tupli_mcap.environment import canonical_json
+from tupli_mcap.errors import FormatError
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording.reader import Recording
+
+__all__ = [
+    "SIGNATURE_MEDIA_TYPE",
+    "SIGNATURE_NAME",
+    "STATEMENTS",
+    "Signed",
+    "claimed_signer",
+    "is_covered_kind",
+    "stays_signed",
+    "voucher",
+]
+
+SIGNATURE_NAME = "signature.ed25519"
+SIGNATURE_MEDIA_TYPE = "application/json"
+# What anybody may state about a recording at any time, so that no signature of it covers them.
+STATEMENTS = (SIGNATURE_NAME, "replay-certificate.json")
+_MAX_BYTES = 16 << 20
+# Names what is signed, so that nobody's key can be made to sign something else that looks like a manifest.
+_PURPOSE = b"tupli_mcap signature v1\0"
+_HEX_KEY = r"^[0-9a-f]{64}$"
+# What an environment is rebuilt from must be signed; other attachments may be added later.
+_COVERED_KINDS = ("benchmark.json", "env.cloudpickle", "artifacts/")
+
+
+class _Document(BaseModel):
+    format: Literal["tupli_mcap.signature"]
+    version: Literal[1]
+    algorithm: Literal["ed25519"]
+    public_key: str = Field(pattern=_HEX_KEY)
+    signature: str = Field(pattern=r"^[0-9a-f]{128}$")
+    manifest: dict[str, JsonValue]
+
+
+class Signed(NamedTuple):
+    """A manifest (JSON values, see `schemas/signature.schema.json`) and a signature of it (64 bytes)."""
+
+    public_key: str
+    signature: bytes
+    manifest: Mapping[str, Any]
+
+    @classmethod
+    def make(cls, manifest: Mapping[str, Any], key: signing.SigningKey) -> Signed:
+        """Signs a manifest."""
+        return cls(key.public_key, key.sign(_PURPOSE + canonical_json(manifest)), manifest)
+
+    def fits(self) -> bool:
+        """Whether the signature is the key's, of this manifest."""
+        return signing.is_signed(self.public_key, self.signature, _PURPOSE + canonical_json(self.manifest))
+
+    def encode(self) -> bytes:
+        """The attachment's bytes."""
+        document = {
+            "format": "tupli_mcap.signature",
+            "version": 1,
+            "algorithm": "ed25519",
+            "public_key": self.public_key,
+            "signature": self.signature.hex(),
+            "manifest": self.manifest,
+        }
+        return json.dumps(document, indent=2).encode("ascii")
+
+    @classmethod
+    def decode(cls, data: bytes, where: str) -> Signed:
+        """Raises FormatError if the bytes are no signature."""
+        if len(data) > _MAX_BYTES:
+            raise FormatError(
+                f"{where}: expected a signature of at most {_MAX_BYTES} bytes, found {len(data)}"
+            )
+        try:
+            document = _Document.model_validate_json(data)
+            canonical_json(document.manifest)
+        except ValidationError as err:
+            first = err.errors(include_url=False, include_input=False)[0]
+            place = ".".join(str(part) for part in first["loc"]) or "the document"
+            raise FormatError(f"{where}: {SIGNATURE_NAME} is no signature: {place}: {first['msg']}") from err
+        except (ValueError, RecursionError) as err:
+            raise FormatError(f"{where}: {SIGNATURE_NAME}: its manifest is no strict JSON: {err}") from err
+        return cls(document.public_key, bytes.fromhex(document.signature), document.manifest)
+
+
+def voucher(signature: bytes, digest: str, where: str) -> trust.TrustedKey | None:
+    """The trusted key that signed an environment, by the manifest alone; None if there is none.
+
+    signature: the attachment's bytes. digest: computed from the environment that is at hand.
+
+    Raises:
+        MissingExtraError: there is a trusted key to ask, and the extra `sign` is not installed.
+    """
+    try:
+        signed = Signed.decode(signature, where)
+    except FormatError:
+        return None
+    known = {key.public_key: key for key in trust.trusted_keys()}
+    if signed.public_key not in known or signed.manifest.get("environment") != digest:
+        return None
+    return known[signed.public_key] if signed.fits() else None
+
+
+def claimed_signer(recording: Recording) -> str | None:
+    """The fingerprint of the key that a recording says has signed it, unchecked; None if it is not signed.
+
+    Raises:
+        FormatError: its signature is no signature.
+    """
+    if SIGNATURE_NAME not in recording.attachments:
+        return None
+    signed = Signed.decode(recording.read_attachment(SIGNATURE_NAME), recording.name)
+    return signing.fingerprint(signed.public_key)
+
+
+def is_covered_kind(name: str) -> bool:
+    """Whether an attachment of that name must have been signed."""
+    return name.startswith(_COVERED_KINDS)
+
+
+def stays_signed(present: Iterable[str], added: Iterable[str]) -> bool:
+    """Whether a signature outlives adding attachments: they replace nothing, and nothing is rebuilt from them."""
+    before = set(present).difference(STATEMENTS)
+    return not any(name in before or is_covered_kind(name) for name in added)

@@ -1,0 +1,192 @@
+"""Ed25519 keys: those that people have for SSH, to sign bundles with and to know each other by.
+
+Public keys are 64 hex digits inside this package, and shown as `ssh-keygen -l` shows them. Reading OpenSSH's public
+keys needs nothing installed; signing and checking need the extra `sign`.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+from tupli_mcap import trust
+from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+__all__ = ["PassphraseNeededError", "SigningKey", "find_key", "fingerprint", "is_signed", "read_public_key"]
+
+_MAX_KEY_FILE = 1 << 16
+_SSH_HEAD = b"\0\0\0\x0bssh-ed25519\0\0\0\x20"  # the name of the algorithm and the length of a key
+_SSH_LINE = re.compile(r"ssh-ed25519\s+([A-Za-z0-9+/]+=*)(?:\s+(.*))?\s*\Z")
+_FINGERPRINT = re.compile(r"SHA256:[A-Za-z0-9+/]{43}\Z")
+
+
+class PassphraseNeededError(SignatureError):
+    """A private key is encrypted, and no passphrase or another one was given."""
+
+
+class SigningKey:
+    """A private Ed25519 key, of OpenSSH (`ssh-keygen -t ed25519`) or in PEM (PKCS #8).
+
+    Args:
+        path: the file.
+        passphrase: of an encrypted key.
+
+    Raises:
+        SignatureError: there is no such file, or it holds another kind of key.
+        PassphraseNeededError: the key is encrypted and the passphrase missing or wrong.
+        MissingExtraError: the extra `sign` is not installed.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], passphrase: str | None = None) -> None:
+        self._key: Ed25519PrivateKey = _load_private(Path(path), passphrase)
+        self.public_key = self._key.public_key().public_bytes_raw().hex()
+
+    def sign(self, message: bytes) -> bytes:
+        """The 64 bytes of a signature."""
+        return self._key.sign(message)
+
+    def __repr__(self) -> str:
+        return f"<SigningKey {fingerprint(self.public_key)}>"
+
+
+def is_signed(public_key: str, signature: bytes, message: bytes) -> bool:
+    """Whether a signature of a message was made with the private half of a key.
+
+    Raises:
+        MissingExtraError: the extra `sign` is not installed.
+    """
+    library = _cryptography()
+    try:
+        library.ed25519.Ed25519PublicKey.from_public_bytes(bytes.fromhex(public_key)).verify(
+            signature, message
+        )
+    except (ValueError, library.InvalidSignature):
+        return False
+    return True
+
+
+def fingerprint(public_key: str) -> str:
+    """`SHA256:...`, as `ssh-keygen -l` prints it."""
+    digest = hashlib.sha256(_SSH_HEAD + bytes.fromhex(public_key)).digest()
+    return f"SHA256:{base64.b64encode(digest).decode('ascii').rstrip('=')}"
+
+
+def read_public_key(text: str, where: str = "the key") -> trust.TrustedKey:
+    """A public key, as OpenSSH (`ssh-ed25519 AAAA... alice@host`, whose comment is its name) or PEM writes it.
+
+    Raises:
+        SignatureError: it is something else.
+    """
+    found = _SSH_LINE.match(text.strip())
+    if found is not None:
+        try:
+            blob = base64.b64decode(found[1], validate=True)
+        except binascii.Error:
+            blob = b""
+        if blob.startswith(_SSH_HEAD) and len(blob) == len(_SSH_HEAD) + 32:
+            return trust.TrustedKey(blob[len(_SSH_HEAD) :].hex(), (found[2] or "").strip())
+    elif "-----BEGIN PUBLIC KEY-----" in text:
+        library = _cryptography()
+        try:
+            key = library.serialization.load_pem_public_key(text.encode())
+        except (ValueError, library.UnsupportedAlgorithm):
+            key = None
+        if isinstance(key, library.ed25519.Ed25519PublicKey):
+            return trust.TrustedKey(key.public_bytes_raw().hex(), "")
+    if "PRIVATE KEY" in text:
+        raise SignatureError(f"{where}: expected a public key, found a private one; give its .pub file")
+    raise SignatureError(
+        f"{where}: expected a public Ed25519 key (`ssh-ed25519 AAAA...` or PEM), found {text.strip()[:40]!r}"
+    )
+
+
+def find_key(text: str) -> trust.TrustedKey:
+    """A public key, given as the name or fingerprint of a trusted one, as the path of its file, or itself.
+
+    Raises:
+        NotFoundError: it is none of these, or several trusted keys have the name.
+        SignatureError: the file holds something else.
+    """
+    known = [
+        key for key in trust.trusted_keys() if text in (key.name, key.public_key, fingerprint(key.public_key))
+    ]
+    if len(known) == 1:
+        return known[0]
+    if len(known) > 1:
+        raise NotFoundError(f"{len(known)} trusted keys are named {text!r}; give a fingerprint")
+    if text.startswith("ssh-") or "-----BEGIN" in text:
+        return read_public_key(text)
+    path = Path(text)
+    if _FINGERPRINT.match(text) or not path.is_file():
+        raise NotFoundError(
+            f"there is no trusted key {text!r} and no file of that name; `tupli-mcap trust --key FILE.pub --name NAME` "
+            "adds one"
+        )
+    return read_public_key(_read(path).decode("utf-8", "replace"), str(path))
+
+
+def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
+    library = _cryptography()
+    data = _read(path)
+    secret = None if passphrase is None else passphrase.encode()
+    load = library.serialization.load_pem_private_key
+    if b"BEGIN OPENSSH PRIVATE KEY" in data:
+        load = library.serialization.load_ssh_private_key
+    try:
+        try:
+            key = load(data, password=secret)
+        except TypeError:
+            if secret is None:
+                raise
+            key = load(data, password=None)  # a passphrase for a key that has none
+    except TypeError as err:
+        raise PassphraseNeededError(f"{path}: the key is encrypted, and needs a passphrase") from err
+    except (ValueError, library.UnsupportedAlgorithm) as err:
+        if secret is not None:
+            raise PassphraseNeededError(f"{path}: the passphrase does not open this key") from err
+        raise SignatureError(
+            f"{path}: expected a private Ed25519 key of OpenSSH or in PEM, found something else ({err}); "
+            "`ssh-keygen -t ed25519` makes one"
+        ) from err
+    if not isinstance(key, library.ed25519.Ed25519PrivateKey):
+        raise SignatureError(
+            f"{path}: expected an Ed25519 key, found {type(key).__name__}; `ssh-keygen -t ed25519` makes one"
+        )
+    return cast("Ed25519PrivateKey", key)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(_MAX_KEY_FILE)
+    except OSError as err:
+        raise SignatureError(f"the key {str(path)!r} cannot be read: {err.strerror}") from err
+
+
+class _Library(NamedTuple):
+    """What is used of `cryptography`."""
+
+    InvalidSignature: Any
+    UnsupportedAlgorithm: Any
+    serialization: Any
+    ed25519: Any
+
+
+def _cryptography() -> _Library:
+    try:
+        from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+        from cryptography.hazmat.primitives import serialization
+        from cryptography.hazmat.primitives.asymmetric import ed25519
+    except ImportError as err:
+        raise MissingExtraError(
+            "signatures of bundles need the package cryptography; pip install 'tupli-mcap[sign]'"
+        ) from err
+    return _Library(InvalidSignature, UnsupportedAlgorithm, serialization, ed25519)
