@@ -15,10 +15,12 @@ from fuzzing.crafted import CRAFTED
 from fuzzing.model import Seed
 from fuzzing.oracle import Facts, judge, observe
 from fuzzing.plain import PLAIN, Mutant
+from fuzzing.tools import use_tools
 
 __all__ = ["MUTATORS", "Case", "Finding", "Fuzzer", "case_of"]
 
 MUTATORS = {**PLAIN, **CRAFTED}
+TOOLS_EVERY = 60  # of the inputs all tools are used on: they take ten times as long
 SECONDS = 10.0
 """The longest an input may take: golden files are read in about 10 ms."""
 
@@ -109,6 +111,8 @@ class Fuzzer:
         try:
             with time_limit(SECONDS):
                 facts, refused = observe(self._path)
+                if case.number % TOOLS_EVERY == 0:
+                    use_tools(self._path)
         except HangError as err:
             return f"took more than {SECONDS} s:\n{err}", "hang"
         except Exception as err:  # noqa: BLE001 (any other than a FormatError is the finding)

@@ -89,15 +89,20 @@ class NameRegistry:
 
     def __init__(self, reserved: Sequence[str] = ()) -> None:
         self._taken = set(reserved)
+        self._counted: dict[tuple[str, tuple[str, ...]], int] = {}  # names are never given back
 
     def take(self, text: str, prefixes: Sequence[str] = ("",)) -> str:
         """A name like `text` that is free, with each of `prefixes` before it."""
         base = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_") or "field"
         if not base[0].isalpha():
             base = f"f_{base}"
-        name, n = base, 2
+        counted = (base, tuple(prefixes))
+        name, n = base, self._counted.get(counted, 2)
+        if n > 2:
+            name, n = f"{base}_{n}", n + 1
         while any(prefix + name in self._taken for prefix in prefixes):
             name, n = f"{base}_{n}", n + 1
+        self._counted[counted] = n
         self._taken.update(prefix + name for prefix in prefixes)
         return name
 

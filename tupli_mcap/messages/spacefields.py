@@ -16,6 +16,7 @@ Json = dict[str, Any]
 
 _DTYPES = {name: np.dtype(name) for name in ROS_TYPES}
 _MAX_DIMENSIONS = 32  # of NumPy 1
+_LARGE = 2**16  # elements
 
 
 class Fields:
@@ -75,6 +76,14 @@ class Fields:
         array = np.array([self._number(name, item, dtype) for item in value], dtype)
         return array.reshape(shape)
 
+    def built_shape(self, shape: tuple[int, ...], *names: str) -> tuple[int, ...]:
+        """`shape`, or one element of as many dimensions where a large space is the same everywhere.
+
+        Such a space takes a few bytes in a file, and it must take few in memory.
+        """
+        uniform = not any(isinstance(self.take(name), list) for name in names)
+        return (1,) * len(shape) if uniform and math.prod(shape) > _LARGE else shape
+
     def _number(self, name: str, value: Any, dtype: np.dtype[Any]) -> Any:
         if dtype.kind == "b":
             exact = type(value) is bool
@@ -109,6 +118,8 @@ def dtype_name(dtype: np.dtype[Any], path: str) -> str:
 
 def numbers(array: np.ndarray[Any, Any]) -> Any:
     """One number if all elements are the same bits, else the list of them; the opposite of `Fields.array`."""
+    if array.size and not any(array.strides):  # one element, spread
+        array = array[(slice(1),) * array.ndim]
     flat = np.ascontiguousarray(array).reshape(-1)
     if flat.size == 0:
         return []

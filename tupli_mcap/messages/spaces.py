@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -27,7 +27,9 @@ MAX_DEPTH = 64
 _MAX_ELEMENTS = (
     2**26
 )  # of all leaves together: a space holds its bounds in memory, and a file only claims its size
+_MAX_COPIED = 2**22  # of them, below a stacked Sequence or a Graph, where Gymnasium makes arrays of its own
 _MAX_SPACES = 2**16
+_FLAGS = ("bounded_below", "bounded_above")
 
 
 class _Budget:
@@ -38,14 +40,19 @@ class _Budget:
 
     def __init__(self) -> None:
         self._elements = _MAX_ELEMENTS
+        self._copied = _MAX_COPIED
         self._spaces = _MAX_SPACES
 
     def take(self, shape: tuple[int, ...], copies: int) -> str | None:
         """Count a space of this shape; return what is wrong, if anything is."""
-        self._elements -= math.prod(shape) * copies
+        size = math.prod(shape) * copies
+        self._elements -= size
+        self._copied -= size if copies > 1 else 0
         self._spaces -= copies
         if self._elements < 0:
             return f"at most {_MAX_ELEMENTS} elements in all, found a shape of {shape}"
+        if self._copied < 0:
+            return f"at most {_MAX_COPIED} elements below a stacked Sequence or a Graph, found a shape of {shape}"
         if self._spaces < 0:
             return f"at most {_MAX_SPACES} spaces, counting the copies Gymnasium makes, found more"
         return None
@@ -146,16 +153,25 @@ def _write_box(space: Any, path: str, _: WriteSub) -> Json:
 
 def _read_box(fields: Fields, _: ReadSub) -> gym.Space[Any]:
     dtype, shape = fields.dtype(), fields.shape("shape")
-    low, high = fields.array("low", dtype, shape), fields.array("high", dtype, shape)
+    built = fields.built_shape(shape, "low", "high", *(_FLAGS if dtype.kind == "i" else ()))
+    low, high = fields.array("low", dtype, built), fields.array("high", dtype, built)
     # The constructor takes no arrays of bools in some versions, and mistakes a lowest integer for a bound.
     as_given = np.uint8 if dtype.kind == "b" else dtype
-    space = spaces.Box(low.astype(as_given), high.astype(as_given), shape, dtype.type)
+    space = spaces.Box(low.astype(as_given), high.astype(as_given), built, dtype.type)
     space.low, space.high = low, high
     if dtype.kind == "i":
         flag = np.dtype(np.bool_)
-        space.bounded_below = fields.array("bounded_below", flag, shape)
-        space.bounded_above = fields.array("bounded_above", flag, shape)
-    return space
+        space.bounded_below = fields.array("bounded_below", flag, built)
+        space.bounded_above = fields.array("bounded_above", flag, built)
+    return space if built == shape else _spread(space, shape, "low", "high", *_FLAGS)
+
+
+def _spread(space: Any, shape: tuple[int, ...], *names: str) -> gym.Space[Any]:
+    """A space of one element made one of many: its arrays take no memory for them, and cannot be written to."""
+    for name in names:
+        setattr(space, name, np.broadcast_to(getattr(space, name), shape))
+    space._shape = shape
+    return cast("gym.Space[Any]", space)
 
 
 def _write_discrete(space: Any, path: str, _: WriteSub) -> Json:
@@ -175,10 +191,12 @@ def _write_multi_discrete(space: Any, path: str, _: WriteSub) -> Json:
 
 def _read_multi_discrete(fields: Fields, _: ReadSub) -> gym.Space[Any]:
     dtype, shape = fields.dtype(), fields.shape("shape")
-    nvec, start = fields.array("nvec", dtype, shape), fields.array("start", dtype, shape)
+    built = fields.built_shape(shape, "nvec", "start")
+    nvec, start = fields.array("nvec", dtype, built), fields.array("start", dtype, built)
     if dtype.kind not in "iu":
         raise fields.wrong("dtype", "an integer dtype")
-    return spaces.MultiDiscrete(nvec, dtype=dtype.type, start=start)
+    space = spaces.MultiDiscrete(nvec, dtype=dtype.type, start=start)
+    return space if built == shape else _spread(space, shape, "nvec", "start")
 
 
 def _write_multi_binary(space: Any, _path: str, _: WriteSub) -> Json:

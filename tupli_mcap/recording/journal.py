@@ -12,6 +12,7 @@ Not thread-safe; one writer.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import mmap
 import os
@@ -26,6 +27,7 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording.durability import boot_id, sync_directory
+from tupli_mcap.recording.source import open_regular
 from tupli_mcap.system import refused
 
 __all__ = [
@@ -274,11 +276,11 @@ def read_journal(path: Path) -> JournalContents:
         FormatError: the file is no journal, or describes areas it does not have.
         OSError: the file cannot be read.
     """
-    with path.open("rb") as file:
+    with _open(path) as file:
         info, areas, length = _read_header(path, file)
+        offsets, end = _place(areas, _HEAD.size + length)
         file.seek(0)
-        raw = np.fromfile(file, dtype=np.uint8)
-    offsets, _ = _place(areas, _HEAD.size + length)
+        raw = np.fromfile(file, dtype=np.uint8, count=min(end, os.fstat(file.fileno()).st_size))
     data = {}
     for area in areas:
         start = offsets[area.name]
@@ -292,8 +294,16 @@ def read_journal(path: Path) -> JournalContents:
 
 def journal_info(path: Path) -> dict[str, Any]:
     """What a journal says of itself; nothing else of it is read. Raises as `read_journal` does."""
-    with path.open("rb") as file:
+    with _open(path) as file:
         return _read_header(path, file)[0]
+
+
+def _open(path: Path) -> BinaryIO:
+    """Opened for reading; where it lies may have been told by a file from somebody else."""
+    try:
+        return os.fdopen(open_regular(path), "rb")
+    except ValueError as err:  # a NUL in the path
+        raise OSError(errno.EINVAL, str(err), str(path)) from err
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], list[Area], int]:

@@ -285,16 +285,15 @@ def _salvage_images(
     found: Scan, journal: JournalContents, layout: StepLayout, env: int, steps: int, tail: _Tail
 ) -> None:
     for leaf in layout.images:
-        topic = next(
+        (step,) = (
             c.topic
             for c in found.channels.values()
             if c.topic.endswith("/step") and c.metadata.get("env") == str(env)
         )
-        channel = next(
-            c.id
-            for c in found.channels.values()
-            if c.topic == f"{topic.removesuffix('/step')}/image/{leaf.name}"
-        )
+        wanted = f"{step.removesuffix('/step')}/image/{leaf.name}"
+        channel = next((c.id for c in found.channels.values() if c.topic == wanted), None)
+        if channel is None:
+            raise FormatError(f"expected a channel {wanted} in the journal, found none")
         dtype = layout.image_messages[leaf.name].dtype
         area = _rows_area(journal, f"{leaf.name}/{env}")
         salvage = Salvage(journal, area, 0, dtype, channel, rewritten=True)  # by resets

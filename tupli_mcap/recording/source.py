@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import stat
 import threading
@@ -13,7 +14,7 @@ from typing import Any, BinaryIO, Protocol
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
 from tupli_mcap.system import refused
 
-__all__ = ["Source", "open_source"]
+__all__ = ["Source", "open_regular", "open_source"]
 
 
 class Source(Protocol):
@@ -34,6 +35,19 @@ class Source(Protocol):
     def close(self) -> None: ...
 
 
+def open_regular(path: Path) -> int:
+    """A descriptor to read a regular file; OSError for anything else, a pipe without a writer is not waited for."""
+    waiting = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+    fd = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | waiting)
+    mode = os.fstat(fd).st_mode
+    if stat.S_ISREG(mode):
+        return fd
+    os.close(fd)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise OSError(errno.EINVAL, "a device, a pipe or a socket, and no file", str(path))
+
+
 class PathSource:
     """A local file, read with positioned reads."""
 
@@ -41,11 +55,17 @@ class PathSource:
         self.path: Path | None = path
         self.name = str(path)
         try:
-            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            self._fd = open_regular(path)
+        except IsADirectoryError as err:
+            raise RecordingError(
+                f"{path} is a directory; give a recording (.mcap), or open it as a FileStorage"
+            ) from err
         except FileNotFoundError as err:
             raise RecordingError(f"{path} does not exist; give the path of a recording (.mcap)") from err
         except OSError as err:
             raise RecordingError(f"{path} cannot be opened: {refused(err)}") from err
+        except ValueError as err:
+            raise RecordingError(f"{path!r} cannot be opened: {err}") from err  # a NUL in it
         try:
             self.refresh()
         except BaseException:
