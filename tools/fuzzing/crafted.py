@@ -538,7 +538,8 @@ def journal_field(rng: random.Random, seed: Seed, seeds: Sequence[Seed]) -> Muta
     elif how == "length":
         _store(journal, 8, number(rng, size), 4)
     else:
-        used = [i for i in range(4096, len(journal), 4) if any(journal[i : i + 4])]
+        words = np.frombuffer(journal[4096 : len(journal) // 4 * 4], "<u4")
+        used = (4096 + 4 * np.flatnonzero(words)).tolist()
         for _ in range(rng.choice([1, 1, 4])):
             _store(journal, rng.choice(used), number(rng, 4), rng.choice([4, 8]))
     return Mutant(seed.data, bytes(journal), False, f"journal of {seed.name}: {how}")

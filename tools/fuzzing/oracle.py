@@ -132,6 +132,8 @@ def _episode(reader: Reader, recording: Recording, i: int) -> Facts:
     ask("final_state", lambda: _exact(episode.final_state))
     ask("steps", lambda: [_exact(tuple(step[:5])) for step in episode])
     ask("infos", lambda: [_exact(info) for info in episode.infos or ()])
+    if i % 4:  # those of all episodes at once are in "columns", too
+        return found
     ask("next_states", lambda: _rows(recording, episode.next_states))
     ask("window", lambda: _exact(_leaves(recording, episode[1:2].states)))
     return found
@@ -180,7 +182,12 @@ def _episode_differs(found: Facts, truth: Facts, *, recovered: bool) -> Iterator
         yield f"steps {steps!r:.300} are not {wanted!r:.300}"
     lost = recovered and found.get("place", (0, 0))[1] < truth["place"][1]
     for name, value in found.items():
-        if name in ("steps", "repr") or value == truth[name] or (lost and name == "window"):
+        if (
+            name in ("steps", "repr")
+            or name not in truth
+            or value == truth[name]
+            or (lost and name == "window")
+        ):
             continue
         if (
             name == "infos"

@@ -20,7 +20,7 @@ from fuzzing.tools import use_tools
 __all__ = ["MUTATORS", "Case", "Finding", "Fuzzer", "case_of"]
 
 MUTATORS = {**PLAIN, **CRAFTED}
-TOOLS_EVERY = 60  # of the inputs all tools are used on: they take ten times as long
+TOOLS_EVERY = 200  # of the inputs all tools are used on: they take ten times as long
 SECONDS = 10.0
 """The longest an input may take: golden files are read in about 10 ms."""
 

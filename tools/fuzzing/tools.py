@@ -19,6 +19,7 @@ from tupli_mcap.doctor import examine
 from tupli_mcap.errors import TupliError
 from tupli_mcap.recording import journal_path
 from tupli_mcap.recording.repair import recover_recording
+from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.listing import list_recordings
 
@@ -29,7 +30,7 @@ def use_tools(path: Path) -> None:
     """Raises UnexpectedError if one of them fails with anything but an error of ours."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        for tool in (_list, _dataset, _storage, _doctor, _recover, _command_line):
+        for tool in (_list, _dataset, _storage, _verify, _doctor, _recover, _command_line):
             try:
                 tool(path)
             except TupliError:
@@ -62,6 +63,10 @@ def _storage(path: Path) -> None:
         for header in storage.list_episodes():
             storage.open_recording(header.recording).close()
     shutil.rmtree(root)
+
+
+def _verify(path: Path) -> None:
+    verify_recording(path)
 
 
 def _doctor(path: Path) -> None:

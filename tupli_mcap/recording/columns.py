@@ -118,7 +118,7 @@ class ColumnReader:
         out: dict[str, Any] = {leaf.name: self._empty(leaf, total) for leaf in leaves}
         out.update({name: np.empty(total, np.bool_) for name in flags})
         if "times" in fields:
-            out[_TIME] = np.empty(total, np.int64)
+            out[_TIME] = np.empty(total, np.uint64)
         tasks: list[Callable[[], None]] = []
         plain = [leaf.name for leaf in leaves if leaf.kind != "image" and leaf.size] + flags
         if layout.constant and "times" in fields:
@@ -149,7 +149,9 @@ class ColumnReader:
         }
         columns.update({f"{name}s": out[name] for name in flags})
         if "times" in fields:
-            columns["times"] = out[_TIME]
+            columns["times"] = out[_TIME].view(np.int64)
+            if (columns["times"] < 0).any():
+                raise FormatError(f"expected times of steps below 2**63 ns, found {out[_TIME].max()}")
         return columns
 
     def _empty(self, leaf: Leaf, total: int) -> Any:
@@ -200,7 +202,7 @@ class ColumnReader:
     def _read_times(self, runs: Sequence[Run], out: Array) -> None:
         for run in runs:
             times = self._store.times(run.channel, run.first, run.steps)
-            out[run.out : run.out + run.steps] = np.fromiter(times, np.int64, run.steps)
+            out[run.out : run.out + run.steps] = np.fromiter(times, np.uint64, run.steps)
 
     def final_columns(self, channel: int, episodes: Array) -> list[Any]:
         """A column of final states for each leaf of the state, of index rows that all have one."""
