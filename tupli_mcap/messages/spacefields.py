@@ -81,7 +81,7 @@ class Fields:
 
         Such a space takes a few bytes in a file, and it must take few in memory.
         """
-        uniform = not any(isinstance(self.take(name), list) for name in names)
+        uniform = not any(isinstance(self._obj.get(name), list) for name in names)
         return (1,) * len(shape) if uniform and math.prod(shape) > _LARGE else shape
 
     def _number(self, name: str, value: Any, dtype: np.dtype[Any]) -> Any:

@@ -148,6 +148,8 @@ class _Exact(io.BytesIO):
 
 def parse_record(opcode: int, body: memoryview, offset: int, name: str) -> Any:
     """A record parsed by the `mcap` package; every defect is a FormatError."""
+    if opcode not in _PARSERS:
+        raise FormatError(f"{name}: expected another record at offset {offset}, found opcode {opcode}")
     stream = _Exact(body)
     try:
         parsed = _PARSERS[opcode].read(ReadDataStream(stream))
