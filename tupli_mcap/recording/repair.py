@@ -18,7 +18,8 @@ from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.repair_foreign import copy_foreign
 from tupli_mcap.recording.repair_gather import Gathered, gather, is_recording, may_be_recording
 from tupli_mcap.recording.repair_journal import add_journal
-from tupli_mcap.recording.repair_plan import Channels, Plan, make_plan
+from tupli_mcap.recording.repair_plan import Plan, make_plan
+from tupli_mcap.recording.repair_segments import Channels
 from tupli_mcap.recording.repair_write import RepairWriter
 from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.survey import Damage, attachment_name

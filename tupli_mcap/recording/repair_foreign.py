@@ -12,11 +12,12 @@ from mcap.records import Channel, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.recording.checked import message_index
 from tupli_mcap.recording.container import PROFILE
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import parse_record
-from tupli_mcap.recording.survey import Chunk, Damage, Found, KnownChunk, Survey, message_index
+from tupli_mcap.recording.survey import Chunk, Damage, Found, KnownChunk, Survey
 from tupli_mcap.recording.tail import Tail
 
 __all__ = ["Copied", "copy_foreign"]

@@ -11,6 +11,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Metadata, Schema
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.checked import message_index
 from tupli_mcap.recording.checksums import check_crc, mended
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.container import CHUNK_ROWS, MAGIC, PROFILE
@@ -19,7 +20,7 @@ from tupli_mcap.recording.headers import ChunkRecords, chunk_records
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import parse_record
-from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey, message_index
+from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.recording.tail import Tail
 
 __all__ = ["Gathered", "Piece", "Pieces", "gather", "is_recording", "may_be_recording"]

@@ -13,7 +13,7 @@ from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, read_journal, recorded_journal
 from tupli_mcap.recording.recover import belongs, define, misplaced_journal
 from tupli_mcap.recording.repair_gather import Gathered, Piece
-from tupli_mcap.recording.repair_plan import Channels, messages
+from tupli_mcap.recording.repair_segments import Channels, messages
 from tupli_mcap.recording.rows import RowDeriver
 from tupli_mcap.recording.salvage import Salvage, log_records, running_record
 

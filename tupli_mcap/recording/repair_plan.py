@@ -2,80 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numpy as np
-
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
-from tupli_mcap.recording.facts import StepFacts, step_facts
-from tupli_mcap.recording.headers import message_headers
 from tupli_mcap.recording.index import EpisodeIndex
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
+from tupli_mcap.recording.repair_segments import Channels, Ranges, Segment, messages, segments
 
-__all__ = [
-    "Channels",
-    "Plan",
-    "PlannedEpisode",
-    "Segment",
-    "Told",
-    "intersection",
-    "make_plan",
-    "message_at",
-    "messages",
-]
-
-Ranges = list[tuple[int, int]]
-
-
-class Channels(NamedTuple):
-    """Ids in the damaged file: by sub-environment, and by image leaf then sub-environment; None: not known."""
-
-    steps: list[int]
-    images: dict[str, list[int | None]]
-    start: int | None
-    end: int | None
-    final: int | None
-    info: int | None
-
-    @classmethod
-    def of(cls, gathered: Gathered, layout: StepLayout) -> Channels:
-        """The channels of a recording, by their topics."""
-        found = step_channels(gathered.channels, gathered.source.name)
-        topics = {channel.topic: channel.id for channel in gathered.channels.values()}
-        images = {
-            leaf.name: [
-                topics.get(f"{channel.topic.removesuffix('/step')}/image/{leaf.name}") for channel in found
-            ]
-            for leaf in layout.images
-        }
-        names = ("/episode_start", "/episode_end", "/final_state", "/info")
-        return cls([channel.id for channel in found], images, *(topics.get(name) for name in names))
-
-
-class Segment(NamedTuple):
-    """Consecutive rows that are here, of consecutive steps of one episode; times in ns.
-
-    `closed`: the row after it is here and another episode's, or there can be none.
-    """
-
-    env: int
-    row: int
-    steps: int
-    episode: int
-    step: int
-    total: float
-    terminal: bool
-    timeout: bool
-    first_time: int
-    last_time: int
-    closed: bool
+__all__ = ["Plan", "PlannedEpisode", "Told", "make_plan"]
 
 
 @dataclass
@@ -126,81 +63,6 @@ class Plan:
     next_episode: int = 0
 
 
-def intersection(a: Ranges, b: Ranges) -> Ranges:
-    """What two lists of ranges have in common."""
-    found: Ranges = []
-    i = j = 0
-    while i < len(a) and j < len(b):
-        low, high = max(a[i][0], b[j][0]), min(a[i][1], b[j][1])
-        if low < high:
-            found.append((low, high))
-        if a[i][1] < b[j][1]:
-            i += 1
-        else:
-            j += 1
-    return found
-
-
-# ---- what is here
-
-
-def segments(
-    gathered: Gathered, store: PackedStore, layout: StepLayout, channels: Channels
-) -> Iterator[Segment]:
-    """The segments of all sub-environments, in the order of their rows."""
-    for env, channel in enumerate(channels.steps):
-        here = gathered.ranges(channel)
-        for ids in channels.images.values():
-            image = ids[env]
-            here = intersection(here, [] if image is None else gathered.ranges(image))
-        for first, stop in here:
-            open_: Segment | None = None
-            row = first
-            for facts in step_facts(store, layout, channel, store.packed(channel, first), stop - first):
-                for found in _cut(facts, env, row):
-                    if open_ is not None and _continues(open_, found):
-                        open_ = _joined(open_, found)
-                        continue
-                    if open_ is not None:
-                        yield open_._replace(closed=open_.row + open_.steps == found.row)
-                    open_ = found
-                row += len(facts.episode)
-            if open_ is not None:
-                yield open_
-
-
-def _cut(facts: StepFacts, env: int, row: int) -> Iterator[Segment]:
-    """The segments of one batch of rows, which starts at `row`."""
-    episode, step = facts.episode.astype(np.int64), facts.step.astype(np.int64)
-    flagged = (facts.terminal != 0) | (facts.timeout != 0)
-    breaks = (episode[1:] != episode[:-1]) | (step[1:] != step[:-1] + 1) | flagged[:-1]
-    edges = {0, len(episode), *(np.flatnonzero(breaks) + 1).tolist()}
-    edges |= set(facts.bad) | {i + 1 for i in facts.bad}
-    order = sorted(edges)
-    for begin, end in itertools.pairwise(order):
-        if begin in facts.bad:
-            continue
-        with np.errstate(invalid="ignore", over="ignore"):
-            total = float(np.cumsum(facts.reward[begin:end])[-1])
-        yield Segment(
-            env, row + begin, end - begin, int(episode[begin]), int(step[begin]), total,
-            bool(facts.terminal[end - 1]), bool(facts.timeout[end - 1]),
-            int(facts.time[begin]), int(facts.time[end - 1]), False,
-        )  # fmt: skip
-
-
-def _continues(a: Segment, b: Segment) -> bool:
-    together = a.row + a.steps == b.row and a.episode == b.episode and a.step + a.steps == b.step
-    return together and not (a.terminal or a.timeout)
-
-
-def _joined(a: Segment, b: Segment) -> Segment:
-    return a._replace(
-        steps=a.steps + b.steps, total=a.total + b.total,
-        terminal=b.terminal, timeout=b.timeout, last_time=b.last_time,
-    )  # fmt: skip
-
-
 # ---- what is told of it
 
 
@@ -228,26 +90,6 @@ def read_told(gathered: Gathered, store: PackedStore, channels: Channels) -> Tol
     if gathered.tail.index is not None:
         told.index = {int(n): i for i, n in enumerate(gathered.tail.index.episodes["episode"])}
     return told
-
-
-def messages(store: PackedStore, channel: int | None) -> Iterator[tuple[int, int, memoryview]]:
-    """(row, log_time, body) of the messages of a channel that are here."""
-    row = 0
-    for chunk in [] if channel is None else store.chunks(channel):
-        data = memoryview(store.load(chunk, keep=False))
-        for header in message_headers(data):
-            start = int(header["#offset"])
-            yield row, int(header["#log_time"]), data[start + BODY : start + 9 + int(header["#length"])]
-            row += 1
-
-
-def message_at(store: PackedStore, channel: int, row: int) -> bytes:
-    """The body of one message."""
-    (span,) = store.spans(channel, row, 1)
-    data = memoryview(store.load(span.chunk))
-    header = message_headers(data)[span.begin]
-    start = int(header["#offset"])
-    return bytes(data[start + BODY : start + 9 + int(header["#length"])])
 
 
 def _index_end(index: EpisodeIndex, i: int) -> tuple[int, EpisodeEnd] | None:

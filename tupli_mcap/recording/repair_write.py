@@ -24,7 +24,8 @@ from tupli_mcap.recording.headers import message_headers
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
-from tupli_mcap.recording.repair_plan import Channels, Plan, PlannedEpisode, message_at, messages
+from tupli_mcap.recording.repair_plan import Plan, PlannedEpisode
+from tupli_mcap.recording.repair_segments import Channels, message_at, messages
 from tupli_mcap.recording.rows import even_rows
 
 __all__ = ["RECOVERED", "RepairWriter"]

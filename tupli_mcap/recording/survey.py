@@ -13,31 +13,21 @@ import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.checked import attachment_index, checked_attachment, message_index
 from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.compression import decompress
 from tupli_mcap.recording.container import MAGIC
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import parse_record
 
-__all__ = [
-    "Chunk",
-    "Damage",
-    "Found",
-    "KnownChunk",
-    "Survey",
-    "attachment_name",
-    "checked_attachment",
-    "message_index",
-]
+__all__ = ["Chunk", "Damage", "Found", "KnownChunk", "Survey", "attachment_name"]
 
 _RECORD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
-_ATTACHMENT_HEAD = struct.Struct("<QQI")
 _PIECE = 1 << 20
 _MAX_RATIO = 1 << 16  # zstd cannot compress further
 _SUMMARY = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
@@ -107,7 +97,8 @@ class Survey:
     Args:
         known: what an index says of the chunks, by offset.
         end: where the data section ends, where that is known.
-        messages: whether Message records outside chunks are records (they are none of ours).
+        messages: whether Message records outside chunks are records, and CRCs of 0 none, as in files that are not
+            ours.
     """
 
     def __init__(
@@ -186,7 +177,7 @@ class Survey:
 
     def _attachment(self, position: int, length: int) -> Found | str:
         try:
-            index = checked_attachment(self._source, position, length)
+            index = checked_attachment(self._source, position, length, unchecked=self._messages)
         except FormatError as err:
             self._budget -= length
             return str(err)
@@ -274,7 +265,7 @@ class Survey:
         except FormatError as err:
             self._budget -= packed
             return str(err)
-        if crc and zlib.crc32(data) != crc:
+        if (crc or not self._messages) and zlib.crc32(data) != crc:
             self._budget -= packed + size
             return "the chunk's CRC differs"
         return data
@@ -293,7 +284,7 @@ class Survey:
         if opcode != Opcode.ATTACHMENT:
             return False
         try:
-            _attachment_index(self._source, position, length)
+            attachment_index(self._source, position, length)
         except FormatError:
             return False
         return True
@@ -347,38 +338,8 @@ class Survey:
         if found.opcode == Opcode.MESSAGE:
             return self._stands_at(found.offset + found.length)
         if found.opcode == Opcode.CHUNK:
-            return self._messages or (found.chunk is not None and found.chunk.crc != 0)
+            return True
         return True
-
-
-def message_index(body: memoryview) -> tuple[int, np.ndarray[Any, np.dtype[np.uint64]]]:
-    """The channel and the entries (log_time, offset) of a MessageIndex record.
-
-    Raises:
-        FormatError: its sizes do not add up.
-    """
-    channel, size = int.from_bytes(body[:2], "little"), int.from_bytes(body[2:6], "little")
-    if len(body) != 6 + size or size % 16:
-        raise FormatError(f"expected a message index of {len(body) - 6} bytes, it says {size}")
-    return channel, np.frombuffer(body[6:], "<u8").reshape(-1, 2)
-
-
-def checked_attachment(source: Source, offset: int, length: int) -> AttachmentIndex:
-    """The facts of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
-
-    Raises:
-        FormatError: it is damaged.
-    """
-    found = _attachment_index(source, offset, length)
-    crc, position, end = 0, offset + 9, offset + 9 + length - 4
-    expected = int.from_bytes(source.read(end, 4), "little")
-    while expected and position < end:
-        piece = source.read(position, min(_PIECE, end - position))
-        crc = zlib.crc32(piece, crc)
-        position += len(piece)
-    if crc != expected:
-        raise FormatError(f"the attachment {found.name!r:.80} is damaged (its CRC differs)")
-    return found
 
 
 def attachment_name(source: Source, damage: Damage) -> str | None:
@@ -386,25 +347,6 @@ def attachment_name(source: Source, damage: Damage) -> str | None:
     if damage.opcode != Opcode.ATTACHMENT:
         return None
     try:
-        return _attachment_index(source, damage.offset, damage.end - damage.offset - 9).name
+        return attachment_index(source, damage.offset, damage.end - damage.offset - 9).name
     except FormatError:
         return None
-
-
-def _attachment_index(source: Source, offset: int, length: int) -> AttachmentIndex:
-    """What an attachment's header says; FormatError if it does not add up to its length."""
-    head = source.read(offset + 9, min(length, _ATTACHMENT_HEAD.size + (1 << 17)))
-    try:
-        log_time, create_time, size = _ATTACHMENT_HEAD.unpack_from(head)
-        at = _ATTACHMENT_HEAD.size
-        name = head[at : at + size].decode()
-        at += size
-        size = int.from_bytes(head[at : at + 4], "little")
-        media_type = head[at + 4 : at + 4 + size].decode()
-        at += 4 + size
-    except (struct.error, UnicodeDecodeError) as err:
-        raise FormatError("the attachment's header is damaged") from err
-    data_size = int.from_bytes(head[at : at + 8], "little")
-    if at + 8 > len(head) or at + 8 + data_size + 4 != length:
-        raise FormatError("the attachment's sizes do not add up")
-    return AttachmentIndex(offset, 9 + length, log_time, create_time, data_size, name, media_type)

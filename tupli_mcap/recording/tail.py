@@ -8,6 +8,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Statistics
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.checked import checked_attachment
 from tupli_mcap.recording.container import COMPRESSIONS, MAGIC
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
 from tupli_mcap.recording.source import Source
@@ -20,7 +21,7 @@ from tupli_mcap.recording.summary import (
     read_summary,
     records,
 )
-from tupli_mcap.recording.survey import KnownChunk, checked_attachment
+from tupli_mcap.recording.survey import KnownChunk
 
 __all__ = ["Tail", "read_tail"]
 

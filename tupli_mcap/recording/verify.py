@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import warnings
 from pathlib import Path
@@ -28,6 +29,7 @@ from tupli_mcap.recording.verify_structure import Structure
 __all__ = ["Problem", "VerifyReport", "verify_recording"]
 
 _ARTIFACT = "artifacts/"
+_FROM_STORAGE = "load its benchmark from the storage it is in"
 
 
 def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
@@ -156,7 +158,16 @@ def _carried(recording: Recording, findings: Findings) -> None:
         except TupliError as err:
             findings.error("benchmark", str(err).removeprefix(f"{recording.name}: "))
     if "env.cloudpickle" in recording.attachments and "benchmark.json" not in recording.attachments:
-        findings.error("benchmark", "it carries a pickled environment without 'benchmark.json'")
+        findings.note("benchmark", "it carries a pickled environment without 'benchmark.json'", _FROM_STORAGE)
+
+
+def _names_pickle(recording: Recording) -> bool:
+    """Whether `benchmark.json` says that a pickle lies beside it."""
+    try:
+        document = json.loads(recording.read_attachment("benchmark.json"))
+        return document["environment"]["pickle"] is not None
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return False
 
 
 def _signature(recording: Recording, findings: Findings) -> None:
@@ -170,6 +181,11 @@ def _signature(recording: Recording, findings: Findings) -> None:
 
 
 def _benchmark(recording: Recording, findings: Findings) -> None:
+    if "env.cloudpickle" not in recording.attachments and _names_pickle(recording):
+        findings.note(
+            "benchmark", "the pickled environment that 'benchmark.json' names is missing", _FROM_STORAGE
+        )
+        return
     record: EnvironmentRecord = recording.benchmark.record  # checks the digests of spec and pickle
     told = record.benchmark or {}
     if "id" in told and told["id"] != recording.benchmark_id:

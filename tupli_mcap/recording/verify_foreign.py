@@ -10,11 +10,12 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.checked import message_index
 from tupli_mcap.recording.container import MAGIC
 from tupli_mcap.recording.findings import Findings
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import FOOTER_SIZE, parse_record, records
-from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey, message_index
+from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.recording.tail import Tail
 
 __all__ = ["verify_foreign"]

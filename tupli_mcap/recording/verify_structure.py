@@ -11,6 +11,7 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import CDR_HEADER
+from tupli_mcap.recording.checked import message_index
 from tupli_mcap.recording.checksums import check_crc
 from tupli_mcap.recording.container import CHUNK_ROWS, COMPRESSIONS, MAGIC, PROFILE
 from tupli_mcap.recording.contents import CHANNEL_KEYS, RECORDING_KEYS, RECORDING_METADATA, is_ours
@@ -19,7 +20,7 @@ from tupli_mcap.recording.headers import ChunkRecords, chunk_records
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import FOOTER_SIZE, parse_record, records
-from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey, message_index
+from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.recording.tail import Tail
 
 __all__ = ["Structure"]

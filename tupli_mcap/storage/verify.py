@@ -113,6 +113,8 @@ def _sidecar(path: Path, findings: Findings) -> None:
 
 def _benchmark(path: Path, findings: Findings) -> None:
     """The id of a benchmark that a recording carries is the hash of its contents."""
+    if any(problem.kind == "benchmark" for problem in findings.report.problems):
+        return  # said already
     with Recording(path) as recording:
         if "benchmark.json" not in recording.attachments:
             return

@@ -1,0 +1,162 @@
+#!/usr/bin/env python
+"""Damages golden recordings in every way that is quick to try, and recovers and verifies each: nothing wrong may pass.
+
+`python tools/damage.py [--every N] [--name NAME ...] [--kind flip|cut|zero|swap]`: every N-th byte of each recording
+is flipped (or the file is cut there, 64 bytes from there on are zeroed, or bytes from elsewhere are put there). Then
+`verify` has to find it, `recover` may only give steps that were recorded, has to name those that are missing, and
+`verify` has to like what it wrote. Prints a line a recording; exit code 1 if something is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import zstandard
+
+from tupli_mcap import Recording, TupliError, recover_recording, verify_recording
+from tupli_mcap.messages import jsonvalue
+
+GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
+Steps = dict[tuple[int, int], str]
+
+
+def flip(data: bytes, at: int, rng: random.Random) -> bytes:
+    """One bit."""
+    bad = bytearray(data)
+    bad[at] ^= 1 << rng.randrange(8)
+    return bytes(bad)
+
+
+def cut(data: bytes, at: int, rng: random.Random) -> bytes:
+    """The end is gone."""
+    return data[:at]
+
+
+def zero(data: bytes, at: int, rng: random.Random) -> bytes:
+    """A stretch of zeros, as a lost page leaves it."""
+    return data[:at] + bytes(len(data[at : at + 64])) + data[at + 64 :]
+
+
+def swap(data: bytes, at: int, rng: random.Random) -> bytes:
+    """Bytes from elsewhere in the file."""
+    other, size = rng.randrange(len(data)), rng.randrange(1, 200)
+    part = data[other : other + size]
+    return data[:at] + part + data[at + len(part) :]
+
+
+DAMAGES: dict[str, Callable[[bytes, int, random.Random], bytes]] = {
+    "flip": flip,
+    "cut": cut,
+    "zero": zero,
+    "swap": swap,
+}
+
+
+def place(name: str, directory: Path) -> Path:
+    """A copy of a golden recording, its journal beside it."""
+    path = directory / f"{name}.mcap"
+    path.write_bytes((GOLDEN / f"{name}.mcap").read_bytes())
+    packed = GOLDEN / f"{name}.mcap.journal.zst"
+    if packed.exists():
+        journal = zstandard.ZstdDecompressor().decompress(packed.read_bytes())
+        (directory / f"{name}.mcap.journal").write_bytes(journal)
+    return path
+
+
+def steps_of(path: Path) -> Steps:
+    """Every step by the episode and step number it had before a repair, exact."""
+    found: Steps = {}
+    with Recording(path) as recording:
+        for episode in recording.episodes:
+            origin = episode.metadata.get("recovered")
+            number, first = (
+                (episode.number, 0) if origin is None else (origin["episode"], origin["first_step"])
+            )
+            for i, step in enumerate(episode):
+                values = [step.state, step.action, step.reward, step.terminal, step.timeout]
+                found[number, first + i] = jsonvalue.dumps(values)
+    return found
+
+
+def wrong(path: Path, wanted: Steps, *, changed: bool) -> str | None:
+    """What is wrong with what becomes of a damaged file; None if nothing is."""
+    if verify_recording(path).problems == [] and changed:
+        return "damage not found"
+    try:
+        report = recover_recording(path, overwrite=True)
+    except TupliError:
+        return None
+    if report.target is None:
+        return None
+    if report.kind == "mcap":
+        return None if report.notes or not report.messages else "copied without a word"
+    verified = verify_recording(report.target)
+    if verified.errors:
+        return f"recovered, and damaged: {verified.errors[0].message}"
+    found = steps_of(Path(report.target))
+    if any(wanted.get(key) != value for key, value in found.items()):
+        return "steps that never were"
+    missing = set(wanted) - set(found)
+    named = {
+        (lost.episode, step)
+        for lost in report.lost
+        for step in range(lost.first, 1000 if lost.stop is None else lost.stop)
+    }
+    tail_is_gone = not report.finished or report.journal in ("stale", "damaged", "missing")
+    if not missing <= named and not tail_is_gone:
+        return f"missing without a word: {sorted(missing - named)[:3]}"
+    return None
+
+
+def main() -> int:
+    """Runs it."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--every", type=int, default=7, help="bytes from one damage to the next")
+    parser.add_argument("--name", action="append", help="of a golden recording; all by default")
+    parser.add_argument("--kind", action="append", choices=list(DAMAGES), help="all by default")
+    asked = parser.parse_args()
+    warnings.simplefilter("ignore")
+    bad = total = 0
+    for name in asked.name or sorted(path.stem for path in GOLDEN.glob("*.mcap")):
+        for kind in asked.kind or DAMAGES:
+            began = time.perf_counter()
+            with tempfile.TemporaryDirectory() as directory:
+                found, tried = sweep(name, kind, asked.every, Path(directory))
+            total, bad = total + tried, bad + sum(found.values())
+            said = "; ".join(f"{count} x {what}" for what, count in found.most_common(5)) or "all well"
+            print(f"{name} {kind}: {tried} in {time.perf_counter() - began:.0f} s, {said}", flush=True)
+    print(f"{total} damaged files, {bad} wrong")
+    return 1 if bad else 0
+
+
+def sweep(name: str, kind: str, every: int, directory: Path) -> tuple[Counter[str], int]:
+    """What went wrong, by sentence (with the first place of each), and how many files were tried."""
+    path = place(name, directory)
+    wanted, data = steps_of(path), path.read_bytes()
+    library = range(37, 47)  # in the header: bytes that no rule is about
+    found: Counter[str] = Counter()
+    first: dict[str, int] = {}
+    for at in range(0, len(data), every):
+        damaged = DAMAGES[kind](data, at, random.Random(at))
+        path.write_bytes(damaged)
+        try:
+            what = wrong(path, wanted, changed=damaged != data and not (kind == "flip" and at in library))
+        except Exception as err:  # noqa: BLE001 - reported
+            what = f"{type(err).__name__}: {err} ({traceback.extract_tb(err.__traceback__)[-1].name})"
+        if what is not None:
+            sentence = f"{what} (first at {first.setdefault(what[:40], at)})"
+            found[sentence] += 1
+    return found, len(range(0, len(data), every))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,73 @@
+"""Records that MCAP readers take on trust, checked: message indexes and attachments."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+from mcap.records import AttachmentIndex
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.source import Source
+
+__all__ = ["attachment_index", "checked_attachment", "message_index"]
+
+_ATTACHMENT_HEAD = struct.Struct("<QQI")  # log_time, create_time, length of the name
+_PIECE = 1 << 20
+
+
+def message_index(body: memoryview) -> tuple[int, np.ndarray[Any, np.dtype[np.uint64]]]:
+    """The channel and the entries (log_time, offset) of a MessageIndex record.
+
+    Raises:
+        FormatError: its sizes do not add up.
+    """
+    channel, size = int.from_bytes(body[:2], "little"), int.from_bytes(body[2:6], "little")
+    if len(body) != 6 + size or size % 16:
+        raise FormatError(f"expected a message index of {len(body) - 6} bytes, it says {size}")
+    return channel, np.frombuffer(body[6:], "<u8").reshape(-1, 2)
+
+
+def checked_attachment(
+    source: Source, offset: int, length: int, *, unchecked: bool = False
+) -> AttachmentIndex:
+    """The facts of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
+
+    `unchecked`: a CRC of 0 says that there is none, as other writers use it.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    found = attachment_index(source, offset, length)
+    crc, position, end = 0, offset + 9, offset + 9 + length - 4
+    expected = int.from_bytes(source.read(end, 4), "little")
+    if unchecked and not expected:
+        return found
+    while position < end:
+        piece = source.read(position, min(_PIECE, end - position))
+        crc = zlib.crc32(piece, crc)
+        position += len(piece)
+    if crc != expected:
+        raise FormatError(f"the attachment {found.name!r:.80} is damaged (its CRC differs)")
+    return found
+
+
+def attachment_index(source: Source, offset: int, length: int) -> AttachmentIndex:
+    """What an attachment's header says; FormatError if it does not add up to its length."""
+    head = source.read(offset + 9, min(length, _ATTACHMENT_HEAD.size + (1 << 17)))
+    try:
+        log_time, create_time, size = _ATTACHMENT_HEAD.unpack_from(head)
+        at = _ATTACHMENT_HEAD.size
+        name = head[at : at + size].decode()
+        at += size
+        size = int.from_bytes(head[at : at + 4], "little")
+        media_type = head[at + 4 : at + 4 + size].decode()
+        at += 4 + size
+    except (struct.error, UnicodeDecodeError) as err:
+        raise FormatError("the attachment's header is damaged") from err
+    data_size = int.from_bytes(head[at : at + 8], "little")
+    if at + 8 > len(head) or at + 8 + data_size + 4 != length:
+        raise FormatError("the attachment's sizes do not add up")
+    return AttachmentIndex(offset, 9 + length, log_time, create_time, data_size, name, media_type)
