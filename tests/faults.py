@@ -95,6 +95,7 @@ class Faults:
 
     def below(self, path: Any) -> str | None:
         """The path if it is below the root."""
+        path = path.fileno() if hasattr(path, "fileno") else path
         if isinstance(path, int):
             try:
                 path = os.readlink(f"/proc/self/fd/{path}")  # noqa: PTH115

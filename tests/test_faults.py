@@ -16,9 +16,10 @@ import pytest
 from environments import Sampler
 from faults import Faults
 from faulty_recordings import WORKLOADS, Case, calls_of, cases, run_case
+from faulty_storages import OPERATIONS, Lab, run_storage_case, run_trust_case, template
 from gymnasium import spaces
 
-from tupli_mcap import RecordEpisodes, Recording, RecordingError
+from tupli_mcap import FileStorage, RecordEpisodes, Recording, RecordingError, StorageError
 
 BOX = spaces.Box(-1, 1, (3,), np.float32)
 
@@ -125,3 +126,65 @@ def test_opening_to_append_changes_nothing(tmp_path: Path) -> None:
     assert Recording(path).complete
     env.close()
     assert path.read_bytes() == before
+
+
+_labs: list[Lab] = []
+
+
+@pytest.fixture
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    """A storage to be copied; made once, when a private configuration directory is there."""
+    if not _labs:
+        _labs.append(template(tmp_path_factory.mktemp("made")))
+    return _labs[0]
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_the_kth_call_on_a_storage_fails(tmp_path: Path, lab: Lab, name: str) -> None:
+    calls = run_storage_case(name, lab, tmp_path / "whole", Case(-1, errno.EIO, False)).calls
+    wanted = [case for case in cases(calls) if calls[case.at][0] not in ("mkdir", "close", "stat")]
+    for i, case in enumerate(random.Random(name).sample(wanted, 2)):
+        assert run_storage_case(name, lab, tmp_path / str(i), case).hit, case
+
+
+def test_trusting_is_all_or_nothing(tmp_path: Path) -> None:
+    calls = run_trust_case(tmp_path / "whole", Case(-1, errno.EIO, False)).calls
+    for i, case in enumerate(random.Random(1).sample(list(cases(calls)), 20)):
+        run_trust_case(tmp_path / str(i), case)
+
+
+def test_a_catalog_that_could_not_be_made_leaves_nothing(tmp_path: Path) -> None:
+    storage = FileStorage(tmp_path / "lab")
+    with (
+        Faults(tmp_path, 0, errno.ENOSPC, kinds=frozenset({"replace"}))(),
+        pytest.warns(UserWarning, match="No space left on device; free some space there"),
+    ):
+        assert storage.count_episodes() == 0
+    assert [p.name for p in storage.root.iterdir() if p.name.startswith("catalog")] == ["catalog.sqlite.lock"]
+    storage.close()
+
+
+def test_too_many_open_files_are_no_missing_recordings(tmp_path: Path) -> None:
+    storage = FileStorage(tmp_path / "lab")
+    for i in range(3):
+        with RecordEpisodes(sampler(), storage.root / f"{i}.mcap") as env:
+            env.reset()
+            env.step(0)
+    with FileStorage(tmp_path / "lab") as another:
+        assert another.count_episodes() == 3
+    (tmp_path / "lab" / "2.mcap").touch()  # to be read anew
+
+    class Recordings(Faults):
+        def check(self, kind: str, name: str) -> None:
+            if name.endswith("2.mcap"):
+                super().check(kind, name)
+
+    with (
+        Recordings(tmp_path, 0, errno.EMFILE, kinds=frozenset({"open"}))(),
+        pytest.raises(
+            StorageError, match=r"cannot list the recordings .*2\.mcap.* Too many open files; close some"
+        ),
+    ):
+        storage.list_episodes()
+    assert len(storage.list_episodes()) == 3
+    storage.close()

@@ -27,6 +27,7 @@ from typing import NamedTuple
 import platformdirs
 
 from tupli_mcap.errors import TupliError
+from tupli_mcap.system import refused
 
 __all__ = [
     "TrustedKey",
@@ -215,14 +216,14 @@ def _store(name: str, text: str) -> None:
         _make_private_dir(path.parent)
         _write(path, text.encode(), replace=True)
     except OSError as err:
-        raise TupliError(f"the signature {str(path)!r} cannot be written: {err}") from err
+        raise TupliError(f"the signature {str(path)!r} cannot be written: {refused(err)}") from err
 
 
 def _remove(path: Path) -> None:
     try:
         path.unlink(missing_ok=True)
     except OSError as err:
-        raise TupliError(f"the signature {str(path)!r} cannot be removed: {err}") from err
+        raise TupliError(f"the signature {str(path)!r} cannot be removed: {refused(err)}") from err
 
 
 def _check_digest(digest: str) -> None:
@@ -245,7 +246,7 @@ def _key(*, create: bool) -> bytes | None:
         if not create:
             return None
     except OSError as err:
-        raise TupliError(f"the key {str(path)!r} cannot be read: {err}") from err
+        raise TupliError(f"the key {str(path)!r} cannot be read: {refused(err)}") from err
     try:
         _make_private_dir(path.parent)
         # The first process to link wins; the others read its key.
@@ -253,7 +254,7 @@ def _key(*, create: bool) -> bytes | None:
             _write(path, secrets.token_bytes(_KEY_BYTES), replace=False)
         return _read_key(path)
     except OSError as err:
-        raise TupliError(f"the key {str(path)!r} cannot be made: {err}") from err
+        raise TupliError(f"the key {str(path)!r} cannot be made: {refused(err)}") from err
 
 
 def _read_key(path: Path) -> bytes:
@@ -306,4 +307,5 @@ def _write(path: Path, data: bytes, *, replace: bool) -> None:
         else:
             os.link(temporary, path)
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # the file is there, or something else is said
+            temporary.unlink(missing_ok=True)

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
+import inspect
 import os
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self, TypeVar
 
-from tupli_mcap.errors import StorageError
+from tupli_mcap.errors import RecordingError, StorageError
+from tupli_mcap.recording import journal_path
 from tupli_mcap.recording.lock import close_private, open_private
+from tupli_mcap.system import refused
 
-__all__ = ["Lock", "LockError", "fill", "locked", "os_errors", "write_bytes"]
+__all__ = ["Lock", "LockError", "fill", "locked", "os_errors", "refusals_told", "write_bytes"]
+
+_Class = TypeVar("_Class")
 
 
 def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
@@ -35,9 +41,9 @@ def fill(path: Path, *, replace: bool = False) -> Iterator[Path]:
     error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     fd, name = tempfile.mkstemp(prefix=".", suffix=".tmp", dir=path.parent)
-    os.close(fd)
     temporary = Path(name)
     try:
+        os.close(fd)
         yield temporary
         with temporary.open("rb+") as file:
             # mkstemp's files are private; a storage is shared the way its directory is.
@@ -48,17 +54,41 @@ def fill(path: Path, *, replace: bool = False) -> Iterator[Path]:
         else:
             os.link(temporary, path)
         _sync_directory(path.parent)
+    except RecordingError as err:  # nobody knows the file by its name for now
+        raise RecordingError(str(err).replace(name, str(path))) from err
     finally:
-        temporary.unlink(missing_ok=True)
+        for left in (temporary, journal_path(temporary)):
+            with contextlib.suppress(OSError):  # the file is written, or something else is said
+                left.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def os_errors(what: str, path: Path) -> Iterator[None]:
-    """Turns an OSError of the block into a StorageError: `<what> '<path>': <reason>`."""
+    """Turns an OSError of the block into a StorageError: `<what> '<path>': <reason>; <what to do>`."""
     try:
         yield
     except OSError as err:
-        raise StorageError(f"{what} {str(path)!r}: {err.strerror or err}") from err
+        raise StorageError(f"{what} {str(path)!r}: {refused(err)}") from err
+
+
+def refusals_told(cls: type[_Class]) -> type[_Class]:
+    """A class decorator: what the system refuses in a public method is a StorageError that names the file."""
+    for name, member in list(vars(cls).items()):
+        if inspect.isfunction(member) and not name.startswith("_"):
+            setattr(cls, name, _told(member))
+    return cls
+
+
+def _told(method: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(method)
+    def call(self: Any, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return method(self, *args, **kwargs)
+        except OSError as err:
+            place = self.root if err.filename is None else os.fsdecode(err.filename)
+            raise StorageError(f"{method.__name__} failed at {str(place)!r}: {refused(err)}") from err
+
+    return call
 
 
 class LockError(StorageError):
@@ -102,8 +132,7 @@ class Lock:
             self._fd = locked(self._path)
         except OSError as err:
             raise LockError(
-                f"cannot change the storage: its lock {str(self._path)!r} cannot be taken: "
-                f"{err.strerror or err}"
+                f"cannot change the storage: its lock {str(self._path)!r} cannot be taken: {refused(err)}"
             ) from err
 
     def __exit__(
@@ -114,7 +143,8 @@ class Lock:
         self._depth -= 1
         if self._depth == 0:
             fd, self._fd = self._fd, -1
-            close_private(fd)
+            with contextlib.suppress(OSError):  # nothing is ever written to it
+                close_private(fd)
         self._thread_lock.release()
 
 
@@ -139,9 +169,9 @@ def _umask() -> int:
 
 
 def _sync_directory(path: Path) -> None:
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        with contextlib.suppress(OSError):  # not every file system can
+    with contextlib.suppress(OSError):  # not every file system can
+        fd = os.open(path, os.O_RDONLY)
+        try:
             os.fsync(fd)
-    finally:
-        os.close(fd)
+        finally:
+            os.close(fd)

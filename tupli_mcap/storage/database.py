@@ -20,6 +20,7 @@ from tupli_mcap.recording.lock import close_private
 from tupli_mcap.storage.atomic import locked
 from tupli_mcap.storage.sqlite import register_functions
 from tupli_mcap.storage.tables import APPLICATION_ID, METADATA, VERSION
+from tupli_mcap.system import refused
 
 _BUSY_MS: Final = 30_000
 _CACHE_KIB: Final = 32 * 1024  # rows come in no order of a declared key: its index has to stay in memory
@@ -67,7 +68,7 @@ class Database:
         Raises:
             StorageError: The file cannot be opened or written.
         """
-        with self._lock, _translated(self.path):
+        with self._lock, _translated(self.path), _usable(self.path):
             self._open()
 
     def close(self) -> None:
@@ -78,7 +79,7 @@ class Database:
 
     def replace(self) -> None:
         """Put an empty catalog in the file's place."""
-        with self._lock, _translated(self.path), _exclusive(self.path):
+        with self._lock, _translated(self.path), _usable(self.path), _exclusive(self.path):
             self._create()
 
     @contextlib.contextmanager
@@ -114,7 +115,7 @@ class Database:
         if self._closed:
             raise StorageError(f"catalog {str(self.path)!r} is closed")
         self._leave_parent()
-        with self._lock:
+        with self._lock, _usable(self.path):
             if _identity(self.path) != self._identity:
                 self._engine.dispose()
                 self._open()
@@ -128,12 +129,6 @@ class Database:
             self._engine.dispose(close=False)
 
     def _open(self) -> None:
-        try:
-            self._open_or_create()
-        except OSError as err:
-            raise CatalogUnusableError(f"catalog {str(self.path)!r} cannot be used: {err}") from err
-
-    def _open_or_create(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if not _is_catalog(self._engine, self.path):
             with _exclusive(self.path):
@@ -157,10 +152,14 @@ class Database:
                 _create_tables(connection)
             with contextlib.closing(engine.raw_connection()) as raw:
                 raw.cursor().execute("PRAGMA journal_mode = WAL")
-        finally:
             engine.dispose()
-        _remove(self.path)
-        new.replace(self.path)
+            _remove(self.path)
+            new.replace(self.path)
+        except BaseException:
+            engine.dispose()
+            with contextlib.suppress(OSError):
+                _remove(new)
+            raise
         self._identity = _identity(self.path)
 
 
@@ -264,6 +263,15 @@ def _shared(lock: Path) -> Iterator[None]:
         yield
     finally:
         close_private(fd)
+
+
+@contextlib.contextmanager
+def _usable(path: Path) -> Iterator[None]:
+    """Errors of the system, where the file is opened, as the one after which another file is taken."""
+    try:
+        yield
+    except OSError as err:
+        raise CatalogUnusableError(f"catalog {str(path)!r} cannot be used: {refused(err)}") from err
 
 
 @contextlib.contextmanager

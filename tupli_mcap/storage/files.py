@@ -33,7 +33,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.storage import bundles
 from tupli_mcap.storage.artifacts import ArtifactFiles
-from tupli_mcap.storage.atomic import Lock, fill, os_errors, write_bytes
+from tupli_mcap.storage.atomic import Lock, fill, os_errors, refusals_told, write_bytes
 from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.common import first_defect
@@ -53,6 +53,7 @@ class _Settings(BaseModel):
     declared_keys: list[str] = []
 
 
+@refusals_told
 class FileStorage(TupliStorage):
     """A storage in the directory `root`, made if it is missing (`storage_base_dir` is PyTupli's name for it).
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
 import os
 import re
 import secrets
+import stat
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -137,7 +139,7 @@ class RecordingFiles:
         path = self._root / recording
         relative = Path(recording)
         inside = recording.endswith(".mcap") and not relative.is_absolute() and ".." not in relative.parts
-        if not inside or not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises for long names
+        if not inside or not _is_file(path):
             raise NotFoundError(f"there is no recording {recording[:200]!r} in {str(self._root)!r}")
         return path
 
@@ -263,6 +265,8 @@ class RecordingFiles:
         except FileNotFoundError:
             self._catalog.remove_recording(relative)
         except (FormatError, RecordingError, OSError) as err:
+            if _is_exhausted(err):
+                raise StorageError(f"cannot list the recordings below {str(self._root)!r}: {err}") from err
             self._catalog.remove_recording(relative)
             self._warn_once(relative, stamp, f"skipped a recording: {err}")
 
@@ -408,6 +412,22 @@ class RecordingFiles:
         groups = {number: sidecar.published_in[number] for number in kept if number in sidecar.published_in}
         Sidecar(published_in=groups).write(path)
         return before - path.stat().st_size
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except OSError as err:
+        if err.errno in (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP):
+            return False
+        raise
+
+
+def _is_exhausted(err: BaseException | None) -> bool:
+    """Whether the process has too many open files or no memory: no fault of the recording that met it."""
+    while err is not None and not isinstance(err, OSError):
+        err = err.__cause__
+    return err is not None and err.errno in (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 def episode_id(uuid: str, episode: int) -> str:
