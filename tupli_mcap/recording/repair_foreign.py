@@ -72,6 +72,7 @@ class _Copier:
         self._new_channels: dict[int, tuple[Channel, int]] = {}
         self._bad_chunk: Damage | None = None  # whose message indexes tell what was in it
         self._unknown: dict[int, int] = {}
+        self._unchecked = 0  # messages
         self.copied = Copied()
 
     def run(self) -> None:
@@ -90,6 +91,9 @@ class _Copier:
         for channel, count in self._unknown.items():
             self.copied.lost[f"channel {channel}"] = count
             self.copied.notes.append(f"{count} messages of channel {channel} are lost with its definition")
+        if self._unchecked:
+            why = f"{self._unchecked} messages have no CRC: damage within them is copied with them"
+            self.copied.notes.append(why)
         self._writer.finish()  # type: ignore[no-untyped-call]
 
     def _start(self, profile: str, library: str) -> None:
@@ -117,8 +121,8 @@ class _Copier:
             self._take_attachment(found)
         elif found.opcode == Opcode.MESSAGE_INDEX:
             self._take_index(found)
-        else:
-            self._record(found.opcode, found.body, found.offset)
+        elif self._record(found.opcode, found.body, found.offset):
+            self._unchecked += found.opcode == Opcode.MESSAGE
 
     def _take_index(self, found: Found) -> None:
         if self._bad_chunk is not None:
@@ -129,7 +133,14 @@ class _Copier:
     def _take_chunk(self, found: Found, chunk: Chunk) -> None:
         if found.repaired:
             self.copied.damages.append(Damage(found.offset, found.offset + 49, found.repaired, -1))
-        position, data = 0, chunk.data
+        before = self.copied.messages
+        try:
+            self._records(found, chunk.data)
+        finally:
+            self._unchecked += 0 if chunk.crc else self.copied.messages - before
+
+    def _records(self, found: Found, data: memoryview) -> None:
+        position = 0
         while position < len(data):
             opcode, length = (0, 0) if position + 9 > len(data) else _RECORD.unpack_from(data, position)
             end = position + 9 + length
