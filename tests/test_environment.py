@@ -425,6 +425,70 @@ def test_a_pickle_of_something_else_is_refused() -> None:
         build(EnvironmentRecord("x", pickle=b"nonsense"), trust=True)
 
 
+def test_one_flipped_byte_of_an_environment_ends_its_trust() -> None:
+    record = capture(Counter())
+    trust.trust(record.digest)
+    build(record)
+    pickled = record.pickle or b""
+    for i in range(0, len(pickled), 11):
+        changed = bytearray(pickled)
+        changed[i] ^= 1
+        with pytest.raises(UntrustedError):
+            build(dataclasses.replace(record, pickle=bytes(changed)))
+
+
+def test_all_that_a_spec_says_is_in_its_digest() -> None:
+    """Every change of what decides which code runs, and with which arguments, is another environment."""
+    wrapper = {"name": "T", "entry_point": "evil:Wrapper", "kwargs": {"a": [1, {"b": "c"}]}}
+    spec = {"id": "Evil-v0", "entry_point": "evil:Env", "kwargs": {"x": 1}, "additional_wrappers": [wrapper]}
+    trust.trust(EnvironmentRecord("x", spec=spec).digest)
+    changes: list[dict[str, Any]] = [
+        {"id": "Evil-v1"},
+        {"entry_point": "evil:Other"},
+        {"entry_point": None},
+        {"vector_entry_point": "evil:Env"},
+        {"kwargs": {"x": 2}},
+        {"kwargs": {"x": 1.5}},
+        {"kwargs": {"x": "1"}},
+        {"kwargs": {"x": 1, "y": None}},
+        {"kwargs": {}},
+        {"max_episode_steps": 3},
+        {"additional_wrappers": []},
+        {"additional_wrappers": [wrapper, wrapper]},
+        {"additional_wrappers": [{**wrapper, "name": "U"}]},
+        {"additional_wrappers": [{**wrapper, "entry_point": "evil:Wrapper2"}]},
+        {"additional_wrappers": [{**wrapper, "kwargs": {"a": [1, {"b": "d"}]}}]},
+        {"new_field": 1},
+    ]
+    for change in changes:
+        changed = EnvironmentRecord("x", spec={**spec, **change})
+        assert not trust.is_trusted(changed.digest), change
+        with pytest.raises(UntrustedError):
+            build(changed)
+    assert trust.is_trusted(
+        EnvironmentRecord("y", spec=spec, versions={"python": "2"}).digest
+    )  # claims for people
+
+
+def test_own_environments_with_telling_arguments_are_signed(tmp_path: Path) -> None:
+    from tupli_mcap import RecordEpisodes, Recording
+
+    gym.register("TupliTold-v0", entry_point="gymnasium.envs.toy_text.frozen_lake:FrozenLakeEnv")
+    try:
+        env = gym.make("TupliTold-v0", desc=["SF.", "FFG"])
+        with RecordEpisodes(env, tmp_path / "a.mcap") as recorded:
+            recorded.reset(seed=0)
+            recorded.step(0)
+        with Recording(tmp_path / "a.mcap") as recording:
+            assert recording.benchmark.record.spec is not None
+            recording.benchmark.make_env()
+            trust.untrust(recording.benchmark.record.digest)
+            with pytest.raises(UntrustedError, match="may name a file or code"):
+                recording.benchmark.make_env()
+    finally:
+        del gym.registry["TupliTold-v0"]
+
+
 # --- benchmark.json ---
 
 

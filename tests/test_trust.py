@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 import stat
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -107,3 +111,138 @@ def test_many_processes_share_one_key() -> None:
         process.join()
         assert process.exitcode == 0
     assert len(trust.trusted_digests()) == 20
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file modes are POSIX's")
+def test_a_directory_open_to_others_is_refused_or_closed(config: Path) -> None:
+    config.mkdir(mode=0o777)
+    config.chmod(0o777)
+    with pytest.raises(
+        TupliError, match=r"must be writable by you alone: found mode 0777 .* chmod it to 0700"
+    ):
+        trust.trust(DIGEST)
+    config.chmod(0o755)  # others may look: what is in it is private
+    (config / "trusted").mkdir()
+    (config / "trusted").chmod(0o777)
+    trust.trust(DIGEST)
+    assert stat.S_IMODE((config / "trusted").stat().st_mode) == 0o700
+    config.chmod(0o770)
+    with pytest.raises(TupliError, match="must be writable by you alone"):
+        trust.is_trusted(DIGEST)
+
+
+def test_a_linked_key_is_refused(config: Path, tmp_path: Path) -> None:
+    """It could lead to a file whose 32 bytes somebody else knows."""
+    trust.trust(DIGEST)
+    (config / "key").rename(tmp_path / "elsewhere")
+    (config / "key").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(TupliError, match="the key .* cannot be read"):
+        trust.is_trusted(DIGEST)
+
+
+def test_a_copied_directory_trusts_the_same(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trust.trust(DIGEST)
+    trust.trust_key(OTHER, "alice")
+    shutil.copytree(config, tmp_path / "copy")
+    monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "copy"))
+    assert trust.trusted_digests() == [DIGEST]
+    assert trust.trusted_keys() == [(OTHER, "alice")]
+    (tmp_path / "copy/key").write_bytes(os.urandom(32))  # signatures without the key they were made with
+    assert trust.trusted_digests() == [] == trust.trusted_keys()
+
+
+def test_every_flipped_bit_of_a_signature_revokes_it(config: Path) -> None:
+    trust.trust(DIGEST)
+    trust.trust_key(OTHER, "alice")
+    trust.vouch("1b" * 32, OTHER)
+    for path in (
+        config / "trusted" / DIGEST,
+        config / "keys" / OTHER,
+        config / "vouched" / f"{'1b' * 32}.{OTHER}",
+    ):
+        good = path.read_bytes()
+        for i in range(0, 8 * len(good), 7):
+            changed = bytearray(good)
+            changed[i // 8] ^= 1 << i % 8
+            path.write_bytes(changed)
+            assert not (trust.is_trusted(DIGEST) and trust.trusted_keys() and trust.is_trusted("1b" * 32)), i
+        path.write_bytes(good)
+    assert trust.trusted_digests() == [DIGEST, "1b" * 32]
+
+
+def test_signatures_of_one_kind_are_none_of_another(config: Path) -> None:
+    """A file that is moved to another place says nothing there."""
+    trust.trust(DIGEST)
+    trust.trust_key(OTHER, "")
+    trust.vouch(DIGEST, OTHER)
+    texts = [
+        path.read_bytes()
+        for directory in ("trusted", "keys", "vouched")
+        for path in (config / directory).iterdir()
+    ]
+    places = [f"trusted/{OTHER}", f"keys/{DIGEST}", f"vouched/{OTHER}.{DIGEST}", f"vouched/{OTHER}.{OTHER}"]
+    for place in places:
+        for text in texts:
+            (config / place).write_bytes(text)
+            assert not trust.is_trusted(OTHER)
+            assert trust.trusted_keys() == [(OTHER, "")]
+
+
+def test_keys_vouch_for_as_long_as_they_are_trusted(config: Path) -> None:
+    trust.vouch(DIGEST, OTHER)
+    assert not trust.is_trusted(DIGEST)
+    trust.trust_key(OTHER, " Alice \n of the lab ")
+    assert trust.trusted_keys() == [(OTHER, "Alice of the lab")]
+    assert trust.is_trusted(DIGEST)
+    assert trust.untrust(DIGEST)
+    assert not trust.is_trusted(DIGEST)
+    trust.vouch(DIGEST, OTHER)
+    assert trust.untrust_key(OTHER)
+    assert not trust.untrust_key(OTHER)
+    trust.trust_key(OTHER, "alice")
+    assert not trust.is_trusted(DIGEST)
+
+
+_CHURN = """
+import sys
+from tupli_mcap import trust
+number = int(sys.argv[1])
+mine, shared, key = f"{number:064x}", "5c" * 32, f"{1000 + number:064x}"
+print("ready", flush=True)
+while True:
+    trust.trust(mine); trust.trust(shared); trust.trust_key(key, "k"); trust.vouch(mine, key)
+    assert trust.is_trusted(mine)
+    trust.untrust(shared); trust.untrust_key(key)
+    assert trust.is_trusted(mine)
+    trust.trusted_digests()
+"""
+
+
+def test_killed_and_crowding_processes_leave_a_sound_store(config: Path) -> None:
+    """Eight processes make the key at once, sign and forget; they are killed one after another."""
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", _CHURN, str(i)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        for i in range(8)
+    ]
+    try:
+        for process in processes:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+        time.sleep(0.3)
+        for process in processes:
+            time.sleep(0.05)
+            assert process.poll() is None, process.stderr and process.stderr.read()
+            process.kill()
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+    assert trust.trusted_digests()
+    assert set(trust.trusted_digests()) <= {*(f"{i:064x}" for i in range(8)), "5c" * 32}
+    trust.trust(DIGEST)
+    assert trust.is_trusted(DIGEST)
+    assert len((config / "key").read_bytes()) == 32
