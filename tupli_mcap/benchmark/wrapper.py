@@ -184,6 +184,15 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         finally:
             super().close()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy, in this process or another one, records to a file of its own."""
+        if self._recorder is not None:
+            raise RecordingError(
+                f"a wrapper that records to {self._path} cannot be pickled or copied; close() it first, or call "
+                "deactivate_recording()"
+            )
+        return {**self.__dict__, "_path": None}
+
     def _open(self) -> RecordEpisodes:
         if self.id is None:
             raise StorageError("this environment is not stored yet: call store(name=...) first")

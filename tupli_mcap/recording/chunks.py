@@ -6,6 +6,7 @@ rows' own headers must agree with the chunk table.
 
 from __future__ import annotations
 
+import os
 import struct
 import threading
 import zlib
@@ -58,6 +59,7 @@ class ChunkStore:
         self._cache: OrderedDict[int, Any] = OrderedDict()
         self._cached = 0
         self._lock = threading.Lock()
+        self._process = os.getpid()
         self._offsets: dict[int, list[tuple[int, int]]] = {}
         self._views: dict[int, np.ndarray[Any, Any]] = {}  # of cached chunks, their headers checked
         self._by_channel: dict[int, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
@@ -106,6 +108,8 @@ class ChunkStore:
 
     def load(self, i: int, *, keep: bool = True) -> Any:
         """The message records of chunk `i`; cached unless `keep` is False."""
+        if self._process != os.getpid():  # forked: the lock may be held by a thread that is not here
+            self._lock, self._process = threading.Lock(), os.getpid()
         with self._lock:
             if i in self._cache:
                 self._cache.move_to_end(i)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, BinaryIO, NamedTuple
@@ -86,6 +86,8 @@ class Recording:
 
     def __init__(self, source: str | os.PathLike[str] | BinaryIO, *, cache_bytes: int = CACHE_BYTES) -> None:
         self._source = open_source(source)
+        self._reopen = None if not isinstance(source, str | os.PathLike) else _absolute(source)
+        self._cache_bytes = cache_bytes
         self.name = self._source.name
         self.path: Path | None = self._source.path
         try:
@@ -421,6 +423,14 @@ class Recording:
         """Closes the file; what was read stays valid."""
         self._source.close()
 
+    def __reduce__(self) -> tuple[Callable[..., Recording], tuple[str, str, int]]:
+        """A copy in another process opens the file itself."""
+        if self._reopen is None:
+            raise RecordingError(
+                f"{self.name} was opened as a file object, which cannot be copied; give its path"
+            )
+        return _opened_again, (self._reopen, self.uuid, self._cache_bytes)
+
     def __enter__(self) -> Recording:
         return self
 
@@ -437,3 +447,18 @@ class Recording:
 
 def _spaces_of(channel: Channel) -> dict[str, str]:
     return {key: value for key, value in channel.metadata.items() if key not in ("env", "crc")}
+
+
+def _absolute(source: str | os.PathLike[str]) -> str:
+    name = os.fspath(source)
+    return name if "://" in name else os.path.abspath(name)  # noqa: PTH100 - links stay
+
+
+def _opened_again(source: str, uuid: str, cache_bytes: int) -> Recording:
+    recording = Recording(source, cache_bytes=cache_bytes)
+    if recording.uuid != uuid:
+        recording.close()
+        raise RecordingError(
+            f"{source} is another recording by now (expected {uuid}, found {recording.uuid})"
+        )
+    return recording

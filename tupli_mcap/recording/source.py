@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import stat
 import threading
@@ -124,6 +125,9 @@ class FileSource:
         self._file = file
         self._owned = owned
         self._lock = threading.Lock()
+        self._process = os.getpid()
+        # a system file is read at a place, not at its cursor, which forked children share
+        self._fd = file.fileno() if _is_system_file(file) else -1
         try:
             self.size = file.seek(0, os.SEEK_END)
         except (OSError, ValueError, AttributeError) as err:
@@ -134,13 +138,19 @@ class FileSource:
             raise FormatError(
                 f"{self.name}: expected {length} bytes at offset {offset}, found the end at {self.size}"
             )
-        with self._lock:
+        if self._process != os.getpid() and self._fd < 0:
+            raise RecordingError(
+                f"{self.name} was opened by the process that this one was forked from; open it again here"
+            )
+        with self._lock if self._fd < 0 else contextlib.nullcontext():
             data = _refusals_told(self.name, offset, length, lambda: self._read(offset, length))
         if len(data) != length:
             raise FormatError(f"{self.name}: expected {length} bytes at offset {offset}, found {len(data)}")
         return data
 
     def _read(self, offset: int, length: int) -> bytes:
+        if self._fd >= 0 and not self._file.closed:
+            return os.pread(self._fd, length, offset)
         self._file.seek(offset)
         return self._file.read(length)
 
@@ -151,6 +161,11 @@ class FileSource:
     def close(self) -> None:
         if self._owned:
             self._file.close()
+
+
+def _is_system_file(file: BinaryIO) -> bool:
+    raw = file.raw if type(file) is io.BufferedReader else file
+    return type(raw) is io.FileIO and not file.closed
 
 
 def _refusals_told(name: str, offset: int, length: int, read: Callable[[], bytes]) -> bytes:

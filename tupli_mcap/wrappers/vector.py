@@ -224,7 +224,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         self.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        raise RecordingError(f"a wrapper that records to {self.path} cannot be pickled or copied")
+        raise RecordingError(f"a wrapper that records to {self.path} cannot be pickled or copied; wrap there")
 
 
 def _autoreset(env: Any, given: str | None) -> Any:
