@@ -6,7 +6,11 @@ A seeded sample of what `tools/faults.py` runs in full.
 from __future__ import annotations
 
 import errno
+import os
 import random
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,16 @@ from faulty_recordings import WORKLOADS, Case, calls_of, cases, run_case
 from faulty_storages import OPERATIONS, Lab, run_storage_case, run_trust_case, template
 from gymnasium import spaces
 
-from tupli_mcap import FileStorage, RecordEpisodes, Recording, RecordingError, StorageError
+from tupli_mcap import (
+    FileStorage,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    StorageError,
+    TupliDataset,
+    TupliEnvWrapper,
+    TupliError,
+)
 
 BOX = spaces.Box(-1, 1, (3,), np.float32)
 
@@ -188,3 +201,167 @@ def test_too_many_open_files_are_no_missing_recordings(tmp_path: Path) -> None:
         storage.list_episodes()
     assert len(storage.list_episodes()) == 3
     storage.close()
+
+
+@pytest.mark.parametrize(
+    ("use", "message"),
+    [
+        (lambda d: FileStorage(d).open_recording(None), "expected the recording of an episode header"),
+        (lambda d: FileStorage(d / "a\0b"), "cannot make the storage .*choose another path"),
+        (lambda d: TupliEnvWrapper(sampler(), "lab"), "storage: expected a TupliStorage"),
+        (lambda d: TupliDataset.from_files(None), "expected paths of recordings"),
+        (
+            lambda d: RecordEpisodes(sampler(), d / "r.mcap", record_info=5),
+            "record_info: expected True, False",
+        ),
+        (lambda d: RecordEpisodes(sampler(), "file:///tmp/r.mcap"), "expected a local path to record to"),
+    ],
+)
+def test_wrong_arguments_are_said(tmp_path: Path, use: Any, message: str) -> None:
+    with pytest.raises(TupliError, match=message):
+        use(tmp_path)
+
+
+REAL = """
+import os, resource, sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import gymnasium as gym, numpy as np
+from environments import Sampler, roll, same
+from gymnasium import spaces
+from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliError
+root = Path(sys.argv[1])
+space = spaces.Box(-1, 1, (20,), np.float32)
+taken = []
+def rollout(path, steps, **options):
+    env = RecordEpisodes(Sampler(space, spaces.Discrete(3), length=50), path, attachments={{}}, **options)
+    try:
+        env.reset(seed=1)
+        for i in range(steps):
+            if i == {trouble_at}:
+                {trouble}
+            result = env.step(i % 3)
+            taken.append(result[0].copy())
+            if result[2] or result[3]:
+                env.reset()
+    finally:
+        env.close()
+{body}
+"""
+
+CHECK = """
+else:
+    raise SystemExit("no error")
+{after}
+with Recording(path) as recording:
+    found = [state for e in recording.episodes for state in e.next_states]
+assert 0 <= len(found) - len(taken) <= 1, (len(found), len(taken))
+assert all(same(a, b) for a, b in zip(found, taken))
+print(len(taken), message)
+"""
+
+FAIL = """
+path = root / "r.mcap"
+try:
+    rollout(path, {steps}, {options})
+except TupliError as err:
+    message = str(err)
+"""
+
+
+def _real(tmp_path: Path, before: str, body: str, *, trouble_at: int = -1, trouble: str = "pass") -> str:
+    """Runs a rollout in a process with file systems of its own; what it printed."""
+    script = tmp_path / "child.py"
+    tests = str(Path(__file__).parent)
+    script.write_text(REAL.format(tests=tests, trouble_at=trouble_at, trouble=trouble, body=body))
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    unshare = ["unshare", "-m"] if os.geteuid() == 0 else ["unshare", "-rm"]
+    command = f"set -e; {before.format(disk=disk)}; exec {sys.executable} {script} {disk}"
+    try:
+        probe = f"mount -t tmpfs none {disk}"
+        subprocess.run([*unshare, "sh", "-c", probe], check=True, capture_output=True, timeout=30)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("mounting a file system is not permitted here")
+    child = subprocess.run([*unshare, "sh", "-c", command], capture_output=True, text=True, timeout=120)
+    assert child.returncode == 0, child.stderr
+    return child.stdout
+
+
+def test_a_disk_that_is_full_at_the_first_step(tmp_path: Path) -> None:
+    body = FAIL.format(steps=5, options="") + 'else:\n    raise SystemExit("no error")\nprint(message)\n'
+    body += "assert not list(root.iterdir())\nrollout(Path('/dev/shm') / f'{os.getpid()}.mcap', 5)\n"
+    body += "os.unlink(f'/dev/shm/{os.getpid()}.mcap')\n"
+    said = _real(tmp_path, "mount -t tmpfs -o size=256k none {disk}", body)
+    assert "could not make the journal of" in said
+    assert "No space left on device; free some space there, or choose another disk" in said
+
+
+def test_a_disk_that_fills_up(tmp_path: Path) -> None:
+    options = 'chunk_size=20_000, compression="none"'
+    body = FAIL.format(steps=100_000, options=options) + CHECK.format(after="")
+    said = _real(tmp_path, "mount -t tmpfs -o size=1m none {disk}", body)
+    assert int(said.split()[0]) > 1000
+    assert "r.mcap: could not write " in said
+    assert "No space left on device; free some space there" in said
+
+
+def test_a_disk_that_becomes_read_only(tmp_path: Path) -> None:
+    """Emergency read-only: ext4 as after an error of the disk."""
+    image = tmp_path / "image"
+    if shutil.which("mkfs.ext4") is None or os.geteuid() != 0:
+        pytest.skip("needs root and mkfs.ext4 for a loop-back file system")
+    before = f"truncate -s 16M {image}; mkfs.ext4 -q {image}; mount -o loop {image} {{disk}}"
+    options = 'chunk_size=20_000, compression="none"'
+    body = FAIL.format(steps=3000, options=options) + CHECK.format(after="")
+    trouble = "os.system(f'mount -o remount,abort,errors=remount-ro {root} 2>/dev/null')"
+    try:
+        said = _real(tmp_path, before, body, trouble_at=900, trouble=trouble)
+    except AssertionError as err:
+        if "mount" in str(err):
+            pytest.skip("loop-back file systems are not permitted here")
+        raise
+    assert int(said.split()[0]) >= 900
+    assert "r.mcap" in said
+
+
+def test_the_size_of_files_is_limited(tmp_path: Path) -> None:
+    options = 'chunk_size=20_000, compression="none"'
+    body = FAIL.format(steps=100_000, options=options) + CHECK.format(after="")
+    trouble = "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))"
+    said = _real(tmp_path, "true", body, trouble_at=10, trouble=trouble)
+    assert "File too large; raise the limit (ulimit -f)" in said
+
+
+def test_all_descriptors_are_taken(tmp_path: Path) -> None:
+    body = """
+rollout(root / "lab" / "a.mcap", 3) if (root / "lab").mkdir() is None else None
+for i in range(40):
+    (root / "lab" / f"{i}.mcap").write_bytes((root / "lab" / "a.mcap").read_bytes())
+storage = FileStorage(root / "lab")
+resource.setrlimit(resource.RLIMIT_NOFILE, (200, 200))
+held = []
+try:
+    while True:
+        held.append(os.open("/dev/null", os.O_RDONLY))
+except OSError:
+    pass
+for use in (
+    lambda: rollout(root / "r.mcap", 3),
+    lambda: Recording(root / "lab" / "a.mcap"),
+    lambda: FileStorage(root / "lab").list_episodes(),
+):
+    try:
+        use()
+    except TupliError as err:
+        print(err)
+    else:
+        raise SystemExit("no error")
+for fd in held:
+    os.close(fd)
+rollout(root / "r.mcap", 3)
+assert len(storage.list_episodes()) == 1
+"""
+    said = _real(tmp_path, "true", body).splitlines()
+    assert len(said) == 3
+    assert all("Too many open files" in line or "unable to open database file" in line for line in said), said

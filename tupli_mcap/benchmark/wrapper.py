@@ -86,6 +86,10 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
                 f"expected recording options among {', '.join(_RECORDING_OPTIONS)}, "
                 f"found {', '.join(sorted(unknown))}"
             )
+        if not isinstance(storage, TupliStorage):
+            raise StorageError(
+                f"storage: expected a TupliStorage, such as FileStorage('lab'), found {storage!r:.80}"
+            )
         self._recording_options = recording_options
         self.storage = storage
         self.id = benchmark_id

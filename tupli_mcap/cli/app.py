@@ -72,7 +72,7 @@ def _report(err: BaseException) -> int:
         # The reader of our output has seen enough. Nothing may be written to it at exit either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return FAILED
-    if isinstance(err, _InterruptedError):
+    if isinstance(err, _InterruptedError | KeyboardInterrupt):
         message = "interrupted"
     elif isinstance(err, FilterError):
         code = USAGE  # filters come from the command line only

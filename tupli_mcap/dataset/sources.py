@@ -106,6 +106,10 @@ class FilesSource:
     """
 
     def __init__(self, files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> None:
+        if not isinstance(files, str | os.PathLike | Iterable):
+            raise RecordingError(
+                f"expected paths of recordings, a pattern or a URL, found {files!r:.80}; give some"
+            )
         given = [files] if isinstance(files, str | os.PathLike) else list(files)
         names = [name for item in given for name in _expand(item)]
         if not names:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.leaves import NameRegistry
 from tupli_mcap.recording.events import read_strings
@@ -33,6 +33,13 @@ class InfoRecorder:
     def __init__(self, select: RecordInfo) -> None:
         if isinstance(select, str):
             select = [select]
+        if not isinstance(select, bool) and not callable(select) and isinstance(select, Iterable):
+            select = list(select)
+        named = isinstance(select, list) and all(isinstance(name, str) for name in select)
+        if not (isinstance(select, bool) or callable(select) or named):
+            raise RecordingError(
+                f"record_info: expected True, False, a list of names or a function, found {select!r:.80}"
+            )
         self._names = [] if isinstance(select, bool) or callable(select) else list(dict.fromkeys(select))
         self._select = select
         registry = NameRegistry(("episode", "step", "json"))

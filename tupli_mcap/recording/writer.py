@@ -77,7 +77,7 @@ class RecordingWriter:
         self.path = Path(path)
         # the process may change its directory before the journal is made
         self._place = Path(os.path.realpath(path))
-        self.options = options = _checked(options)
+        self.options = options = _checked(path, options)
         self.closed = False
         self.failed: RecordingError | None = None
         self._broken_off = False
@@ -487,18 +487,22 @@ class RecordingWriter:
             if self._durable:  # before the journal goes
                 sync_file(self.lock.fd, str(self.path))
                 sync_directory(self._place.parent)
-        except BaseException:
-            if self.journal is not None:
-                self.journal.close(unlink=False)
-            raise
-        else:
             if self.journal is not None:
                 self.journal.close(unlink=True)
             elif self._old_journal is not None:
                 self._remove_old_journal(self._old_journal)
+        except BaseException as err:
+            if self.journal is not None:
+                self.journal.close(unlink=False)
+            self._broken_off = not isinstance(err, RecordingError)
+            raise
         finally:
-            self.worker.close()
-            self.lock.release()
+            try:
+                self.worker.close()
+            finally:
+                self.lock.release()
+            if self._broken_off:  # by Ctrl-C: the file is finished all the same
+                self._finish_broken_off()
 
     def _remove_old_journal(self, place: Path) -> None:
         """What a killed writer left of its journal, and of one that was not in its place yet."""
@@ -561,8 +565,12 @@ class _Whole:
             self._writer.stop(err)
 
 
-def _checked(options: WriterOptions) -> WriterOptions:
+def _checked(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:
     """The options, with a place for the journal that does not depend on the process's directory."""
+    if "://" in os.fspath(path):
+        raise RecordingError(
+            f"{path}: expected a local path to record to, found a URL; record to a path, and copy the file"
+        )
     if options.chunk_size < 1:
         raise RecordingError(f"chunk_size: expected at least 1 byte, found {options.chunk_size!r}")
     check_durability(options.durability)

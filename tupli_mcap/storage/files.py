@@ -72,8 +72,13 @@ class FileStorage(TupliStorage):
     ) -> None:
         # Absolute: the working directory may change while something is recorded.
         self.root = Path(root if storage_base_dir is None else storage_base_dir).absolute()
-        with os_errors("cannot make the storage", self.root):
-            self.root.mkdir(parents=True, exist_ok=True)
+        try:
+            with os_errors("cannot make the storage", self.root):
+                self.root.mkdir(parents=True, exist_ok=True)
+        except ValueError as err:  # a NUL in it
+            raise StorageError(
+                f"cannot make the storage {str(self.root)!r}: {err}; choose another path"
+            ) from err
         self._lock = Lock(self.root / ".lock")
         self.import_lock = Lock(self.root / ".import.lock")  # two imports of one file would copy it twice
         self._benchmarks = BenchmarkFiles(self.root / "benchmarks", self._lock)

@@ -136,6 +136,10 @@ class RecordingFiles:
         Raises:
             NotFoundError: It is not one, or not below the root.
         """
+        if not isinstance(recording, str):
+            raise NotFoundError(
+                f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
+            )
         path = self._root / recording
         relative = Path(recording)
         inside = recording.endswith(".mcap") and not relative.is_absolute() and ".." not in relative.parts
@@ -162,7 +166,10 @@ class RecordingFiles:
         if os.access(self._root, os.W_OK):  # else a storage that can only be read, as its owner wants it
             warnings.warn(f"{err}; the episodes are listed with a temporary one, made anew", stacklevel=7)
         self.close()
-        self._opened = Catalog(None)
+        try:
+            self._opened = Catalog(None)
+        except (OSError, StorageError):
+            raise err from None  # there is no place for another one either
         self._declare_all(self._opened)
         return self._opened
 
