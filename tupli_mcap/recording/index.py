@@ -132,6 +132,9 @@ class EpisodeIndex(NamedTuple):
         texts, at = _decompress(data, at, metadata, where)
         if rows and (np.frombuffer(rows, EPISODE_ROWS)["end"] > 2).any():
             raise FormatError(f"{where}: the episode index names ends that do not exist")
+        found = np.frombuffer(rows, EPISODE_ROWS)
+        if int(found["metadata_length"].sum(dtype=np.uint64)) > len(texts):
+            raise FormatError(f"{where}: the episode index claims more metadata than its {len(texts)} bytes")
         if at != len(data):
             raise FormatError(f"{where}: expected an episode index of {at} bytes, found {len(data)}")
         return cls(np.frombuffer(rows, EPISODE_ROWS), np.frombuffer(table, CHUNK_ROWS), texts)

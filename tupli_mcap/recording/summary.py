@@ -99,16 +99,21 @@ def read_summary(source: Source) -> Summary:
         raise FormatError(f"{source.name}: the summary at offset {start} is damaged (its CRC differs)")
     summary = Summary({}, {}, {}, {}, 0, start)
     chunks = 0
+    topics: dict[str, int] = {}
     for opcode, position, body in records(data, start, source.name):
         if opcode == Opcode.CHUNK_INDEX:
             chunks += 1
             continue
         if opcode == Opcode.SCHEMA:
             schema: Schema = parse_record(opcode, body, position, source.name)
-            summary.schemas[schema.id] = schema
+            _once(summary.schemas, schema.id, schema, f"schema {schema.id}", source.name)
         elif opcode == Opcode.CHANNEL:
             channel: Channel = parse_record(opcode, body, position, source.name)
-            summary.channels[channel.id] = channel
+            _once(summary.channels, channel.id, channel, f"channel {channel.id}", source.name)
+            if topics.setdefault(channel.topic, channel.id) != channel.id:
+                raise FormatError(
+                    f"{source.name}: expected each topic once, found {channel.topic!r:.80} twice"
+                )
         elif opcode == Opcode.ATTACHMENT_INDEX:
             attachment: AttachmentIndex = parse_record(opcode, body, position, source.name)
             summary.attachments[attachment.name] = attachment
@@ -116,6 +121,12 @@ def read_summary(source: Source) -> Summary:
             metadata: MetadataIndex = parse_record(opcode, body, position, source.name)
             summary.metadata[metadata.name] = metadata
     return summary._replace(chunks=chunks)
+
+
+def _once(found: dict[int, Any], number: int, value: Any, what: str, name: str) -> None:
+    """Keeps a definition; FormatError where there is another one of that number."""
+    if found.setdefault(number, value) != value:
+        raise FormatError(f"{name}: expected {what} once in the summary, found another one")
 
 
 def records(data: bytes | memoryview, base: int, name: str) -> Iterator[tuple[int, int, memoryview]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,8 +39,9 @@ def scan(root: Path) -> Iterator[FoundRecording]:
                     if entry.is_file():
                         journal = journal_path(name).name in found
                         yield FoundRecording(prefix + name, _stamp(entry, found), journal)
-                except FileNotFoundError:
-                    continue
+                except OSError as err:
+                    if err.errno not in (errno.ENOENT, errno.ELOOP):  # deleted since, or a link in a circle
+                        raise
             elif entry.is_dir(follow_symlinks=False):
                 pending.append((entry.path, f"{prefix}{name}/"))
 

@@ -1,0 +1,427 @@
+"""Files that lie about sizes, counts and places: refused by one error, in little memory and in linear time."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+
+from fuzzing.crafted import checksum
+from fuzzing.model import ATTACHMENT, CHANNEL, SCHEMA, Model, Part, load_seeds, record, strings
+from fuzzing.oracle import observe
+
+from tupli_mcap.cli.app import app
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.compression import decompress
+from tupli_mcap.recording.journal import read_journal
+from tupli_mcap.storage import FileStorage
+from tupli_mcap.storage.listing import list_recordings
+
+SEEDS = {seed.name: seed for seed in load_seeds()}
+CAP, MULTIPLE = 64 << 20, 40  # bytes to open and list a file: as schemas/README.md has it
+BIG = 2**64 - 1
+
+
+def model(name: str = "constant_none") -> Model:
+    return Model.of(SEEDS[name].data)
+
+
+def with_episode(**fields: int) -> bytes:
+    file = model()
+    assert file.index is not None
+    for name, value in fields.items():
+        file.index.episodes[name][0] = value
+    return file.encode()
+
+
+def with_chunk(change: Callable[[np.ndarray[Any, Any]], Any]) -> bytes:
+    file = model()
+    assert file.index is not None
+
+    def changed(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        found = change(rows)
+        return rows if found is None else found
+
+    file.index.change_chunks = changed
+    return file.encode()
+
+
+def setting(name: str, value: int) -> Callable[[np.ndarray[Any, Any]], None]:
+    def change(rows: np.ndarray[Any, Any]) -> None:
+        rows[name][0] = value
+
+    return change
+
+
+def on_the_first(name: str) -> Callable[[np.ndarray[Any, Any]], None]:
+    def change(rows: np.ndarray[Any, Any]) -> None:
+        rows[name][1] = rows[name][0]
+
+    return change
+
+
+def with_claim(place: int) -> bytes:
+    file = model()
+    assert file.index is not None
+    file.index.claims[place] = 1 << 59
+    return file.encode()
+
+
+def with_space(space: Any) -> bytes:
+    """Whose step channel and final states describe this space, with right checksums."""
+    file = model()
+    text = space if isinstance(space, bytes) else json.dumps(space).encode()
+    for opcode, body in list(file.summary):
+        if opcode != CHANNEL or b"observation_space" not in body:
+            continue
+        at, texts = 4, []
+        for _ in range(2):
+            at += 4 + int.from_bytes(body[at : at + 4], "little")
+        head, at = body[:at], at + 4
+        while at < len(body):
+            size = int.from_bytes(body[at : at + 4], "little")
+            texts.append(body[at + 4 : at + 4 + size])
+            at += 4 + size
+        pairs = dict(zip(texts[::2], texts[1::2], strict=True)) | {b"observation_space": text}
+        pairs[b"crc"] = b"%08x" % checksum(pairs)
+        data = strings(*[one for pair in pairs.items() for one in pair])
+        new = head + len(data).to_bytes(4, "little") + data
+        file.summary = [(kind, new if old == body else old) for kind, old in file.summary]
+    return file.encode()
+
+
+def box(**fields: Any) -> dict[str, Any]:
+    return {"type": "Box", "dtype": "float32", "shape": [4], "low": 0.0, "high": 1.0, **fields}
+
+
+def nested(depth: int, stack: bool = False) -> dict[str, Any]:
+    space = box(shape=[2**20] if stack else [1])
+    for _ in range(depth):
+        space = (
+            {"type": "Sequence", "stack": True, "space": space}
+            if stack
+            else {"type": "Tuple", "spaces": [space]}
+        )
+    return space
+
+
+def with_summary(opcode: int, times: int, change: Callable[[int, bytes], bytes]) -> bytes:
+    """Records behind the first one of a kind in the summary."""
+    file = model()
+    at = next(i for i, (kind, _) in enumerate(file.summary) if kind == opcode)
+    body = file.summary[at][1]
+    file.summary[at + 1 : at + 1] = [(opcode, change(i, body)) for i in range(times)]
+    return file.encode()
+
+
+def attached(name: bytes, times: int = 1, claim: int = 1) -> bytes:
+    file = model()
+    body = bytes(16) + strings(name, b"text/plain") + struct.pack("<Q", claim) + b"x" + bytes(4)
+    file.parts[2:2] = [Part(ATTACHMENT, body)] * times
+    return file.encode()
+
+
+def with_texts(text: bytes) -> bytes:
+    """The metadata of the first episode, and of no other."""
+    file = model()
+    assert file.index is not None
+    file.index.texts = text
+    file.index.episodes["metadata_offset"] = file.index.episodes["metadata_length"] = 0
+    file.index.episodes["metadata_length"][0] = len(text)
+    return file.encode()
+
+
+def footer(start: int) -> bytes:
+    data = SEEDS["constant_none"].data
+    return data[: -8 - 20] + struct.pack("<Q", start) + data[-8 - 12 :]
+
+
+def channels(count: int) -> bytes:
+    return with_summary(
+        CHANNEL,
+        count,
+        lambda i, _: struct.pack("<HH", 100 + i, 0) + strings(b"/%d" % i, b"cdr") + bytes(4),
+    )
+
+
+def leaves(count: int) -> bytes:
+    """Keys whose names all have to be told apart."""
+    one = {"type": "Discrete", "dtype": "int64", "n": 2, "start": 0}
+    return with_space(
+        {"type": "Dict", "spaces": [["-" * (i % 50) + "a" + "." * (i // 50), one] for i in range(count)]}
+    )
+
+
+def chunks(count: int) -> bytes:
+    def change(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        return np.concatenate([rows, np.repeat(rows[:1], count)])
+
+    return with_chunk(change)
+
+
+REFUSED: dict[str, Callable[[], bytes]] = {
+    "an episode that ends beyond 2**64": lambda: with_episode(first_row=BIG, length=2),
+    "an episode of 2**63 steps": lambda: with_episode(length=1 << 63),
+    "an episode without a step": lambda: with_episode(length=0),
+    "an episode of another sub-environment": lambda: with_episode(env=7),
+    "two episodes with the same steps": lambda: with_episode(length=4),
+    "a final state that is not there": lambda: with_episode(final_row=1 << 40),
+    "an episode count beyond the file": lambda: with_claim(1),
+    "one text for all episodes": lambda: with_episode(metadata_offset=0, metadata_length=90),
+    "a chunk count beyond the file": lambda: with_claim(2),
+    "texts beyond the file": lambda: with_claim(3),
+    "a chunk beyond the file": lambda: with_chunk(setting("offset", 1 << 40)),
+    "a chunk in a journal's place": lambda: with_chunk(setting("offset", 1 << 63)),
+    "a chunk of 2**63 bytes": lambda: with_chunk(setting("length", 1 << 63)),
+    "a chunk of 2**40 bytes unpacked": lambda: with_chunk(setting("uncompressed", 1 << 40)),
+    "more rows than bytes": lambda: with_chunk(setting("rows", 1 << 31)),
+    "a skip beyond the chunk": lambda: with_chunk(setting("skip", 1 << 31)),
+    "a compression without a name": lambda: with_chunk(setting("compression", 9)),
+    "chunks on one another": lambda: with_chunk(on_the_first("offset")),
+    "a chunk in the index and not in the file": lambda: chunks(1),
+    "a summary beyond the file": lambda: footer(1 << 50),
+    "a summary in the data": lambda: footer(8),
+    "a space that is no object": lambda: with_space(b"[]"),
+    "a space nested 65 times": lambda: with_space(nested(65)),
+    "a space nested 100,000 times": lambda: with_space(b'{"type":"Tuple","spaces":[' * 100_000),
+    "a space of 2**62 elements": lambda: with_space(box(shape=[2**31, 2**31])),
+    "a space that Gymnasium copies again and again": lambda: with_space(nested(6, stack=True)),
+    "a space of 2**26 numbers in a few bytes": lambda: with_space(box(shape=[2**26])),
+    "a MultiDiscrete of 2**26 numbers": lambda: with_space(
+        {"type": "MultiDiscrete", "dtype": "int64", "shape": [2**26], "nvec": 3, "start": 0}
+    ),
+    "a bound of 4,000 digits": lambda: with_space(
+        b'{"type":"Discrete","dtype":"int64","start":0,"n":' + b"9" * 4000 + b"}"
+    ),
+    "a channel id twice": lambda: with_summary(
+        CHANNEL, 1, lambda _, body: body[:2] + body[2:].replace(b"/step", b"/stop")
+    ),
+    "a topic twice": lambda: with_summary(CHANNEL, 1, lambda _, body: b"\x63\0" + body[2:]),
+    "a schema id twice": lambda: with_summary(SCHEMA, 1, lambda _, body: body + b"bool more\n"),
+    "schemas of many sizes": lambda: with_summary(SCHEMA, 1, lambda _, body: body[:2] + b"\xff" * 8 + body[10:]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_claims_are_refused(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(REFUSED[name]())
+    with pytest.raises(
+        FormatError, match="expected|claims|places|names|gives|not the one its spaces|describes"
+    ):
+        Recording(path)
+
+
+MEASURE = """
+import sys, warnings
+from pathlib import Path
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording import Recording
+warnings.simplefilter("ignore")
+def peak():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
+def read(path):
+    try:
+        with Recording(path) as recording:
+            recording.all_metadata(), [e.number for e in recording.episodes], recording.attachments
+    except FormatError:
+        pass
+read(sys.argv[1])
+for path in sys.argv[1:]:
+    Path("/proc/self/clear_refs").write_text("5")
+    before = peak()
+    read(path)
+    print(peak() - before)
+"""
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/clear_refs").exists(), reason="peak memory is measured as Linux tells it"
+)
+def test_memory_is_bounded_by_the_file(tmp_path: Path) -> None:
+    made = {**REFUSED, "channels": lambda: channels(30_000), "leaves": lambda: leaves(2_000)}
+    made |= {
+        "attachments": lambda: attached(b"a", 5_000),
+        "texts": lambda: with_texts(b'{"a":0}' + b" " * (1 << 22)),
+    }
+    paths = []
+    for i, make in enumerate(made.values()):
+        paths.append(tmp_path / f"{i}.mcap")
+        paths[-1].write_bytes(make())
+    command = [sys.executable, "-c", MEASURE, *map(str, paths)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=True)
+    for name, path, taken in zip(made, paths, done.stdout.split(), strict=True):
+        limit = CAP + MULTIPLE * path.stat().st_size
+        assert int(taken) <= limit, f"{name}: {int(taken) >> 20} MiB for {path.stat().st_size} bytes"
+
+
+@pytest.mark.parametrize("make", [channels, leaves, lambda n: attached(b"a", n), chunks])
+def test_time_grows_as_the_file_does(make: Callable[[int], bytes], tmp_path: Path) -> None:
+    def seconds(count: int) -> float:
+        path = tmp_path / f"{count}.mcap"
+        path.write_bytes(make(count))
+        begun = time.process_time()
+        with contextlib.suppress(FormatError):
+            Recording(path).close()
+        return time.process_time() - begun
+
+    seconds(10)
+    small, large = (min(seconds(n) for _ in range(2)) for n in (500, 4_000))
+    assert large < 8 * 6 * small + 0.5  # eight times as much; a square would be 64 times
+
+
+@pytest.mark.parametrize("name", ["zstd", "lz4"])
+@pytest.mark.parametrize("wrong", [-1, 1, 10**6, 2**31 - 1001])
+def test_a_size_that_lies_either_way(name: str, wrong: int) -> None:
+    data = bytes(range(250)) * 4
+    plain: dict[str, bytes] = {
+        "zstd": zstandard.ZstdCompressor().compress(data),
+        "lz4": lz4.frame.compress(data, store_size=False),
+    }
+    assert bytes(decompress(name, memoryview(plain[name]), len(data), "here")) == data
+    with pytest.raises(FormatError, match="here: (expected|the compressed data is damaged)"):
+        decompress(name, memoryview(plain[name]), len(data) + wrong, "here")
+    if name == "zstd":  # the frame says what the file says, and holds something else
+        unsized = zstandard.ZstdCompressor(write_content_size=False).compress(data)
+        with pytest.raises(FormatError, match="here: (expected|the compressed data is damaged)"):
+            decompress(name, memoryview(unsized), len(data) + wrong, "here")
+        lying = bytearray(plain[name])
+        lying[5:7] = struct.pack("<H", (len(data) - 256 + wrong) & 0xFFFF)
+        claimed = zstandard.frame_content_size(bytes(lying))
+        with pytest.raises(FormatError, match="here: (expected|the compressed data is damaged)"):
+            decompress(name, memoryview(bytes(lying)), claimed, "here")
+
+
+@pytest.mark.parametrize(
+    "name", [b"../../x", b"/etc/passwd", b"a\0b", b"CON", b"", b"\xff", b"x" * 70_000, b"artifacts/../../x"]
+)
+def test_attachment_names_are_no_paths(name: bytes, tmp_path: Path) -> None:
+    directory = tmp_path / "a" / "b"
+    directory.mkdir(parents=True)
+    path = directory / "hostile.mcap"
+    path.write_bytes(attached(name))
+    before = sorted(tmp_path.rglob("*"))
+    facts, refused = observe(path)
+    assert facts["open"] or refused
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"", b"null", b"[1]", b"\xff", b"NaN", b"[" * 100_000, b'{"a":' * 300 + b"1" + b"}" * 300, b"9" * 5_000],
+)
+def test_metadata_that_is_no_object(text: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(with_texts(text))
+    with Recording(path) as recording:
+        assert len(recording.read().rewards) == recording.num_steps
+        if text:
+            with pytest.raises(FormatError, match="expected"):
+                _ = recording.episodes[0].metadata
+
+
+@pytest.mark.parametrize("time_ns", [0, 1, -(2**63), 2**63 - 1])
+def test_times_at_the_limits(time_ns: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(with_episode(start_time=time_ns, end_time=time_ns))
+    for words in (["info"], ["episodes"], ["ls", "--json"]):
+        with pytest.raises(SystemExit) as stopped:
+            app([*words, str(path)])
+        assert not stopped.value.code, capsys.readouterr().err
+    with FileStorage(tmp_path / "storage") as storage:
+        path.rename(tmp_path / "storage" / "hostile.mcap")
+        assert len(storage.list_episodes()) == 3
+
+
+def test_pipes_devices_and_directories_are_no_recordings(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    (tmp_path / "directory.mcap").mkdir()
+    (tmp_path / "nowhere.mcap").symlink_to(tmp_path / "missing")
+    (tmp_path / "loop.mcap").symlink_to(tmp_path / "loop.mcap")
+    for name in ("pipe.mcap", "directory.mcap", "nowhere.mcap", "loop.mcap", "a\0b"):
+        with pytest.raises(RecordingError, match="cannot be opened|is a directory|does not exist"):
+            Recording(tmp_path / name)
+    with pytest.raises(OSError, match="no file"):  # where a recording may say that its journal is
+        read_journal(Path("/dev/zero"))
+    assert [item for item in list_recordings([tmp_path]) if item.error is None] == []
+    with FileStorage(tmp_path) as storage:
+        assert storage.list_episodes() == []
+
+
+def test_one_recording_twice_in_a_storage(tmp_path: Path) -> None:
+    for name in ("one.mcap", "two.mcap"):
+        (tmp_path / name).write_bytes(SEEDS["constant_zstd"].data)
+    with FileStorage(tmp_path) as storage:
+        with pytest.warns(UserWarning, match="skipped a recording: .* holds episodes of one.mcap again"):
+            assert len(storage.list_episodes()) == 3
+
+
+def test_zeros_do_not_switch_a_check_off(tmp_path: Path) -> None:
+    """An attachment's data and its CRC after it, lost to a run of zeros."""
+    data = bytearray(SEEDS["constant_none"].data)
+    at = data.index(b"golden") + 5
+    data[at : at + 5] = bytes(5)
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(data)
+    with Recording(path) as recording, pytest.raises(FormatError, match="'note' .* is damaged"):
+        recording.read_attachment("note")
+
+
+def test_chunks_of_one_size_are_not_swapped(tmp_path: Path) -> None:
+    data = SEEDS["dict_with_images"].data
+    with Recording(Path(__file__).parent / "golden" / "dict_with_images.mcap") as recording:
+        table = recording._contents.table
+        places = [(int(row["offset"]), int(row["length"])) for row in table]
+        kinds = [
+            (row["length"], row["uncompressed"], row["channel"], row["rows"], row["skip"]) for row in table
+        ]
+    i, j = next((i, j) for i in range(len(kinds)) for j in range(i) if kinds[i] == kinds[j])
+    (a, size), (b, _) = places[j], places[i]
+    swapped = data[:a] + data[b : b + size] + data[a + size : b] + data[a : a + size] + data[b + size :]
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(swapped)
+    with Recording(path) as recording, pytest.raises(FormatError, match="damaged or another one"):
+        recording.read()
+
+
+@pytest.mark.parametrize("key", [b"created_ns", b"uuid", b"benchmark_id", b"crc"])
+def test_damaged_metadata_is_seen(key: bytes, tmp_path: Path) -> None:
+    data = bytearray(SEEDS["constant_zstd"].data)
+    at = data.index(key) + len(key) + 4 + 3
+    for place in (at, data.index(key) + 1):  # in the value, in the key
+        damaged = data.copy()
+        damaged[place] ^= 1
+        path = tmp_path / "hostile.mcap"
+        path.write_bytes(damaged)
+        with pytest.raises(FormatError, match="is damaged|expected a key 'crc'"):
+            Recording(path)
+
+
+def test_records_beyond_the_file(tmp_path: Path) -> None:
+    """In a file without an end, lengths are claims too."""
+    file = model()
+    file.parts, file.index = file.parts[:2], None
+    for opcode in (3, 4, 5, 6, 9, 12, 0xFF):
+        path = tmp_path / f"{opcode}.mcap"
+        path.write_bytes(
+            file.encode() + struct.pack("<BQ", opcode, BIG - 8) + bytes(100) + record(6, bytes(60))
+        )
+        with Recording(path) as recording:
+            assert not recording.complete
+            assert len(recording) == 0
