@@ -53,9 +53,9 @@ def test_a_killed_process_loses_no_finished_step(tmp_path: Path, kind: str, mome
     ("breakage", "kind", "moment"),
     [
         ("commit before the data", "box", "stores"),
-        ("forget the pending state", "box", "any time"),
+        ("forget the pending state", "box", "stores"),
         ("end before the records", "box", "episode log"),
-        ("chunks late", "large", "any time"),
+        ("chunks late", "large", "stores"),
     ],
 )
 def test_a_broken_recorder_is_found_out(tmp_path: Path, breakage: str, kind: str, moment: str) -> None:
