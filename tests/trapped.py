@@ -179,7 +179,6 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
     yield "tupli-mcap trust --show", _cli("trust", str(path), "--show")
     yield "tupli-mcap trust --show --json", _cli("trust", str(path), "--show", "--json")
     yield "tupli-mcap verify --replay", _cli("verify", "--replay", str(path))
-    yield "tupli-mcap replay", _cli("replay", str(path), "--output", str(work / "x.rrd"))
     yield "tupli-mcap recover", _cli("recover", str(path), "-o", str(work / f"again_{name}"), "--force")
     yield (
         "tupli-mcap bundle",
@@ -189,7 +188,6 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
         "tupli-mcap import --dry-run",
         _cli("import", str(path), "--storage", str(work / "lab"), "--dry-run"),
     )
-    yield "tupli-mcap import", _cli("import", str(path), "--storage", str(work / "lab2"))
     if name != "journal.mcap":  # whose journal lies where it says, also for those who append to it
         yield "append", lambda: _append(path, work)
 
@@ -308,7 +306,9 @@ def _cli(*words: str) -> Callable[[], Any]:
     def run() -> None:
         out = io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
-            _COMMAND.main(list(words), standalone_mode=False)
+            code = _COMMAND.main(list(words), standalone_mode=False)
+        if code not in (None, 0, 1):
+            raise AssertionError(f"{words} is no command: {out.getvalue()[-300:]}")
 
     return run
 
