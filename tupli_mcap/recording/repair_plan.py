@@ -131,6 +131,7 @@ class _Planner:
         told_next = (gathered.metadata or {}).get("next_episode", "")
         self._next = max([*known, int(told_next) - 1 if told_next.isdecimal() else -1]) + 1
         self._taken: set[int] = set()
+        self._ended: set[int] = set()  # old episodes whose last step is here
         self._here: dict[int, Ranges] = {}  # rows that are kept, by sub-environment
         for segment in found:
             self._here.setdefault(segment.env, []).append((segment.row, segment.row + segment.steps))
@@ -139,9 +140,11 @@ class _Planner:
         of: dict[int, list[Segment]] = {}
         for segment in self._found:
             of.setdefault(segment.episode, []).append(segment)
+        totals = [self._total(env, channels) for env in range(len(channels.steps))]
         for segment in self._found:
-            last = self._here[segment.env][-1][1] == self._total(segment.env, channels)
+            last = self._here[segment.env][-1][1] == totals[segment.env]
             self._plan.episodes.append(self._episode(segment, last=last and self._knows_total))
+        self._ended = {e.segment.episode for e in self._plan.episodes if e.tail}
         for number in sorted(set(of) | set(self._told.ends) | set(self._told.starts)):
             self._note_loss(number, of.get(number, []))
         for env in range(len(channels.steps)):
@@ -246,8 +249,7 @@ class _Planner:
             at = max(at, segment.step + segment.steps)
         if told is not None and told[1].length > at:
             lost.append((at, told[1].length))
-        planned = [e for e in self._plan.episodes if e.segment.episode == number]
-        if told is None and not any(e.tail for e in planned) and (found or self._in_a_hole(number)):
+        if told is None and number not in self._ended and (found or self._in_a_hole(number)):
             lost.append((at, None))
         if lost:
             self._plan.lost[number] = lost
