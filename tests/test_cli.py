@@ -250,7 +250,10 @@ class TestRecord:
     def test_places_that_cannot_be_written(self, here: Path) -> None:
         Path("file").touch()
         line = fails("record", "CartPole-v1", "-o", "file/a.mcap")
-        assert line == "file/a.mcap cannot be recorded to: Not a directory; choose a writable place"
+        assert (
+            line
+            == "file/a.mcap cannot be recorded to: Not a directory; choose a path whose directories are directories"
+        )
         line = fails("record", "CartPole-v1", "-o", "none/a.mcap")
         assert line == "none/a.mcap cannot be recorded to: its directory does not exist"
         line = fails("record", "CartPole-v1", "-o", "/proc/a.mcap")
