@@ -17,6 +17,7 @@ import json
 import multiprocessing as mp
 import os
 import resource
+import signal
 import sys
 import tempfile
 import time
@@ -30,12 +31,14 @@ from fuzzing.model import load_seeds
 from fuzzing.run import MUTATORS, SECONDS, Finding, Fuzzer, case_of
 
 BATCH = 250
+PROGRESS = 5_000
 ADDRESS_SPACE = 2 << 30  # more than a worker has once everything is imported
 
 
 def work(inbox: Any, outbox: Any, now: Any, options: argparse.Namespace) -> None:
     """Judges batches of inputs; `now` is the number in work, for the parent to see."""
     faulthandler.enable()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's business
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (taken + ADDRESS_SPACE, taken + ADDRESS_SPACE))
     shm = Path("/dev/shm")
@@ -79,7 +82,13 @@ def run(options: argparse.Namespace) -> int:
     outcomes: dict[str, Counter[str]] = {}
     findings: list[Finding] = []
     waiting = set(starts)
-    while waiting and not (options.minutes and time.monotonic() - begun > 60 * options.minutes):
+    stopped = []  # a run that is stopped says what it has done
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.append(True))
+    told = 0
+    while (
+        waiting and not stopped and not (options.minutes and time.monotonic() - begun > 60 * options.minutes)
+    ):
         with contextlib.suppress(mp.queues.Empty):
             start, found, counts = outbox.get(timeout=1)
             waiting.discard(start)
@@ -87,6 +96,12 @@ def run(options: argparse.Namespace) -> int:
                 outcomes.setdefault(name, Counter()).update(outcome)
             for finding in found:
                 report(finding, findings)
+            done = sum(sum(counts.values()) for counts in outcomes.values())
+            if done // PROGRESS > told:
+                told = done // PROGRESS
+                print(
+                    f"{done} inputs, {len(findings)} findings, {time.monotonic() - begun:.0f} s", flush=True
+                )
         for i, worker in enumerate(workers):
             dead = not worker.process.is_alive()
             if dead or worker.stuck():
