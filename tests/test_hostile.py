@@ -413,6 +413,17 @@ def test_damaged_metadata_is_seen(key: bytes, tmp_path: Path) -> None:
             Recording(path)
 
 
+def test_a_length_that_swallows_the_checksum(tmp_path: Path) -> None:
+    data = bytearray(SEEDS["vector_same_step"].data)
+    at = data.index(b"benchmark_id") + len(b"benchmark_id")
+    assert data[at : at + 4] == bytes(4)
+    data[at] = 4 + len("crc") + 4 + 8
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match="expected a key 'crc'"):
+        Recording(path)
+
+
 def test_records_beyond_the_file(tmp_path: Path) -> None:
     """In a file without an end, lengths are claims too."""
     file = model()

@@ -28,7 +28,8 @@ def check_crc(values: Mapping[str, str], known: Collection[str], where: str) -> 
     """
     pairs = {key: value for key, value in values.items() if key != _KEY}
     if _KEY not in values:
-        other = sorted(pairs.keys() - set(known))
+        # A damaged length may have made the key part of a value: the bytes of a length in it are seen by their zeros.
+        other = sorted(pairs.keys() - set(known)) or [key for key, value in pairs.items() if "\0" in value]
         if other:
             raise FormatError(
                 f"{where}: expected a key 'crc' beside {other!r:.80}, found none; the file is damaged"
