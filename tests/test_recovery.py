@@ -16,7 +16,14 @@ import pytest
 from environments import Sampler, roll
 from gymnasium import spaces
 
-from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError, journal_path
+from tupli_mcap import (
+    FormatError,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    journal_path,
+    recover_recording,
+)
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)
@@ -287,3 +294,27 @@ def test_a_recording_that_names_any_file_as_its_journal_is_refused(
         cart_pole(tmp_path / "killed.mcap", mode="a")
     assert precious.read_text() == "precious"
     assert Recording(path).num_steps == 5
+
+
+def test_appending_cuts_nothing_good_off_behind_damage(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    pid = os.fork()
+    if pid == 0:
+        env = cart_pole(path)
+        roll(env, 300)
+        os.kill(os.getpid(), 9)
+    os.waitpid(pid, 0)
+    data = path.read_bytes()
+    first = Recording(path)._contents.table[0]
+    at = int(first["offset"]) + int(first["length"]) - 20
+    path.write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
+    with pytest.raises(
+        RecordingError, match=r"damaged at offset \d+: appending would lose \d+ message\(s\) of /step"
+    ):
+        cart_pole(path, mode="a")
+    assert len(path.read_bytes()) == len(data)
+    report = recover_recording(path, tmp_path / "whole.mcap")
+    assert report.steps > 200
+    with cart_pole(tmp_path / "whole.mcap", mode="a") as env:
+        roll(env, 5)
+    assert Recording(tmp_path / "whole.mcap").num_steps == report.steps + 5

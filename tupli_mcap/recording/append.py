@@ -50,6 +50,7 @@ def resume(writer: RecordingWriter) -> None:
             raise RecordingError(
                 f"{writer.path} holds episodes of benchmark {found or 'none'!r}, not {asked!r}; record to another file"
             )
+        _check_nothing_behind(writer, contents, source)
         _check_aligned(writer, contents)
         _restore(writer, contents, source)
     finally:
@@ -103,6 +104,27 @@ def _is_same(path: Path, metadata: Mapping[str, str]) -> bool:
         return False
     finally:
         source.close()
+
+
+def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: Source) -> None:
+    """What lies behind the end is cut off: the torn record of a killed writer, but not good rows behind damage."""
+    if contents.complete or source.size == contents.data_end:
+        return
+    from tupli_mcap.recording.repair_gather import gather
+    from tupli_mcap.recording.repair_journal import add_journal
+    from tupli_mcap.recording.tail import read_tail
+
+    gathered = gather(source, read_tail(source))
+    add_journal(gathered)
+    for channel in contents.channels:
+        kept = int(contents.table["rows"][contents.table["channel"] == channel].sum())
+        found = sum(stop - first for first, stop in gathered.ranges(channel))
+        if found > kept:
+            raise RecordingError(
+                f"{writer.path} is damaged at offset {contents.data_end}: appending would lose {found - kept} "
+                f'message(s) of {contents.channels[channel].topic} behind it; "tupli-mcap recover {writer.path}" '
+                "writes all that is whole to a new file, which can be appended to"
+            )
 
 
 def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
