@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -12,3 +13,9 @@ def _private_config(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytes
     directory = tmp_path_factory.mktemp("config")
     monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(directory))
     return directory
+
+
+def pytest_configure() -> None:
+    """Ctrl-C interrupts what tests start, too where this runs in the background of a shell, which ignores it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
