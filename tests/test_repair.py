@@ -24,6 +24,7 @@ from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError, j
 from tupli_mcap.cli.app import app
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import RecoveryReport
+from tupli_mcap.recording.headers import message_headers
 from tupli_mcap.recording.source import PathSource
 from tupli_mcap.recording.survey import Damage, Found, Survey
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -500,3 +501,24 @@ def test_interrupted_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(KeyboardInterrupt):
         recover_recording(path)
     assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_headers_of_a_chunk_are_read_once_not_for_each_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = record(tmp_path / "a.mcap", steps=1200, length=2)
+    hit(path, chunks(path, "/step")[3])
+    calls = []
+
+    def counted(data: memoryview) -> Any:
+        calls.append(len(data))
+        return message_headers(data)
+
+    monkeypatch.setattr("tupli_mcap.recording.repair_gather.message_headers", counted)
+    report, recording = recovered(path)
+    with recording:
+        assert len(recording.episodes) > 500
+        assert report.final_states_lost == []
+    with Recording(path) as damaged:
+        table = damaged._contents.table
+    assert 0 < len(calls) <= len(table)

@@ -63,11 +63,13 @@ class ChunkStore:
         self._offsets: dict[int, list[tuple[int, int]]] = {}
         self._views: dict[int, np.ndarray[Any, Any]] = {}  # of cached chunks, their headers checked
         self._by_channel: dict[int, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
+        self._counts: dict[int, int] = {}
         for channel in np.unique(table["channel"]):
             chosen = np.flatnonzero(table["channel"] == channel)
             chosen = chosen[np.argsort(table["first"][chosen], kind="stable")]
             self._check_chain(chosen, int(channel))
             self._by_channel[int(channel)] = (chosen, table["first"][chosen].astype(np.int64))
+            self._counts[int(channel)] = int(table["rows"][chosen].sum())
 
     def _check_chain(self, chosen: np.ndarray[Any, Any], channel: int) -> None:
         ends = np.cumsum(self.table["rows"][chosen], dtype=np.uint64)
@@ -78,9 +80,7 @@ class ChunkStore:
 
     def count(self, channel: int) -> int:
         """Rows of a channel."""
-        if channel not in self._by_channel:
-            return 0
-        return int(self.table["rows"][self._by_channel[channel][0]].sum())
+        return self._counts.get(channel, 0)
 
     def chunks(self, channel: int) -> list[int]:
         """The chunks of a channel in the order of their rows."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import bisect
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, overload
 
@@ -11,12 +12,13 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Metadata, Schema
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.checked import message_index
 from tupli_mcap.recording.checksums import check_crc, mended
-from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
+from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore, Span
 from tupli_mcap.recording.container import CHUNK_ROWS, MAGIC, PROFILE
 from tupli_mcap.recording.contents import CHANNEL_KEYS, RECORDING_KEYS, RECORDING_METADATA, is_ours
-from tupli_mcap.recording.headers import ChunkRecords, chunk_records
+from tupli_mcap.recording.headers import ChunkRecords, chunk_records, message_headers
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import parse_record
@@ -26,6 +28,7 @@ from tupli_mcap.recording.tail import Tail
 __all__ = ["Gathered", "Piece", "Pieces", "gather", "is_recording", "may_be_recording"]
 
 _CACHE = 64 << 20
+_HEADERS = 16  # chunks whose headers are kept: a message at a time is taken from them
 _HEAD = 4096  # the recording's metadata record begins within so many bytes
 
 
@@ -150,12 +153,25 @@ class PackedStore(ChunkStore):
             ]
         rows = np.array(table, CHUNK_ROWS)
         super().__init__(gathered.source, rows, gathered.loaded, _CACHE)
+        self._headers: dict[int, np.ndarray[Any, Any]] = {}  # of the chunks that were last asked for
 
     def packed(self, channel: int, row: int) -> int:
         """The number here of a row that is here."""
         firsts, counts = self._firsts[channel]
-        at = int(np.searchsorted(firsts, row, side="right")) - 1
+        at = bisect.bisect_right(firsts, row) - 1
         return counts[at] + row - firsts[at]
+
+    def messages_of(self, span: Span) -> Iterator[tuple[int, memoryview]]:
+        """(log_time, body) of the messages of a span."""
+        data = memoryview(self.load(span.chunk))
+        headers = self._headers.get(span.chunk)
+        if headers is None:
+            while len(self._headers) >= _HEADERS:
+                del self._headers[next(iter(self._headers))]
+            headers = self._headers[span.chunk] = message_headers(data)
+        for header in headers[span.begin : span.end]:
+            start = int(header["#offset"])
+            yield int(header["#log_time"]), data[start + BODY : start + 9 + int(header["#length"])]
 
 
 def gather(source: Source, tail: Tail) -> Gathered:

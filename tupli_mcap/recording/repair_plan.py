@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,6 +14,8 @@ from tupli_mcap.recording.repair_gather import Gathered, PackedStore
 from tupli_mcap.recording.repair_segments import Channels, Ranges, Segment, messages, segments
 
 __all__ = ["Plan", "PlannedEpisode", "Told", "make_plan"]
+
+_END = 1 << 64  # beyond any row number
 
 
 @dataclass
@@ -140,29 +143,29 @@ class _Planner:
         of: dict[int, list[Segment]] = {}
         for segment in self._found:
             of.setdefault(segment.episode, []).append(segment)
-        totals = [self._total(env, channels) for env in range(len(channels.steps))]
+        stops: dict[int, int] = {}  # where the ends say that the rows of a sub-environment end
+        for _, end in self._told.ends.values():
+            stops[end.env] = max(stops.get(end.env, 0), end.first_row + end.length)
+        totals = [self._total(env, channels, stops.get(env, 0)) for env in range(len(channels.steps))]
         for segment in self._found:
             last = self._here[segment.env][-1][1] == totals[segment.env]
             self._plan.episodes.append(self._episode(segment, last=last and self._knows_total))
         self._ended = {e.segment.episode for e in self._plan.episodes if e.tail}
         for number in sorted(set(of) | set(self._told.ends) | set(self._told.starts)):
             self._note_loss(number, of.get(number, []))
-        for env in range(len(channels.steps)):
-            self._plan.lost_rows += self._total(env, channels) - sum(
-                b - a for a, b in self._here.get(env, [])
-            )
+        for env, total in enumerate(totals):
+            self._plan.lost_rows += total - sum(b - a for a, b in self._here.get(env, []))
         self._plan.next_episode = self._next
         return self._plan
 
-    def _total(self, env: int, channels: Channels) -> int:
+    def _total(self, env: int, channels: Channels, told: int) -> int:
         """Rows that a sub-environment had, as far as anything tells."""
         ids = [channels.steps[env], *(images[env] for images in channels.images.values())]
         stops = [p.stop for i in ids[:1] if i is not None for p in self._gathered.pieces.get(i, [])[-1:]]
         statistics = self._gathered.tail.statistics
         if statistics is not None:
             stops += [statistics.channel_message_counts.get(i, 0) for i in ids if i is not None]
-        stops += [end.first_row + end.length for _, end in self._told.ends.values() if end.env == env]
-        return max(stops, default=0)
+        return max(told, *stops, 0)
 
     def _length(self, segment: Segment) -> int | None:
         """The steps of the old episode, if that is known."""
@@ -257,6 +260,6 @@ class _Planner:
     def _in_a_hole(self, number: int) -> bool:
         """Whether an episode of which only the start is here had steps that are not."""
         _, start = self._told.starts[number]
-        return any(start.first_row < first for first, _ in self._here.get(start.env, [])) and not any(
-            first <= start.first_row < stop for first, stop in self._here.get(start.env, [])
-        )
+        here = self._here.get(start.env, [])
+        after = bisect.bisect_right(here, (start.first_row, _END))
+        return after < len(here) and not (after and start.first_row < here[after - 1][1])

@@ -150,7 +150,5 @@ def messages(store: PackedStore, channel: int | None) -> Iterator[tuple[int, int
 def message_at(store: PackedStore, channel: int, row: int) -> bytes:
     """The body of one message."""
     (span,) = store.spans(channel, row, 1)
-    data = memoryview(store.load(span.chunk))
-    header = message_headers(data)[span.begin]
-    start = int(header["#offset"])
-    return bytes(data[start + BODY : start + 9 + int(header["#length"])])
+    ((_, body),) = store.messages_of(span)
+    return bytes(body)

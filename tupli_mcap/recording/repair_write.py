@@ -14,13 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import record
-from tupli_mcap.recording.headers import message_headers
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
@@ -99,8 +97,11 @@ class RepairWriter:
         self._container.define_channels()
         rows: dict[int, int] = {}  # first row of each episode in the new file
         dtype = layout.step_message.dtype if layout.constant else None
+        of: dict[int, list[PlannedEpisode]] = {}
+        for episode in plan.episodes:
+            of.setdefault(episode.segment.env, []).append(episode)
         for env, channel in enumerate(old.steps):
-            mine = [e for e in plan.episodes if e.segment.env == env]
+            mine = of.get(env, [])
             at = 0
             for episode in mine:
                 rows[episode.number] = at
@@ -172,12 +173,9 @@ class RepairWriter:
             segment = episode.segment
             step = 0
             for span in store.spans(channel, store.packed(channel, segment.row), segment.steps):
-                data = memoryview(store.load(span.chunk))
-                for header in message_headers(data)[span.begin : span.end]:
-                    start = int(header["#offset"])
-                    body = bytes(data[start + BODY : start + 9 + int(header["#length"])])
+                for log_time, body in store.messages_of(span):
                     numbers = episode.number.to_bytes(4, "little") + step.to_bytes(4, "little")
-                    yield int(header["#log_time"]), numbers + body[8:]
+                    yield log_time, numbers + bytes(body[8:])
                     step += 1
 
     def _put(self, channel: int, messages: Iterable[tuple[int, bytes]]) -> None:
