@@ -54,7 +54,7 @@ def test_a_killed_process_loses_no_finished_step(tmp_path: Path, kind: str, mome
     [
         ("commit before the data", "box", "stores"),
         ("forget the pending state", "box", "stores"),
-        ("end before the records", "box", "episode log"),
+        ("events taken off first", "box", "flush"),
         ("chunks late", "large", "stores"),
     ],
 )

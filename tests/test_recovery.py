@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from environments import Sampler, roll
 from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
 
 from tupli_mcap import (
     FormatError,
@@ -23,7 +24,9 @@ from tupli_mcap import (
     RecordingError,
     journal_path,
     recover_recording,
+    verify_recording,
 )
+from tupli_mcap.recording import recover
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)
@@ -318,3 +321,70 @@ def test_appending_cuts_nothing_good_off_behind_damage(tmp_path: Path) -> None:
     with cart_pole(tmp_path / "whole.mcap", mode="a") as env:
         roll(env, 5)
     assert Recording(tmp_path / "whole.mcap").num_steps == report.steps + 5
+
+
+@pytest.mark.parametrize("slow", ["rows", "events"])
+def test_what_a_writer_does_while_its_journal_is_read_makes_nothing_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: str
+) -> None:
+    """Rows may have gone to the file since; their episodes keep their seeds and their metadata."""
+    path, seeds = tmp_path / "r.mcap", iter(range(1000))
+    env = RecordEpisodes(
+        Sampler(BOX, spaces.Discrete(3), length=5), path, metadata_callback=Numbered(), chunk_size=1000
+    )
+
+    def record(episodes: int) -> None:
+        for _ in range(episodes):
+            env.reset(seed=next(seeds))
+            for _ in range(5):
+                env.step(0)
+
+    def read(place: Path, only: Any = None) -> Any:
+        found = real(place, only)
+        if (only is None) == (slow == "rows") and not done:
+            done.append(True)
+            record(20)
+        return found
+
+    real, done = recover.read_journal, list[bool]()
+    monkeypatch.setattr(recover, "read_journal", read)
+    record(10)
+    with Recording(path) as recording:
+        assert done and 50 <= recording.num_steps <= 150
+        assert [episode.seed for episode in recording.episodes] == list(range(len(recording.index)))
+        assert all(episode.metadata == {"steps": 5} for episode in recording.episodes if len(episode) == 5)
+    env.close()
+
+
+class Numbered:
+    """A metadata callback that counts steps."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self._steps = 0
+
+    def __call__(self, rl_tuple: Any) -> dict[str, Any]:
+        self._steps += 1
+        return {"steps": self._steps}
+
+
+def test_what_recovery_makes_keeps_the_order_of_time(tmp_path: Path) -> None:
+    """The end that is made for one sub-environment is not before that of another."""
+    path = tmp_path / "r.mcap"
+
+    def vector(path: Path, **kwargs: Any) -> Any:
+        makers = [lambda i=i: Sampler(BOX, spaces.Discrete(3), length=3 + i) for i in range(3)]
+        return RecordVector(SyncVectorEnv(makers), path, **kwargs)
+
+    def run(path: Path) -> Any:
+        env = vector(path)
+        env.reset(seed=1)
+        for _ in range(11):
+            env.step(env.action_space.sample())
+        os.kill(os.getpid(), 9)
+
+    abandon(path, run, 0)
+    vector(path, mode="a").close()
+    assert verify_recording(path).ok

@@ -41,13 +41,13 @@ def _forget_the_pending_state() -> None:
     rows.SingleRows._switch = switch  # type: ignore[method-assign]
 
 
-def _end_before_the_records() -> None:
-    def append(self: Any, time_ns: int, *messages: tuple[int, bytes]) -> int:
-        self._commit[0] = self._position + sum(logs._EVENT.size + len(body) for _, body in messages)
-        return appended(self, time_ns, *messages)
+def _events_taken_off_first() -> None:
+    def flush(self: Any, *, keep_last: bool = False) -> None:
+        self._commit[0] = 0  # before they are in the file
+        flushed(self, keep_last=keep_last)
 
-    appended = logs.EventLog.append
-    logs.EventLog.append = append  # type: ignore[method-assign]
+    flushed = logs.EventLog.flush
+    logs.EventLog.flush = flush  # type: ignore[method-assign]
 
 
 def _chunks_late() -> None:
@@ -65,6 +65,6 @@ def _chunks_late() -> None:
 BREAKAGES: dict[str, Callable[[], None]] = {
     "commit before the data": _commit_before_the_data,
     "forget the pending state": _forget_the_pending_state,
-    "end before the records": _end_before_the_records,
+    "events taken off first": _events_taken_off_first,
     "chunks late": _chunks_late,
 }

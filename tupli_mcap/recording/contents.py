@@ -62,13 +62,14 @@ class Contents:
     )
     complete: bool = True
     data_end: int = 0
+    used_episodes: int = 0  # beyond the numbers of episodes whose steps were lost, and whose ends were not
 
     @property
     def next_episode(self) -> int:
         """The number of the next episode: no number is given twice, not even one that was left out in rewriting."""
         told = self.metadata.get("next_episode", "0")
         numbers = self.index.episodes["episode"]
-        free = int(numbers.max()) + 1 if len(numbers) else 0
+        free = max(self.used_episodes, int(numbers.max()) + 1 if len(numbers) else 0)
         return max(free, int(told)) if re.fullmatch("[0-9]{1,10}", told) else free
 
 
@@ -95,8 +96,7 @@ def _read_contents(source: Source) -> Contents:
     if not has_summary(source):
         from tupli_mcap.recording.recover import find_journal, recover_contents
 
-        journal = find_journal(source)
-        source.refresh()  # a writer that closed in between has left a summary, and no journal
+        journal = find_journal(source)  # a writer that closed in between has left a summary, and no journal
         if not has_summary(source):
             return recover_contents(source, journal)
     summary = read_summary(source)
