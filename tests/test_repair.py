@@ -20,11 +20,20 @@ from mcap.writer import CompressionType, IndexType, Writer
 from test_golden import NAMES, as_read, assert_same, expected, place
 from typer.testing import CliRunner
 
-from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError, journal_path, recover_recording
+from tupli_mcap import (
+    FormatError,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    journal_path,
+    recover_recording,
+    verify_recording,
+)
 from tupli_mcap.cli.app import app
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import RecoveryReport
 from tupli_mcap.recording.headers import message_headers
+from tupli_mcap.recording.signature import SIGNATURE_NAME, check_signature, sign_recording
 from tupli_mcap.recording.source import PathSource
 from tupli_mcap.recording.survey import Damage, Found, Survey
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -522,3 +531,40 @@ def test_headers_of_a_chunk_are_read_once_not_for_each_episode(
     with Recording(path) as damaged:
         table = damaged._contents.table
     assert 0 < len(calls) <= len(table)
+
+
+def test_no_step_saved_is_a_failure(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", steps=60)
+    for found in chunks(path, "/step"):
+        hit(path, found)
+    result = CliRunner().invoke(app, ["recover", str(path)])
+    assert result.exit_code == 1
+    assert f"{path}: none of its 60 steps could be saved; 2 attachments saved to" in result.output
+    with Recording(tmp_path / "a.recovered.mcap") as recording:
+        assert (recording.num_steps, list(recording.attachments)) == (
+            0,
+            ["benchmark.json", "env.cloudpickle"],
+        )
+
+
+def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
+    pytest.importorskip("cryptography")
+    from test_signing import write_key
+
+    path = record(tmp_path / "a.mcap", steps=60)
+    sign_recording(path, write_key(tmp_path / "key"))
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-3])
+    report, recording = recovered(cut)
+    with recording:
+        assert check_signature(recording) is not None
+        assert recording.num_steps == 60
+    assert report.notes == []
+    hit(path, chunks(path, "/step")[1])
+    report, recording = recovered(path)
+    with recording:
+        assert SIGNATURE_NAME not in recording.attachments
+        assert 0 < recording.num_steps < 60
+    assert report.notes == ["its signature is left out: it is not of what could be saved"]
+    assert report.attachments_lost == []
+    assert verify_recording(str(report.target)).problems == []

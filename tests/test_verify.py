@@ -32,7 +32,7 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording import VerifyReport, rewrite
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
-from tupli_mcap.recording.index import EpisodeRow, IndexBuilder
+from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage.verify import verify_paths, verify_storage
 
@@ -397,3 +397,47 @@ def test_memory_is_that_of_a_few_chunks(tmp_path: Path) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 8_000_000 + (64 << 20) * 0.2
+
+
+@pytest.mark.parametrize("topic", ["/step", "/episode_start", "/episode_end", "/final_state"])
+def test_one_bad_chunk_is_one_problem_in_the_text(topic: str, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    hit(path, chunks(path, topic)[0])
+    shown = CliRunner().invoke(app, ["verify", str(path)], env={"COLUMNS": "80"})
+    assert shown.exit_code == 1
+    lines = shown.output.splitlines()
+    assert lines[0].startswith(f"{path}: 1 problem (")
+    assert "error" in lines[1]
+    assert shown.output.count("CRC differs") == 1
+    assert shown.output.count("tupli-mcap recover") == 1
+    assert "follow from that; see --json" in shown.output
+    problems = json.loads(CliRunner().invoke(app, ["verify", str(path), "--json"]).output)["reports"][0]
+    assert [problem["follows"] for problem in problems["problems"]].count(False) == 1
+    assert len(problems["problems"]) > 3
+
+
+def test_killed_while_the_end_is_written_is_no_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    env = RecordEpisodes(Sampler(BOX, spaces.Discrete(3)), path)
+    roll(env, 60)
+    journal = journal_path(path).read_bytes()
+    env.close()
+    whole = path.read_bytes()
+    index = next(item for item in places(path) if item.attachment and item.attachment.name == INDEX_NAME)
+    for size in range(index.offset, len(whole), 97):
+        path.write_bytes(whole[:size])
+        journal_path(path).write_bytes(journal)
+        report = verify_recording(path)
+        assert (report.ok, report.state) == (True, "unfinished"), (size, said(report))
+        assert recover_recording(path, overwrite=True).steps == 60
+
+
+def test_a_cut_footer_is_not_said_to_be_nothing(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    path.write_bytes(path.read_bytes()[:-3])
+    assert not verify_recording(path).ok
+    report = recover_recording(path)
+    assert not report.intact
+    assert (report.steps, report.damaged[-1].why) == (300, "the footer is damaged or cut off")
+    shown = CliRunner().invoke(app, ["recover", str(path), "--force"])
+    assert "nothing was lost" in shown.output

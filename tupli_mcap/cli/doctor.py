@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tupli_mcap.cli.options import FilterText, Json, filter_of
-from tupli_mcap.cli.output import Column, number, print_json, print_table, short_ids, terminal_width, visible
+from tupli_mcap.cli.output import Column, number, print_json, print_table, print_wrapped, short_ids, visible
 
 if TYPE_CHECKING:
     from tupli_mcap.doctor import Diagnosis, Finding, Severity
@@ -20,7 +20,6 @@ __all__ = ["register"]
 
 _INDENT = 9  # columns: the longest severity and a gap
 _OTHERS = 3  # recordings with the same finding that are named
-_WIDEST = 100  # columns: longer lines are hard to read
 _STYLES = {"error": "bold red", "warning": "bold yellow", "info": "bold blue"}
 
 
@@ -205,21 +204,4 @@ def _at(finding: Finding) -> str:
 
 
 def _print_wrapped(text: str, hang: int = 0) -> None:
-    import textwrap
-
-    width = terminal_width()
-    indent = " " * _INDENT
-    if width is None:
-        print(indent + visible(text))
-        return
-    room = max(30, min(width, _WIDEST))
-    print(
-        textwrap.fill(
-            visible(text),
-            room,
-            initial_indent=indent,
-            subsequent_indent=indent + " " * hang,
-            break_on_hyphens=False,
-            break_long_words=False,
-        )
-    )
+    print_wrapped(text, " " * _INDENT, " " * (_INDENT + hang))

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
@@ -20,6 +21,7 @@ __all__ = [
     "print_facts",
     "print_json",
     "print_table",
+    "print_wrapped",
     "short_ids",
     "step_progress",
     "terminal_width",
@@ -30,6 +32,7 @@ __all__ = [
 ]
 
 _GAP = "  "
+_WIDEST = 100  # columns of running text
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _LONG_ID = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{20,52}\b")
 
@@ -76,8 +79,6 @@ def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], *, emp
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:
     """Print `label  value` lines; long values go on below themselves."""
-    import textwrap
-
     pairs = [(label, visible(value)) for label, value in facts]
     indent = max(len(label) for label, _ in pairs) + len(_GAP)
     width = terminal_width()
@@ -87,6 +88,25 @@ def print_facts(facts: Iterable[tuple[str, str]]) -> None:
             lines = textwrap.wrap(value, max(20, width - indent), break_on_hyphens=False) or [""]
         for i, line in enumerate(lines):
             print(f"{label if i == 0 else '':<{indent}}{line}")
+
+
+def print_wrapped(text: str, first: str, others: str) -> None:
+    """Print a text in lines that fit the terminal, at most 100 columns: `first` begins its first, `others` the next."""
+    width = terminal_width()
+    if width is None:
+        print(first + visible(text))
+        return
+    room = max(30, min(width, _WIDEST))
+    print(
+        textwrap.fill(
+            visible(text),
+            room,
+            initial_indent=first,
+            subsequent_indent=others,
+            break_on_hyphens=False,
+            break_long_words=False,
+        )
+    )
 
 
 def print_json(value: Any) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import Column, bytes_of, number, print_json, print_table
+from tupli_mcap.cli.output import Column, bytes_of, number, print_json, print_table, print_wrapped
 from tupli_mcap.cli.replaying import Replays, episode_numbers
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["register"]
 
 _STATES = {"unfinished": "not finished", "recording": "being recorded"}
+_NOTHING = "nothing to be done"
 _SHOWN = 20  # damaged places, lost episodes: what is beyond is in --json
 
 
@@ -75,22 +77,36 @@ def _verify(
 
 
 def _print_verified(report: VerifyReport) -> None:
-    """A line on a file, and one on each problem."""
-    facts = {
-        "recording": f"{number(report.episodes)} episodes, {number(report.steps)} steps",
-        "mcap": f"no recording, {number(report.messages)} messages",
-        "storage": f"{number(report.attachments)} artifacts",
-    }[report.kind]
-    damage = f"{number(len(report.errors) + report.more)} problems"
+    """A line on a file, one on each problem that does not follow from another, and what to do about them."""
+    from tupli_mcap.recording.findings import RECOVER
+
+    unread = report.kind == "recording" and not (report.ok or report.episodes)
+    facts = (
+        "its episodes cannot be read as it is"
+        if unread
+        else {
+            "recording": f"{number(report.episodes)} episodes, {number(report.steps)} steps",
+            "mcap": f"no recording, {number(report.messages)} messages",
+            "storage": f"{number(report.attachments)} artifacts",
+        }[report.kind]
+    )
+    roots = [problem for problem in report.problems if not problem.follows]
+    count = sum(problem.severity == "error" for problem in roots) + report.more
+    damage = f"{number(count)} {'problem' if count == 1 else 'problems'}"
     state = "" if report.state == "complete" else f", {_STATES[report.state]}"
     print(f"{report.path}: {'ok' if report.ok else damage} ({facts}{state})")
-    shown = report.problems[:_SHOWN]
-    for problem in shown:
+    for problem in roots[:_SHOWN]:
         place = f"{problem.place}: " if problem.place else ""
-        print(f"  {problem.severity}: {place}{problem.message}; {problem.advice}")
-    hidden = len(report.problems) - len(shown) + report.more
-    if hidden:
-        print(f"  ... and {number(hidden)} more; see --json")
+        print_wrapped(f"{problem.severity}: {place}{problem.message}", "  ", "    ")
+    if len(roots) > _SHOWN or report.more:
+        print(f"  ... and {number(len(roots) - min(_SHOWN, len(roots)) + report.more)} more; see --json")
+    followers = len(report.problems) - len(roots)
+    if followers:
+        follow = f"{'follows' if followers == 1 else 'follow'} from {'that' if len(roots) == 1 else 'these'}"
+        print(f"  ({number(followers)} more {follow}; see --json)")
+    for advice in dict.fromkeys(problem.advice for problem in roots if problem.advice != _NOTHING):
+        file = f" {shlex.quote(report.path)}" if advice == RECOVER else ""
+        print_wrapped(f"→ {advice}{file}", "  ", "    ")
 
 
 def _recover(
@@ -106,7 +122,7 @@ def _recover(
     """Save everything good in a damaged or unfinished file into a new one.
 
     The file itself is only read. What was lost is said by episode and step; an episode that lost steps in the
-    middle becomes several. Exit code 1 only if nothing could be saved.
+    middle becomes several. Exit code 1 only if nothing could be saved, or no step of a recording that had some.
     """
     from tupli_mcap.recording.repair import recover_recording
 
@@ -120,9 +136,9 @@ def _recover(
 
 
 def _print_recovery(report: RecoveryReport) -> None:
-    print(_summary(report))
+    print_wrapped(_summary(report), "", "  ")
     for line in [*_losses(report), *report.notes]:
-        print(f"  {line}")
+        print_wrapped(line, "  ", "    ")
     if report.lost:
         pieces: dict[int, list[str]] = {}
         for cut in report.cut:
@@ -158,9 +174,12 @@ def _print_rest(count: int) -> None:
 
 
 def _summary(report: RecoveryReport) -> str:
-    if not report.saved:
-        return f"{report.source}: nothing could be saved"
     where = "can be saved (nothing was written)" if report.target is None else f"saved to {report.target}"
+    if not report.saved:
+        lost = f"none of its {number(report.steps_lost)} steps" if report.steps_lost else "nothing"
+        files = "attachment" if report.attachments == 1 else "attachments"
+        also = f"; {number(report.attachments)} {files} {where}" if report.attachments else ""
+        return f"{report.source}: {lost} could be saved{also}"
     if report.kind == "mcap":
         what = f"{number(report.messages)} messages and {number(report.attachments)} attachments"
     else:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-__all__ = ["Findings", "Problem", "VerifyReport"]
+__all__ = ["RECOVER", "Findings", "Problem", "VerifyReport"]
 
 _MOST = 1000  # problems that are kept of a file; the others are counted
-_RECOVER = "save what is good with tupli-mcap recover"
+RECOVER = "save what is good with tupli-mcap recover"
 
 
 @dataclass(frozen=True)
@@ -18,16 +20,18 @@ class Problem:
     kind: "file", "record", "chunk", "message_index", "attachment", "metadata", "summary", "index", "layout", "rows",
         "episode", "final_state", "info", "image", "benchmark", "signature", "journal", or one of a storage's.
     offset: in the file (bytes). channel: a topic. episode, step: numbers.
+    follows: damage found elsewhere in the file is enough to explain it.
     """
 
     kind: str
     message: str
     severity: str = "error"
-    advice: str = _RECOVER
+    advice: str = RECOVER
     offset: int | None = None
     channel: str | None = None
     episode: int | None = None
     step: int | None = None
+    follows: bool = False
 
     @property
     def place(self) -> str:
@@ -85,10 +89,20 @@ class Findings:
 
     def __init__(self, report: VerifyReport) -> None:
         self.report = report
+        self._explained = False
+
+    @contextlib.contextmanager
+    def following(self, explained: bool) -> Iterator[None]:
+        """Damage found within follows from what was found before, if `explained`."""
+        before, self._explained = self._explained, self._explained or explained
+        try:
+            yield
+        finally:
+            self._explained = before
 
     def error(self, kind: str, message: str, **place: Any) -> None:
         """Damage, where it is (`Problem`'s fields)."""
-        self._add(Problem(kind, message, **place))
+        self._add(Problem(kind, message, follows=self._explained, **place))
 
     def note(self, kind: str, message: str, advice: str, **place: Any) -> None:
         """Something that is no damage."""

@@ -9,18 +9,20 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.container import MAGIC, Container
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.lock import is_locked
+from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.repair_foreign import copy_foreign
 from tupli_mcap.recording.repair_gather import Gathered, gather, is_recording, may_be_recording
 from tupli_mcap.recording.repair_journal import add_journal
 from tupli_mcap.recording.repair_plan import Plan, make_plan
 from tupli_mcap.recording.repair_segments import Channels
 from tupli_mcap.recording.repair_write import RepairWriter
+from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.survey import Damage, attachment_name
 from tupli_mcap.recording.tail import read_tail
@@ -91,7 +93,9 @@ class RecoveryReport:
 
     @property
     def saved(self) -> bool:
-        """Whether anything could be saved."""
+        """Whether anything could be saved: of a damaged recording, whether a step was."""
+        if self.kind == "recording" and (self.steps_lost or self.lost or self.damaged):
+            return self.steps > 0
         return bool(self.messages or self.attachments)
 
     @property
@@ -143,9 +147,14 @@ def recover_recording(
         if dry_run:
             with _nowhere() as fd:
                 return _recover(opened, fd, compression)
-        with _replacing(goal) as fd:
+        with _replacing(goal) as (fd, temporary):
             report = _recover(opened, fd, compression)
-            if not report.saved:
+            if report.kind == "recording" and not _signature_fits(temporary):
+                os.ftruncate(fd, os.lseek(fd, 0, os.SEEK_SET))
+                report = _recover(opened, fd, compression, leave_out=SIGNATURE_NAME)
+                report.attachments_lost = [n for n in report.attachments_lost if n != SIGNATURE_NAME]
+                report.notes.append("its signature is left out: it is not of what could be saved")
+            if not (report.saved or report.attachments):
                 raise _NothingSavedError(report)
         report.target = str(goal)
         return report
@@ -174,8 +183,8 @@ def _check(path: Path, goal: Path, *, overwrite: bool, dry_run: bool) -> None:
 
 
 @contextlib.contextmanager
-def _replacing(goal: Path) -> Iterator[int]:
-    """A descriptor of a file that takes the place of `goal` once it is whole."""
+def _replacing(goal: Path) -> Iterator[tuple[int, Path]]:
+    """A descriptor and the path of a file that takes the place of `goal` once it is whole."""
     temporary = goal.with_name(f".{goal.name}.{os.getpid()}.tmp")
     try:
         fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
@@ -183,7 +192,7 @@ def _replacing(goal: Path) -> Iterator[int]:
         raise RecordingError(f"{goal} cannot be written: {err.strerror}; choose a writable place") from err
     try:
         try:
-            yield fd
+            yield fd, temporary
             os.fsync(fd)
         finally:
             os.close(fd)
@@ -203,13 +212,26 @@ def _nowhere() -> Iterator[int]:
         os.close(fd)
 
 
-def _recover(source: Source, fd: int, compression: str) -> RecoveryReport:
+def _signature_fits(path: Path) -> bool:
+    """Whether what was written is still what its signature is of; True if it is not signed."""
+    with Recording(path) as recording:
+        if SIGNATURE_NAME not in recording.attachments:
+            return True
+        try:
+            verify_signature(recording)
+        except (SignatureError, FormatError, MissingExtraError):
+            return False
+    return True
+
+
+def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") -> RecoveryReport:
     if not source.size:
         raise FormatError(f"{source.name} is empty: nothing can be saved from it; delete it")
     tail = read_tail(source)
     notes = []
     if may_be_recording(source, tail):
         gathered = gather(source, tail)
+        gathered.attachments.pop(leave_out, None)
         if is_recording(gathered):
             add_journal(gathered)
             try:
@@ -270,7 +292,7 @@ def _recover_ours(
         report.notes.append("the recording's metadata are lost: it has a new uuid and names no benchmark")
     elif writer.metadata_lost:
         report.notes.append(f"of the recording's metadata, {', '.join(writer.metadata_lost)} are lost")
-    report.damaged = _places(gathered.damages)
+    report.damaged = [*_ends(gathered), *_places(gathered.damages)]
     report.messages = sum(container.counts.values())
     report.attachments = len(container.attachment_indexes) - 1
     report.attachments_lost = _attachments_lost(gathered)
@@ -310,6 +332,17 @@ def _attachments_lost(gathered: Gathered) -> list[str]:
     known = set() if summary is None else set(summary.attachments)
     known |= {attachment_name(gathered.source, damage) or INDEX_NAME for damage in gathered.damages}
     return sorted(known - set(gathered.attachments) - {INDEX_NAME})
+
+
+def _ends(gathered: Gathered) -> list[DamagedPlace]:
+    """Damage of the first and the last bytes of the file, from which nothing is taken."""
+    source, tail = gathered.source, gathered.tail
+    found = []
+    if source.read(0, min(len(MAGIC), source.size)) != MAGIC:
+        found.append(DamagedPlace(0, min(len(MAGIC), source.size), "expected the magic of MCAP"))
+    if tail.finished and tail.summary is None and not tail.why:
+        found.append(DamagedPlace(source.size, 0, "the footer is damaged or cut off"))
+    return found
 
 
 def _places(damages: list[Damage]) -> list[DamagedPlace]:

@@ -71,7 +71,7 @@ def _verify(source: Source, findings: Findings) -> None:
         report.kind = "mcap"
         verify_foreign(source, tail, findings)
         return
-    if not has_summary(source) and tail.index is None:
+    if not has_summary(source) and (tail.index is None or _has_journal(source)):
         report.state = "recording" if live else "unfinished"
         _note_unfinished(source, findings)
     structure = Structure(source, tail, findings)
@@ -90,12 +90,16 @@ def _note_unfinished(source: Source, findings: Findings) -> None:
         "its writer did not finish it; all finished steps are there",
         "append to it, or write a finished copy with tupli-mcap recover",
     )
-    if source.path is not None and not journal_path(source.path).exists():
+    if not _has_journal(source):
         findings.note(
             "journal",
             "there is no journal beside it: steps not yet in a chunk are not here",
             "keep a recording and its journal together",
         )
+
+
+def _has_journal(source: Source) -> bool:
+    return source.path is not None and journal_path(source.path).exists()
 
 
 def _contents(source: Source, structure: Structure, findings: Findings) -> None:
@@ -112,8 +116,9 @@ def _contents(source: Source, structure: Structure, findings: Findings) -> None:
     with recording:
         findings.report.attachments = len(recording.attachments)
         _layout(recording, structure, findings)
-        verify_episodes(recording, findings)
-        _carried(recording, findings)
+        with findings.following(structure.missing):
+            verify_episodes(recording, findings)
+        _carried(recording, structure, findings)
 
 
 def _layout(recording: Recording, structure: Structure, findings: Findings) -> None:
@@ -143,7 +148,7 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
             findings.error("layout", "its schema is not the one its spaces have", channel=channel.topic)
 
 
-def _carried(recording: Recording, findings: Findings) -> None:
+def _carried(recording: Recording, structure: Structure, findings: Findings) -> None:
     """The benchmark and the artifacts, by their digests."""
     for name in recording.attachments:
         try:
@@ -154,7 +159,8 @@ def _carried(recording: Recording, findings: Findings) -> None:
             elif name == "benchmark.json":
                 _benchmark(recording, findings)
             elif name == SIGNATURE_NAME:
-                _signature(recording, findings)
+                with findings.following(structure.missing):
+                    _signature(recording, findings)
         except TupliError as err:
             findings.error("benchmark", str(err).removeprefix(f"{recording.name}: "))
     if "env.cloudpickle" in recording.attachments and "benchmark.json" not in recording.attachments:

@@ -55,9 +55,10 @@ class Structure:
         self._counts: dict[int, int] = {}
         self._latest: dict[int, int] = {}
         self._waiting: _Waiting | None = None
+        self._behind_damage = False
         self._started: set[int] = set()
         self._records = 0
-        self._missing = False  # damage that rows may have been lost with
+        self.missing = False  # damage that rows may have been lost with
         self._ended = False
         self._outside: set[tuple[type[Any], int]] = set()  # definitions outside chunks
 
@@ -78,11 +79,12 @@ class Structure:
 
     def _damaged(self, damage: Damage) -> None:
         self._waiting = None
+        self._behind_damage = True
         if not self._tail.finished and damage.end == self._source.size and self._is_cut(damage):
             what = f"the last record is cut off, {damage.end - damage.offset} bytes are left of it"
             self._findings.note("record", what, "nothing to be done", offset=damage.offset)
             return  # a killed writer's last write
-        self._missing = True
+        self.missing = True
         kind = _KINDS.get(Opcode(damage.opcode), "record") if 0 < damage.opcode < 16 else "record"
         size = damage.end - damage.offset
         self._findings.error(kind, f"{damage.why}; {size} bytes are damaged", offset=damage.offset)
@@ -98,6 +100,7 @@ class Structure:
                 "record", "expected the summary after the end of the data", offset=found.offset
             )
         waiting, self._waiting = self._waiting, None
+        behind_damage, self._behind_damage = self._behind_damage, False
         if waiting is not None and found.opcode != Opcode.MESSAGE_INDEX:
             self._findings.error(
                 "message_index", "expected the message index of the chunk", offset=waiting.offset
@@ -109,7 +112,8 @@ class Structure:
         elif found.attachment is not None:
             self._attachments.append(found.attachment)
         elif found.opcode == Opcode.MESSAGE_INDEX:
-            self._message_index(found, waiting)
+            with self._findings.following(behind_damage):
+                self._message_index(found, waiting)
         elif found.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             record = parse_record(found.opcode, found.body, found.offset, self._source.name)
             self._outside.add((type(record), record.id))
@@ -203,9 +207,9 @@ class Structure:
         topic = self.channels[number].topic if number in self.channels else f"{number}"
         place = {"offset": found.offset, "channel": topic}
         expected = self._counts.get(number, 0)
-        if content.first != expected and not (self._missing and content.first > expected):
+        if content.first != expected and not (self.missing and content.first > expected):
             self._findings.error("rows", f"expected row {expected}, found row {content.first}", **place)
-        if (number in self._started) == bool(content.skip) and not (self._missing and not content.skip):
+        if (number in self._started) == bool(content.skip) and not (self.missing and not content.skip):
             self._findings.error(
                 "chunk", "expected definitions in the first chunk of a channel only", **place
             )
@@ -243,8 +247,8 @@ class Structure:
         }
         for kind, number in sorted((kind.__name__.lower(), number) for kind, number in known - self._outside):
             self._findings.error("layout", f"{kind} {number} is not defined outside of the chunks")
-        if not self._tail.finished:
-            return
+        if not self._tail.finished or self._findings.report.state == "unfinished":
+            return  # its writer was killed, perhaps while it wrote the end
         if self._waiting is not None:
             why = "expected the message index of the chunk"
             self._findings.error("message_index", why, offset=self._waiting.offset)
@@ -255,7 +259,8 @@ class Structure:
         if self._tail.index is not None:
             table = np.array(self._table, CHUNK_ROWS)
             if not np.array_equal(table, self._tail.index.chunks):
-                self._findings.error("index", "the episode index lists other chunks than there are")
+                with self._findings.following(self.missing):
+                    self._findings.error("index", "the episode index lists other chunks than there are")
         if self._tail.summary is None:
             if not self._tail.why:
                 self._findings.error("summary", "the footer is damaged or cut off", offset=self._source.size)
@@ -290,7 +295,8 @@ class Structure:
             if _ordered(opcode, here) != _ordered(opcode, wanted):
                 what = Opcode(opcode).name.lower().replace("_", " ")
                 why = f"its {len(here)} {what} records say other than the data, where there are {len(wanted)}"
-                self._findings.error("summary", why, offset=groups.get(opcode, [start])[0])
+                with self._findings.following(self.missing):
+                    self._findings.error("summary", why, offset=groups.get(opcode, [start])[0])
 
     def _offsets(self, body: memoryview, groups: dict[int, list[int]], offset: int) -> None:
         start, length = int.from_bytes(body[1:9], "little"), int.from_bytes(body[9:17], "little")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import sqlite3
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,8 +85,10 @@ def _recording(path: Path) -> VerifyReport:
         report = verify_recording(path)
         findings = Findings(report)
         if report.kind == "recording" and report.ok:
-            _sidecar(path, findings)
-            _benchmark(path, findings)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of the journal: the report says it
+                _sidecar(path, findings)
+                _benchmark(path, findings)
     except (TupliError, OSError) as err:
         what = str(err).removeprefix(f"{path}: ").removeprefix(f"{path} ")
         Findings(report).error("file", what, advice="give a recording (.mcap) or a directory of them")
