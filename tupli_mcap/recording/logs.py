@@ -27,9 +27,9 @@ __all__ = ["EventLog", "StepLog", "group_records", "iter_records", "leaf_encoder
 
 Sink = Callable[[Rows], None]
 Encoder = Callable[[Any, bytearray, int], None]
+_Record = tuple[int, int, int, bytes]  # channel, sequence, log_time, the whole record
 _HEADER = 64
 _FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
-_CHECKSUM = struct.Struct("<Q")
 
 
 def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
@@ -53,17 +53,25 @@ def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, i
 
 def group_records(data: memoryview, *, sealed: bool = False) -> list[Rows]:
     """The records in `data` by channel, in their order; of a journal (`sealed`), with their `publish_time`."""
-    groups: dict[int, tuple[list[bytes], list[int], list[int], int]] = {}
     whole = bytes(data)
-    for start, end, channel, sequence, log_time in iter_records(data):
+    records = iter_records(data)
+    return _grouped(
+        [(channel, sequence, time, whole[start:end]) for start, end, channel, sequence, time in records],
+        sealed=sealed,
+    )
+
+
+def _grouped(records: Sequence[_Record], *, sealed: bool) -> list[Rows]:
+    groups: dict[int, tuple[list[bytes], list[int], int]] = {}
+    for channel, sequence, log_time, record in records:
         if channel not in groups:
-            groups[channel] = ([], [], [], sequence)
-        parts, sizes, times, _ = groups[channel]
-        parts.append(whole[start:end])
-        sizes.append(end - start)
+            groups[channel] = ([], [], sequence)
+        parts, times, _ = groups[channel]
+        parts.append(record)
         times.append(log_time)
     rows = []
-    for channel, (parts, sizes, times, first) in groups.items():
+    for channel, (parts, times, first) in groups.items():
+        sizes = [len(part) for part in parts]
         offsets = np.zeros(len(sizes), dtype=np.uint64)
         np.cumsum(sizes[:-1], out=offsets[1:])
         joined = bytearray().join(parts)
@@ -92,6 +100,7 @@ class EventLog:
         self.sequences = sequences
         self._sink = sink
         self._time = time_ns
+        self._kept: list[_Record] = []  # what the journal holds, so that a flush need not take it apart
         self._last = 0  # where the last message began
         self._can_drop = False
         self.move(area, buffer)
@@ -109,21 +118,25 @@ class EventLog:
         if time_ns > self._time:
             self._time = time_ns
         time_ns, data, sequences = self._time, b"", self.sequences
+        records: list[_Record] = []
         for channel, body in messages:
             sequence = sequences[channel]
             sequences[channel] = sequence + 1
             front = _FRONT.pack(5, BODY - 9 + len(body), channel, sequence, time_ns)
             tail = CDR_HEADER + body
-            data += front + _CHECKSUM.pack(crc32(tail, crc32(front))) + tail
+            record = front + crc32(tail, crc32(front)).to_bytes(8, "little") + tail
+            records.append((channel, sequence, time_ns, record))
+            data += record
         end = self._position + len(data)
         if end > self._capacity:
             self.flush()
             end = len(data)
             if end > self._capacity:
-                for rows in group_records(memoryview(data), sealed=True):
+                for rows in _grouped(records, sealed=True):
                     self._sink(rows)
                 self._can_drop = False
                 return time_ns
+        self._kept += records
         self._last, self._can_drop = self._position, True
         self._records[self._last : end] = data
         self._position = end
@@ -134,6 +147,7 @@ class EventLog:
         """Takes back the message of the last `append`, which was one of `channel`, unless it is in the file already."""
         if not self._can_drop:
             return
+        self._kept.pop()
         self._position = self._last
         self._commit[0] = self._last
         self.sequences[channel] -= 1
@@ -143,8 +157,10 @@ class EventLog:
         keep_last = keep_last and self._can_drop
         end = self._last if keep_last else self._position
         last = bytes(self._records[end : self._position])
-        for rows in group_records(self._records[:end], sealed=True):
+        kept = self._kept[-1:] if keep_last else []
+        for rows in _grouped(self._kept[: len(self._kept) - len(kept)], sealed=True):
             self._sink(rows)
+        self._kept = kept
         self._commit[0] = 0
         self._records[: len(last)] = last
         self._last, self._position, self._can_drop = 0, len(last), keep_last
