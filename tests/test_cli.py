@@ -696,7 +696,7 @@ class TestSharing:
         env.close()
         ok("bundle", benchmark, "-o", "b.mcap", "--storage", "lab")
         out = ok("import", "b.mcap", "--storage", "other")
-        assert out.splitlines()[0] == "imported 0 of 0 episodes, 1 of 1 artifacts"
+        assert out.splitlines()[0] == "imported 0 of 0 episodes, 1 of 1 artifact"
         assert [item["id"] for item in run("list-artifacts", "--storage", "other", "--json").json] == [
             artifact
         ]

@@ -6,6 +6,8 @@ import json
 import os
 import random
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.doctor import examine
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording import VerifyReport, rewrite
 from tupli_mcap.recording.container import Container
@@ -441,3 +444,82 @@ def test_a_cut_footer_is_not_said_to_be_nothing(tmp_path: Path) -> None:
     assert (report.steps, report.damaged[-1].why) == (300, "the footer is damaged or cut off")
     shown = CliRunner().invoke(app, ["recover", str(path), "--force"])
     assert "nothing was lost" in shown.output
+
+
+# --- what there is to say of what cannot be verified ---
+
+
+def tell(*args: object) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a command."""
+    result = CliRunner().invoke(app, [str(arg) for arg in args])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def unprivileged(*args: object) -> subprocess.CompletedProcess[str]:
+    """A command that permissions hold for, as root's do not."""
+    drop = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
+    if drop and shutil.which("setpriv") is None:
+        pytest.skip("needs setpriv")
+    command = [*drop, sys.executable, "-c", "from tupli_mcap.cli import main; main()", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+
+
+def test_a_missing_file_is_told_with_one_advice(tmp_path: Path) -> None:
+    path = tmp_path / "none.mcap"
+    code, out, _ = tell("verify", path)
+    assert code == 1
+    assert out.splitlines() == [
+        f"{path}: 1 problem (its episodes cannot be read as it is)",
+        "  error: does not exist",
+        "  → give the path of a recording (.mcap)",
+    ]
+
+
+def test_nothing_to_verify_or_to_replay_is_said(tmp_path: Path) -> None:
+    assert tell("verify", tmp_path) == (
+        1, "", "error: there is nothing to verify; give recordings (.mcap) or directories of them\n"
+    )  # fmt: skip
+    (tmp_path / "empty.mcap").touch()
+    code, _, err = tell("verify", "--replay", tmp_path)
+    assert (code, err.count("\n")) == (1, 1)
+    assert err.startswith("error: nothing was replayed")
+
+
+def test_a_lost_journal_is_not_called_all_there(tmp_path: Path) -> None:
+    path = place(next(iter(UNFINISHED)), tmp_path)
+    assert "all finished steps are there" in tell("verify", path)[1]
+    journal_path(path).unlink()
+    _, out, _ = tell("verify", path)
+    assert "no journal beside it" in out
+    with pytest.warns(UserWarning, match="no journal"):
+        found = examine(path)
+    for text in (out, *(finding.message for finding in found.findings)):
+        assert "all finished steps are there" not in text
+
+
+@pytest.mark.parametrize(
+    "command", ["verify", "recover", "ls", "info", "episodes", "doctor", "trust", "import"]
+)
+def test_what_may_not_be_read_fails_and_is_no_usage_error(command: str, tmp_path: Path) -> None:
+    path = place(NAMES[0], tmp_path)
+    path.chmod(0)
+    done = unprivileged(command, path, *(["--storage", tmp_path / "lab"] if command == "import" else []))
+    assert done.returncode == 1
+    assert "permissions" in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("command", ["verify", "ls"])
+def test_a_closed_directory_stops_nothing(command: str, tmp_path: Path) -> None:
+    (tmp_path / "closed").mkdir(mode=0)
+    shutil.copy(place(NAMES[0], tmp_path), tmp_path / "open.mcap")
+    done = unprivileged(command, tmp_path / "closed", tmp_path / "open.mcap")
+    assert done.returncode == 1
+    assert "cannot be read" in done.stdout + done.stderr
+    assert "open.mcap" in done.stdout
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    with pytest.raises(RecordingError, match="a device, a pipe or a socket"):
+        recover_recording(tmp_path / "pipe.mcap")

@@ -24,7 +24,8 @@ FilterText = Annotated[
     typer.Option("--filter", metavar="FILTER", help="Such as 'metadata.score > -200 and env = 0'."),
 ]
 StoragePath = Annotated[
-    Path, typer.Option("--storage", envvar="TUPLI_MCAP_STORAGE", help="The storage's directory.")
+    Path,
+    typer.Option("--storage", envvar="TUPLI_MCAP_STORAGE", help="The storage's directory.", readable=False),
 ]
 DEFAULT_STORAGE = Path("_local_storage")
 _SHORTEST_ID = 4

@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 __all__ = [
     "Column",
     "bytes_of",
+    "counted",
     "number",
     "numbers",
     "print_facts",
@@ -171,6 +172,11 @@ def number(value: float | None, decimals: int = 2) -> str:
     if abs(value) >= 1e9 or abs(value) < 10.0**-decimals:
         return f"{value:.3g}"
     return f"{value:,.{decimals}f}"
+
+
+def counted(count: int, noun: str) -> str:
+    """A count of things: `1 episode`, `2,000 episodes`."""
+    return f"{number(count)} {noun}{'' if count == 1 else 's'}"
 
 
 def numbers(values: Sequence[float | None], decimals: int = 2) -> list[str]:

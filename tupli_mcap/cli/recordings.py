@@ -13,6 +13,7 @@ from tupli_mcap.cli.options import FilterText, Json, Limit, filter_of, open_stor
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
+    counted,
     number,
     numbers,
     print_facts,
@@ -122,7 +123,7 @@ def _record(
         print_json({**summary._asdict(), "path": str(summary.path)})
         return
     print(
-        f"{summary.path}: {number(summary.episodes)} episodes, {number(summary.steps)} steps, "
+        f"{summary.path}: {counted(summary.episodes, 'episode')}, {counted(summary.steps, 'step')}, "
         f"mean return {number(summary.return_mean)}, {bytes_of(summary.size)} in {summary.seconds:.1f} s"
     )
 
@@ -130,15 +131,17 @@ def _record(
 def _ls(
     paths: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[PATH]...", help="Files, directories, storages; here by default."),
+        typer.Argument(
+            metavar="[PATH]...", help="Files, directories, storages; here by default.", readable=False
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
     """List recordings in files and directories.
 
     RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; or recovered:
-    its writer was killed or failed, and all steps that were finished are there. Deleted episodes
-    of a storage are not counted.
+    its writer was killed or failed, and all steps that were finished are there, if its journal is.
+    Deleted episodes of a storage are not counted.
     """
     from tupli_mcap.storage.listing import list_recordings
 
@@ -202,7 +205,8 @@ def _info(
 
 def _episodes(
     path: Annotated[
-        Path, typer.Argument(metavar="FILE|STORAGE", help="A recording, or a storage's directory.")
+        Path,
+        typer.Argument(metavar="FILE|STORAGE", help="A recording, or a storage's directory.", readable=False),
     ],
     filter_text: FilterText = None,
     limit: Limit = None,
@@ -277,7 +281,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
     states = {
         "complete": "complete",
         "recording": "a writer is at work on it",
-        "recovered": "recovered: its writer did not finish it, all finished steps are here",
+        "recovered": "recovered: its writer did not finish it, what its chunks and its journal hold is here",
     }
     environment = d.environment or "none attached"
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)

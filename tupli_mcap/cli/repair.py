@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import Column, bytes_of, number, print_json, print_table, print_wrapped
+from tupli_mcap.cli.output import Column, bytes_of, counted, number, print_json, print_table, print_wrapped
 from tupli_mcap.cli.replaying import Replays, episode_numbers
 
 if TYPE_CHECKING:
@@ -32,7 +33,9 @@ def register(app: typer.Typer) -> None:
 def _verify(
     paths: Annotated[
         list[Path],
-        typer.Argument(metavar="PATH...", help="Recordings, other MCAP files, directories, storages."),
+        typer.Argument(
+            metavar="PATH...", help="Recordings, other MCAP files, directories, storages.", readable=False
+        ),
     ],
     replay: Annotated[
         bool, typer.Option("--replay", help="Also replay recordings and compare, bit for bit.")
@@ -70,8 +73,18 @@ def _verify(
             replays.add(Path(report.path), quiet=as_json)
     if as_json:
         print_json({**found.to_json(), **({} if replays is None else {"replays": replays.to_json()})})
+    elif not found.files:
+        print(
+            "error: there is nothing to verify; give recordings (.mcap) or directories of them",
+            file=sys.stderr,
+        )
+        raise typer.Exit(1)
     elif len(found.files) > 1:
         print(f"{number(len(found.files))} verified, {number(len(found.damaged))} damaged")
+    if replays is not None and not replays.tried and not as_json:
+        print(
+            "error: nothing was replayed: there is no undamaged recording; recover one first", file=sys.stderr
+        )
     if not found.ok or (replays is not None and not replays.ok):
         raise typer.Exit(1)
 
@@ -85,14 +98,14 @@ def _print_verified(report: VerifyReport) -> None:
         "its episodes cannot be read as it is"
         if unread
         else {
-            "recording": f"{number(report.episodes)} episodes, {number(report.steps)} steps",
-            "mcap": f"no recording, {number(report.messages)} messages",
-            "storage": f"{number(report.attachments)} artifacts",
+            "recording": f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}",
+            "mcap": f"no recording, {counted(report.messages, 'message')}",
+            "storage": f"{counted(report.attachments, 'artifact')}",
         }[report.kind]
     )
     roots = [problem for problem in report.problems if not problem.follows]
     count = sum(problem.severity == "error" for problem in roots) + report.more
-    damage = f"{number(count)} {'problem' if count == 1 else 'problems'}"
+    damage = counted(count, "problem")
     state = "" if report.state == "complete" else f", {_STATES[report.state]}"
     print(f"{report.path}: {'ok' if report.ok else damage} ({facts}{state})")
     for problem in roots[:_SHOWN]:
@@ -110,7 +123,9 @@ def _print_verified(report: VerifyReport) -> None:
 
 
 def _recover(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file, a recording or any other.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="An MCAP file, a recording or any other.", readable=False)
+    ],
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="FILE", help="By default FILE.recovered.mcap, beside it."),
@@ -181,9 +196,9 @@ def _summary(report: RecoveryReport) -> str:
         also = f"; {number(report.attachments)} {files} {where}" if report.attachments else ""
         return f"{report.source}: {lost} could be saved{also}"
     if report.kind == "mcap":
-        what = f"{number(report.messages)} messages and {number(report.attachments)} attachments"
+        what = f"{counted(report.messages, 'message')} and {counted(report.attachments, 'attachment')}"
     else:
-        what = f"{number(report.episodes)} episodes, {number(report.steps)} steps"
+        what = f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}"
     state = (
         "nothing was wrong with it" if report.intact else "nothing was lost" if _lost_nothing(report) else ""
     )
@@ -199,7 +214,7 @@ def _losses(report: RecoveryReport) -> list[str]:
     found = []
     if report.steps_lost or report.episodes_lost:
         found.append(
-            f"lost: {number(report.steps_lost)} steps, {number(report.episodes_lost)} whole episodes"
+            f"lost: {counted(report.steps_lost, 'step')}, {counted(report.episodes_lost, 'whole episode')}"
         )
     for what, episodes in (
         ("the start (seed, options, info) of episodes", report.starts_lost),
@@ -210,9 +225,9 @@ def _losses(report: RecoveryReport) -> list[str]:
             shown = ", ".join(str(n) for n in episodes[:_SHOWN])
             found.append(f"lost: {what} {shown}{' ...' if len(episodes) > _SHOWN else ''}")
     if report.infos_lost:
-        found.append(f"lost: {number(report.infos_lost)} infos of steps")
+        found.append(f"lost: {counted(report.infos_lost, 'info')} of steps")
     for topic, count in report.messages_lost.items():
-        found.append(f"lost: {number(count)} messages of {topic}")
+        found.append(f"lost: {counted(count, 'message')} of {topic}")
     if report.attachments_lost:
         found.append(f"lost: the attachments {', '.join(report.attachments_lost[:_SHOWN])}")
     if report.journal == "missing":

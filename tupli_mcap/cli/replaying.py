@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
-from tupli_mcap.cli.output import number, step_progress, terminal_width, time_of, visible
+from tupli_mcap.cli.output import counted, number, step_progress, terminal_width, time_of, visible
 from tupli_mcap.errors import FormatError, TupliError
 
 if TYPE_CHECKING:
@@ -48,6 +48,11 @@ class Replays:
         self._episodes = episodes
         self._write = write
         self._found: list[tuple[Path, Certificate | None, str]] = []
+
+    @property
+    def tried(self) -> bool:
+        """Whether there was a recording to replay."""
+        return bool(self._found)
 
     @property
     def ok(self) -> bool:
@@ -132,11 +137,9 @@ def _outcome(c: Certificate) -> str:
     if not c.agrees:
         return "nothing could be checked" if c.recorded.episodes else "there is no episode to replay"
     if c.complete:
-        return f"all {number(c.agreed.episodes)} episodes ({number(c.agreed.steps)} steps) agree bit for bit"
-    steps = f"{number(c.agreed.steps)} of {number(c.recorded.steps)} steps"
-    return (
-        f"{number(c.agreed.episodes)} of {number(c.recorded.episodes)} episodes ({steps}) agree bit for bit"
-    )
+        return f"all {counted(c.agreed.episodes, 'episode')} ({counted(c.agreed.steps, 'step')}) agree bit for bit"
+    steps = f"{number(c.agreed.steps)} of {counted(c.recorded.steps, 'step')}"
+    return f"{number(c.agreed.episodes)} of {counted(c.recorded.episodes, 'episode')} ({steps}) agree bit for bit"
 
 
 def _lines(c: Certificate, seconds: float, *, written: bool) -> list[str]:
@@ -149,14 +152,14 @@ def _lines(c: Certificate, seconds: float, *, written: bool) -> list[str]:
         hidden = c.diverged.episodes - 1 - _SHOWN
         lines += [f"... and {number(hidden)} more episodes that diverge; see --json"] if hidden > 0 else []
         lines.append(
-            f"{number(c.diverged.episodes)} of {number(c.chosen.episodes)} episodes diverge, "
+            f"{number(c.diverged.episodes)} of {counted(c.chosen.episodes, 'episode')} diverge, "
             f"{number(c.agreed.episodes)} agree bit for bit"
         )
         lines += [
             f"{name} {then} when recorded, {now} now" for name, (then, now) in c.version_differences.items()
         ]
     lines += [
-        f"{number(s.episodes)} episodes could not be checked, the first is {s.first}: {s.reason}"
+        f"{counted(s.episodes, 'episode')} could not be checked, the first is {s.first}: {s.reason}"
         for s in c.skipped
     ]
     versions = ", ".join(f"{name} {version}" for name, version in c.versions.items())
@@ -168,9 +171,9 @@ def _lines(c: Certificate, seconds: float, *, written: bool) -> list[str]:
 def _spread(first: Any) -> list[str]:
     if first.kind == "error" or not first.differing_steps:
         return []
-    counted = f"{number(first.differing_steps)} of the episode's {number(first.length)} steps differ"
+    differ = f"{number(first.differing_steps)} of the episode's {counted(first.length, 'step')} differ"
     if first.largest_difference is None:
-        return [counted]
+        return [differ]
     return [
-        f"{counted}; of {first.leaf} by at most {first.largest_difference:.3g}, at step {first.largest_step}"
+        f"{differ}; of {first.leaf} by at most {first.largest_difference:.3g}, at step {first.largest_step}"
     ]

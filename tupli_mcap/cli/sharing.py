@@ -17,7 +17,7 @@ from tupli_mcap.cli.options import (
     full_id,
     open_storage,
 )
-from tupli_mcap.cli.output import bytes_of, number, print_facts, print_json
+from tupli_mcap.cli.output import bytes_of, counted, number, print_facts, print_json
 
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["register"]
 
 Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write (.mcap).")]
-Source = Annotated[Path, typer.Argument(metavar="FILE", help="A recording.")]
+Source = Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)]
 
 
 def register(app: typer.Typer) -> None:
@@ -44,7 +44,12 @@ def _bundle(
     filter_text: FilterText = None,
     sign: Annotated[
         Path | None,
-        typer.Option("--sign", metavar="KEY", help="Sign it with this private Ed25519 key (OpenSSH or PEM)."),
+        typer.Option(
+            "--sign",
+            metavar="KEY",
+            help="Sign it with this private Ed25519 key (OpenSSH or PEM).",
+            readable=False,
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -132,8 +137,8 @@ def _import(
         return
     verb = "would import" if dry_run else "imported"
     print(
-        f"{verb} {number(preview.new_episodes)} of {number(preview.episodes)} episodes, "
-        f"{number(preview.new_artifacts)} of {number(preview.artifacts)} artifacts"
+        f"{verb} {number(preview.new_episodes)} of {counted(preview.episodes, 'episode')}, "
+        f"{number(preview.new_artifacts)} of {counted(preview.artifacts, 'artifact')}"
     )
     print_facts([("benchmark", preview.benchmark_id), ("name", preview.name)])
 
@@ -161,4 +166,6 @@ def _print_written(path: Path, as_json: bool) -> None:
     if as_json:
         print_json(item._asdict())
     else:
-        print(f"{path}: {number(item.episodes)} episodes, {number(item.steps)} steps, {bytes_of(item.size)}")
+        print(
+            f"{path}: {counted(item.episodes, 'episode')}, {counted(item.steps, 'step')}, {bytes_of(item.size)}"
+        )

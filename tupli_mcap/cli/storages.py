@@ -15,7 +15,7 @@ from tupli_mcap.cli.options import (
     filter_of,
     open_storage,
 )
-from tupli_mcap.cli.output import Column, bytes_of, number, print_json, print_table, short_ids, when
+from tupli_mcap.cli.output import Column, bytes_of, counted, number, print_json, print_table, short_ids, when
 from tupli_mcap.cli.recordings import print_episodes
 
 __all__ = ["register"]
@@ -125,7 +125,9 @@ def _compact(
         print_table(columns, rows, empty="nothing to compact")
         return
     print(
-        f"rewrote {number(len(found))} recordings, freed {bytes_of(freed)}" if found else "nothing to compact"
+        f"rewrote {counted(len(found), 'recording')}, freed {bytes_of(freed)}"
+        if found
+        else "nothing to compact"
     )
 
 
@@ -140,4 +142,4 @@ def _reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False)
     if as_json:
         print_json({"storage": str(storage_path), "episodes": episodes})
     else:
-        print(f"{storage_path}: {number(episodes)} episodes")
+        print(f"{storage_path}: {counted(episodes, 'episode')}")

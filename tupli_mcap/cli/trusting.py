@@ -26,7 +26,9 @@ def register(app: typer.Typer) -> None:
 
 
 def _trust(
-    file: Annotated[Path | None, typer.Argument(metavar="[FILE]", help="A recording.")] = None,
+    file: Annotated[
+        Path | None, typer.Argument(metavar="[FILE]", help="A recording.", readable=False)
+    ] = None,
     show: Annotated[bool, typer.Option("--show", help="Only show what would run.")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Trust it no longer.")] = False,
     key: Annotated[

@@ -130,10 +130,8 @@ def _unreadable(name: str, err: TupliError | OSError) -> Finding:
     message = str(err)
     if isinstance(err, OSError) and not isinstance(err, TupliError):
         message = err.strerror or str(err)
-    return Finding(
-        UNREADABLE,
-        Severity.ERROR,
-        name,
-        " ".join(message.split()),
-        "see what can be saved with 'tupli-mcap recover'",
-    )
+    message, suggestion = " ".join(message.split()), "see what can be saved with 'tupli-mcap recover'"
+    if isinstance(err, RecordingError):  # nothing is wrong with the file, or there is none
+        said, _, advice = message.partition("; ")
+        message, suggestion = said, advice or "give a recording (.mcap) or a directory of them"
+    return Finding(UNREADABLE, Severity.ERROR, name, message, suggestion)

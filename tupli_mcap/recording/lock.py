@@ -267,7 +267,7 @@ def is_locked(path: Path) -> bool:
         RecordingError: the system does not say (too many open files, say): there may be one.
     """
     try:
-        fd = open_private(path, os.O_RDONLY)
+        fd = open_private(path, os.O_RDONLY | os.O_NONBLOCK)  # no pipe is waited for
         try:
             return not _try_shared(fd)
         finally:

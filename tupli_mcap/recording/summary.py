@@ -70,7 +70,10 @@ def check_magic(source: Source) -> None:
         raise FormatError(f"{source.name} is empty; expected an MCAP recording, so delete it or record again")
     head = source.read(0, min(len(MAGIC), source.size))
     if head != MAGIC:
-        raise FormatError(f"{source.name}: expected an MCAP file, found {head!r} at its start")
+        raise FormatError(
+            f"{source.name}: expected an MCAP file, found {head!r} at its start; "
+            "give a recording (.mcap), or see what tupli-mcap recover can save"
+        )
 
 
 def has_summary(source: Source) -> bool:
@@ -210,5 +213,6 @@ def read_metadata(source: Source, index: MetadataIndex) -> dict[str, str]:
 def foreign(source: Source, why: str) -> FormatError:
     """The error for an MCAP file that is no recording of ours."""
     return FormatError(
-        f"{source.name} is an MCAP file, but no tupli_mcap recording ({why}); expected the profile {PROFILE!r}"
+        f"{source.name} is an MCAP file, but no tupli_mcap recording ({why}); expected the profile {PROFILE!r} "
+        "(tupli-mcap verify and recover take any MCAP file)"
     )

@@ -85,12 +85,13 @@ def _note_unfinished(source: Source, findings: Findings) -> None:
     if findings.report.state == "recording":
         findings.note("file", "a writer is at work on it", "verify it again once it is closed")
         return
+    here = _has_journal(source)
     findings.note(
         "file",
-        "its writer did not finish it; all finished steps are there",
+        f"its writer did not finish it{'; all finished steps are there' if here else ''}",
         "append to it, or write a finished copy with tupli-mcap recover",
     )
-    if not _has_journal(source):
+    if not here:
         findings.note(
             "journal",
             "there is no journal beside it: steps not yet in a chunk are not here",

@@ -12,6 +12,7 @@ from tupli_mcap.recording.describe import state_of
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.storage.scan import scan
 from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.system import refused
 
 __all__ = ["Compactable", "ListedRecording", "compactable", "find_recordings", "list_recordings"]
 
@@ -46,10 +47,13 @@ def find_recordings(path: Path) -> list[Path]:
     """A file itself, or the recordings (`.mcap`) below a directory, sorted.
 
     Raises:
-        RecordingError: there is no such file or directory.
+        RecordingError: there is no such file or directory, or the directory cannot be read.
     """
     if path.is_dir():
-        return [path / item.relative for item in sorted(scan(path))]
+        try:
+            return [path / item.relative for item in sorted(scan(path))]
+        except OSError as err:
+            raise RecordingError(f"{path} cannot be read: {refused(err)}") from err
     if not path.exists():
         raise RecordingError(f"{path} does not exist; give a recording (.mcap) or a directory of them")
     return [path]

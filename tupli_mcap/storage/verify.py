@@ -72,7 +72,15 @@ def verify_paths(paths: Iterable[Path]) -> Iterator[VerifyReport]:
     """
     for path in paths:
         if path.is_dir():
-            for item in sorted(scan(path)):
+            try:
+                found = sorted(scan(path))
+            except OSError as err:
+                report = VerifyReport(str(path), kind="storage")
+                advice = "check the directory's permissions"
+                Findings(report).error("file", f"it cannot be read: {err.strerror}", advice=advice)
+                yield report
+                continue
+            for item in found:
                 yield _recording(path / item.relative)
             yield from _directory(path)
         else:
@@ -90,8 +98,10 @@ def _recording(path: Path) -> VerifyReport:
                 _sidecar(path, findings)
                 _benchmark(path, findings)
     except (TupliError, OSError) as err:
-        what = str(err).removeprefix(f"{path}: ").removeprefix(f"{path} ")
-        Findings(report).error("file", what, advice="give a recording (.mcap) or a directory of them")
+        said, _, advice = str(err).removeprefix(f"{path}: ").removeprefix(f"{path} ").partition("; ")
+        Findings(report).error(
+            "file", said, advice=advice or "give a recording (.mcap) or a directory of them"
+        )
     return report
 
 

@@ -36,7 +36,7 @@ def unfinished(chart: Chart) -> Iterator[Finding]:
         chart.path,
         "a writer is at work on it"
         if alive
-        else "its writer did not finish it; all finished steps are there",
+        else "its writer did not finish it; what its chunks and its journal hold is there",
         "examine it again when the writer is done" if alive else "finish it with 'tupli-mcap recover'",
     )
 
