@@ -568,3 +568,21 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
     assert report.notes == ["its signature is left out: it is not of what could be saved"]
     assert report.attachments_lost == []
     assert verify_recording(str(report.target)).problems == []
+
+
+@pytest.mark.parametrize("lost", ["benchmark.json", "env.cloudpickle"])
+def test_appending_makes_no_environment_of_two_halves(lost: str, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", steps=60)
+    hit(path, next(item for item in places(path) if item.attachment and item.attachment.name == lost))
+    report, recording = recovered(path)
+    recording.close()
+    assert report.attachments_lost == [lost]
+    target = Path(str(report.target))
+    other = Sampler(BOX, spaces.Discrete(3), length=40)
+    other.steps = 1234567  # its pickle differs
+    with RecordEpisodes(other, target, mode="a") as env:
+        roll(env, 20)
+    found = verify_recording(target)
+    assert (found.errors, found.steps) == ([], 80)
+    with Recording(target) as appended:
+        assert {"benchmark.json", "env.cloudpickle"} - set(appended.attachments) == {lost}
