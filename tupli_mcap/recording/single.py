@@ -76,9 +76,10 @@ class SingleRecorder:
         """
         if self._writer.closed or self._writer.failed is not None:
             self._closed()
-        self._keep_start_for(facts)
-        self.end(INTERRUPTED, metadata)
-        self._writer.sync_step()  # before the running state is written over
+        if self._reset is not None or self._episode is not None:
+            self._keep_start_for(facts)
+            self.end(INTERRUPTED, metadata)
+            self._writer.sync_step()  # before the running state is written over
         rows = self._writer.rows
         self.put = self._unreset
         if rows is None:
@@ -91,7 +92,8 @@ class SingleRecorder:
             rows.put_state(state)
             self._episode = self._writer.start_episode(0, rows.count, facts)
             self.put = rows.put
-        self._writer.sync_step()
+        if self._writer.syncs_steps:
+            self._writer.sync_step()
 
     def _keep_start_for(self, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""

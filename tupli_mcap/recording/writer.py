@@ -90,7 +90,7 @@ class RecordingWriter:
         self.rows: SingleRows | StepLog | None = None
         self.vector: VectorRows | list[StepLog] | None = None
         self._durable = options.durability != "os"
-        self._sealed = options.durability == "step"
+        self.syncs_steps = self._sealed = options.durability == "step"
         self.images: list[list[ImageRows]] = []
         self.worker = ChunkWorker(self.add_chunk)
         self.events: EventLog | None = None
@@ -266,11 +266,11 @@ class RecordingWriter:
             self.lost_streams.discard(env)
             if reset.goes_on:
                 self._append_start(env, first_row, ResetFacts(None, None, "", "{}", reset.time_ns, True))
-        message, start_time, row = self._append_start(env, first_row, reset)
+        started = self._append_start(env, first_row, reset)
         self.next_episode += 1
-        return StartedEpisode(message.episode, env, first_row, start_time, message.seed_number, row)
+        return started
 
-    def _append_start(self, env: int, first_row: int, reset: ResetFacts) -> tuple[EpisodeStart, int, int]:
+    def _append_start(self, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
         seed = reset.seed if reset.seed is not None else reset.drawn_seed
         message = EpisodeStart(
             self.next_episode,
@@ -282,9 +282,10 @@ class RecordingWriter:
             reset.options,
             reset.info,
         )
-        row = self._events().sequences[self.channels.start]
-        start_time = self._events().append(reset.time_ns, (self.channels.start, message.encode()))
-        return message, start_time, row
+        events, channel = self._events(), self.channels.start
+        row = events.sequences[channel]
+        start_time = events.append(reset.time_ns, (channel, message.encode()))
+        return StartedEpisode(self.next_episode, env, first_row, start_time, seed, row)
 
     def drop_start(self) -> None:
         """Takes back the last `/episode_start`, the last event: a reset without a step is no episode."""
