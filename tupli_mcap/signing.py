@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from tupli_mcap import trust
 from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
+from tupli_mcap.system import refused
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -167,8 +168,12 @@ def _read(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             return file.read(_MAX_KEY_FILE)
+    except FileNotFoundError as err:
+        raise SignatureError(
+            f"the key {str(path)!r} cannot be read: {err.strerror}; give the path of a key"
+        ) from err
     except OSError as err:
-        raise SignatureError(f"the key {str(path)!r} cannot be read: {err.strerror}") from err
+        raise SignatureError(f"the key {str(path)!r} cannot be read: {refused(err)}") from err
 
 
 class _Library(NamedTuple):

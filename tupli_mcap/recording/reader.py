@@ -168,10 +168,12 @@ class Recording:
 
     @property
     def observation_space(self) -> gym.Space[Any]:
+        """The space of the states, of one sub-environment; RecordingError before the first step."""
         return self.layout.observation_space
 
     @property
     def action_space(self) -> gym.Space[Any]:
+        """The space of the actions, of one sub-environment; RecordingError before the first step."""
         return self.layout.action_space
 
     @property
