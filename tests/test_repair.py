@@ -32,7 +32,9 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import RecoveryReport
+from tupli_mcap.recording.attach import add_attachments
 from tupli_mcap.recording.headers import message_headers
+from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.signature import SIGNATURE_NAME, check_signature, sign_recording
 from tupli_mcap.recording.source import PathSource
 from tupli_mcap.recording.survey import Damage, Found, Survey
@@ -586,3 +588,30 @@ def test_appending_makes_no_environment_of_two_halves(lost: str, tmp_path: Path)
     assert (found.errors, found.steps) == ([], 80)
     with Recording(target) as appended:
         assert {"benchmark.json", "env.cloudpickle"} - set(appended.attachments) == {lost}
+
+
+def test_episodes_lost_at_the_end_are_named_by_their_starts(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", steps=300)
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+    last = chunks(path, "/step")[-3:]
+    ends = chunks(path, "/episode_end")
+    index = next(item for item in places(path) if item.attachment and item.attachment.name == INDEX_NAME)
+    for found in [*last, *ends, index]:
+        hit(path, found)
+    report, recording = recovered(path)
+    with recording:
+        assert_true(steps_of(recording), wanted, report)
+    assert report.episodes_lost >= 1
+
+
+def test_an_attachment_replaced_before_another_is_no_damage(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", steps=60)
+    for content in (b"{}", b'{"a": 1}'):
+        add_attachments(path, {"replay-certificate.json": ("application/json", content)})
+        add_attachments(path, {f"card-{len(content)}.txt": ("text/plain", b"x")})
+    assert verify_recording(path).problems == []
+    report, recording = recovered(path)
+    with recording:
+        assert recording.read_attachment("replay-certificate.json") == b'{"a": 1}'
+    assert report.intact

@@ -133,6 +133,7 @@ class _Planner:
         known = [s.episode for s in found] + list(told.starts) + list(told.ends) + list(told.index)
         told_next = (gathered.metadata or {}).get("next_episode", "")
         self._next = max([*known, int(told_next) - 1 if told_next.isdecimal() else -1]) + 1
+        self._totals: dict[int, int] = {}
         self._taken: set[int] = set()
         self._ended: set[int] = set()  # old episodes whose last step is here
         self._here: dict[int, Ranges] = {}  # rows that are kept, by sub-environment
@@ -147,6 +148,7 @@ class _Planner:
         for _, end in self._told.ends.values():
             stops[end.env] = max(stops.get(end.env, 0), end.first_row + end.length)
         totals = [self._total(env, channels, stops.get(env, 0)) for env in range(len(channels.steps))]
+        self._totals = dict(enumerate(totals))
         for segment in self._found:
             last = self._here[segment.env][-1][1] == totals[segment.env]
             self._plan.episodes.append(self._episode(segment, last=last and self._knows_total))
@@ -262,4 +264,5 @@ class _Planner:
         _, start = self._told.starts[number]
         here = self._here.get(start.env, [])
         after = bisect.bisect_right(here, (start.first_row, _END))
-        return after < len(here) and not (after and start.first_row < here[after - 1][1])
+        behind = after == len(here) and start.first_row >= self._totals.get(start.env, 0)
+        return not behind and not (after and start.first_row < here[after - 1][1])

@@ -265,6 +265,8 @@ class Structure:
             if not self._tail.why:
                 self._findings.error("summary", "the footer is damaged or cut off", offset=self._source.size)
             return
+        last = {index.name: index for index in self._attachments}  # one that was replaced may keep its bytes
+        self._attachments = sorted(last.values(), key=lambda index: index.offset)
         self._summary(self._tail.summary.start)
 
     def _summary(self, start: int) -> None:
