@@ -388,3 +388,45 @@ def test_what_recovery_makes_keeps_the_order_of_time(tmp_path: Path) -> None:
     abandon(path, run, 0)
     vector(path, mode="a").close()
     assert verify_recording(path).ok
+
+
+def test_the_journal_of_a_renamed_recording_is_kept(tmp_path: Path) -> None:
+    path, kept = tmp_path / "r.mcap", tmp_path / "kept.mcap"
+    abandon(path, cart_pole, 7)
+    path.rename(kept)
+    with (
+        pytest.warns(UserWarning, match="journal of another recording and is kept as"),
+        cart_pole(path) as env,
+    ):
+        roll(env, 5)
+    (journal,) = tmp_path.glob("*.journal")
+    with pytest.warns(UserWarning, match=rf"{journal.name} is its journal: rename that to kept"):
+        assert Recording(kept).num_steps == 0
+    journal.rename(journal_path(kept))
+    assert (Recording(kept).num_steps, Recording(path).num_steps) == (7, 5)
+
+
+def test_a_writer_leaves_the_journal_of_another_one_alone(tmp_path: Path) -> None:
+    """A recording is renamed while it is written, and another one begins at its path."""
+    path, moved = tmp_path / "r.mcap", tmp_path / "moved.mcap"
+    first = cart_pole(path)
+    roll(first, 3)
+    path.rename(moved)
+    second = cart_pole(path)
+    with pytest.warns(UserWarning, match="is kept as"):
+        roll(second, 4)
+    first.close()
+    assert [p.name for p in tmp_path.glob("*.journal")] == ["r.mcap.journal"]
+    assert Recording(path).num_steps == 4
+    second.close()
+    assert Recording(moved).num_steps == 3
+    assert list(tmp_path.glob("*.journal")) == []
+
+
+def test_replacing_a_recording_removes_its_journal(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    abandon(path, cart_pole, 7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cart_pole(path, mode="w").close()
+    assert list(tmp_path.iterdir()) == []

@@ -16,6 +16,7 @@ import errno
 import json
 import mmap
 import os
+import re
 import struct
 import warnings
 import zlib
@@ -46,6 +47,7 @@ _HEAD = struct.Struct("<8sII")
 PAGE = 4096
 _LOG_HEADER = 64
 _MAX_HEADER = 64 << 20
+_UUID = re.compile("[0-9a-f]{32}")
 
 
 def journal_path(path: str | os.PathLike[str]) -> Path:
@@ -137,7 +139,7 @@ class Journal:
         header, self.offsets, size = _plan(areas, self.info)
         self._temporary = temporary = path.with_name(path.name + ".tmp")
         try:
-            self._map = _create(temporary, size)
+            self._map, self._status = _create(temporary, size)
             self._map[: len(header)] = header
         except OSError as err:
             with contextlib.suppress(OSError):
@@ -149,11 +151,13 @@ class Journal:
     def publish(self, *, durable: bool = False) -> None:
         """Puts the journal in its place, instead of one that may be there; until then it is not found.
 
-        With `durable` it is on the disk before its name is.
+        With `durable` it is on the disk before its name is. The journal of another recording is kept, and a warning
+        says where: that recording may have been renamed without it.
         """
         if durable:
             self.sync()
         try:
+            _set_aside(self.path, self.info.get("uuid"))
             self._temporary.replace(self.path)
         except OSError as err:
             with contextlib.suppress(OSError):
@@ -195,19 +199,46 @@ class Journal:
             ) from err
 
     def close(self, *, unlink: bool) -> None:
-        """Lets go of the map (freed with its last view) and, with `unlink`, removes the file.
+        """Lets go of the map (freed with its last view) and, with `unlink`, removes the file, if it is still this one.
 
         Warns if it cannot be removed: the recording is finished, and the file of no use.
         """
-        if unlink:
+        if not unlink:
+            return
+        for place in (self.path, _aside(self.path, str(self.info.get("uuid")))):
             try:
-                self.path.unlink(missing_ok=True)
+                if os.path.samestat(place.stat(), self._status):
+                    place.unlink()
+            except FileNotFoundError:
+                pass
             except OSError as err:
                 warnings.warn(
-                    f"{self.path}: the recording is finished, but its journal cannot be removed "
+                    f"{place}: the recording is finished, but its journal cannot be removed "
                     f"({err.strerror}); delete it",
                     stacklevel=2,
                 )
+
+
+def _aside(path: Path, uuid: str) -> Path:
+    """Where the journal of a recording goes if another one needs its name."""
+    return journal_in(path.parent, path.with_name(path.name.removesuffix(".journal")), uuid)
+
+
+def _set_aside(path: Path, uuid: Any) -> None:
+    """Renames the journal of another recording than that of `uuid`."""
+    try:
+        found = str(journal_info(path).get("uuid"))
+    except (OSError, FormatError):  # none, or none that can be read
+        return
+    if found == uuid or not _UUID.fullmatch(found):
+        return
+    kept = _aside(path, found)
+    path.rename(kept)
+    warnings.warn(
+        f"{path} was the journal of another recording and is kept as {kept.name}: if that recording was renamed, "
+        "rename its journal accordingly; if it was deleted, delete this too",
+        stacklevel=2,
+    )
 
 
 def _plan(areas: list[Area], info: Mapping[str, Any]) -> tuple[bytes, dict[str, int], int]:
@@ -226,11 +257,11 @@ def _place(areas: list[Area], header: int) -> tuple[dict[str, int], int]:
     return offsets, offset
 
 
-def _create(path: Path, size: int) -> mmap.mmap:
+def _create(path: Path, size: int) -> tuple[mmap.mmap, os.stat_result]:
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | getattr(os, "O_CLOEXEC", 0), 0o644)
     try:
         _reserve(fd, size)
-        return mmap.mmap(fd, size)
+        return mmap.mmap(fd, size), os.fstat(fd)
     finally:
         os.close(fd)
 

@@ -34,7 +34,9 @@ from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow,
 from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_info, journal_path
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog, StepLog
+from tupli_mcap.recording.recover import head
 from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
+from tupli_mcap.recording.source import PathSource
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.worker import ChunkWorker
 from tupli_mcap.system import refused
@@ -130,6 +132,7 @@ class RecordingWriter:
             resume(self)
             self._old_journal = self.journal_place
             return
+        replaced = _uuid_of(self._place) if self.options.mode == "w" else ""
         try:
             os.ftruncate(self.lock.fd, 0)
         except OSError as err:
@@ -151,6 +154,8 @@ class RecordingWriter:
         for name, (media_type, data) in (self.options.attachments or {}).items():
             self.container.add_attachment(name, media_type, data, now)
         self.lock.publish()
+        if replaced:
+            self._remove_old_journal(journal_path(self._place), replaced)
 
     # ---- the first step
 
@@ -491,7 +496,7 @@ class RecordingWriter:
             if self.journal is not None:
                 self.journal.close(unlink=True)
             elif self._old_journal is not None:
-                self._remove_old_journal(self._old_journal)
+                self._remove_old_journal(self._old_journal, self.uuid)
         except BaseException as err:
             if self.journal is not None:
                 self.journal.close(unlink=False)
@@ -505,11 +510,11 @@ class RecordingWriter:
             if self._broken_off:  # by Ctrl-C: the file is finished all the same
                 self._finish_broken_off()
 
-    def _remove_old_journal(self, place: Path) -> None:
+    def _remove_old_journal(self, place: Path, uuid: str) -> None:
         """What a killed writer left of its journal, and of one that was not in its place yet."""
         unnamed = place.with_name(f"{place.name}.tmp")
         with contextlib.suppress(OSError, FormatError):
-            if journal_info(place).get("uuid") == self.uuid:
+            if journal_info(place).get("uuid") == uuid:
                 place.unlink()
         unnamed.unlink(missing_ok=True)
 
@@ -522,7 +527,7 @@ class RecordingWriter:
             if self._is_cut:
                 self._place.unlink()
             if self._old_journal is not None:
-                self._remove_old_journal(self._old_journal)
+                self._remove_old_journal(self._old_journal, self.uuid)
         self.lock.release()
 
     def _finish_broken_off(self) -> None:
@@ -564,6 +569,15 @@ class _Whole:
     ) -> None:
         if err is not None and not isinstance(err, StepError):
             self._writer.stop(err)
+
+
+def _uuid_of(path: Path) -> str:
+    """The UUID of a recording that is there; empty if there is none."""
+    if not path.is_file():
+        return ""
+    with contextlib.suppress(RecordingError, FormatError), contextlib.closing(PathSource(path)) as source:
+        return head(source).get("uuid", "")
+    return ""
 
 
 def _checked(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:
