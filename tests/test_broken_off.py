@@ -191,3 +191,38 @@ def test_a_reset_that_fails_ends_the_episode(tmp_path: Path) -> None:
     assert [(e.states[:, 0].tolist(), e.final_state[0], e.end) for e in episodes] == [
         ([0.0], 1.0, "interrupted")
     ] * 2
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_a_step_broken_off_in_the_environment_is_followed_by_a_reset(tmp_path: Path, vector: bool) -> None:
+    """The environment may have moved on: the next step would be one from a state to the one after the next."""
+
+    class Broken(gym.Wrapper[Any, Any, Any, Any]):
+        breaks = False
+
+        def step(self, action: Any) -> Any:
+            result = self.env.step(action)
+            if self.breaks:
+                raise KeyboardInterrupt
+            return result
+
+    inner, path = Broken(scripted("box")), tmp_path / "r.mcap"
+    env: Any = (
+        RecordVector(gym.vector.SyncVectorEnv([lambda: inner]), path)
+        if vector
+        else RecordEpisodes(inner, path)
+    )
+    action = env.action_space.sample()
+    with env:
+        env.reset()
+        env.step(action)
+        inner.breaks = True
+        with pytest.raises(KeyboardInterrupt):
+            env.step(action)
+        inner.breaks = False
+        with pytest.raises(StepError, match="could not be recorded; call env.reset"):
+            env.step(action)
+        env.reset()
+        env.step(action)
+    assert [[_number(x) for x in step] for step in transitions(path)] == [[0, 1], [0, 1]]
+    assert [episode.end for episode in Recording(path).episodes] == ["interrupted"] * 2

@@ -129,8 +129,16 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         return self._writer.closed
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        result = self.env.step(action)
-        state, reward, terminal, timeout, info = result
+        try:
+            result = self.env.step(action)
+            state, reward, terminal, timeout, info = result
+        except Exception:  # a step that the environment refuses may be no step
+            raise
+        except (
+            BaseException
+        ):  # Ctrl-C: wherever the environment is now, it is not where the last step has led to
+            self._recorder.refuse(self._taken_metadata())
+            raise
         try:
             self._recorder.put(action, state, reward, terminal, timeout)
         except StepError:

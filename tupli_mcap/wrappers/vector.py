@@ -101,7 +101,13 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         self._finalizer = weakref.finalize(self, self._recorder.close)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        result = self.env.step(actions)
+        try:
+            result = self.env.step(actions)
+        except Exception:  # a step that an environment refuses may be no step
+            raise
+        except BaseException:  # Ctrl-C: some environments may have taken it
+            self._recorder.refuse()
+            raise
         states, rewards, terminals, timeouts, infos = result
         if self._writer.closed:
             raise RecordingError(f"{self.path} is closed; wrap the environment again to record")
