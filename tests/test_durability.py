@@ -9,11 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
-from power_loss import KINDS, check, crash, record
+from environments import Scripted
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from power_loss import KINDS, OTHER_BOOT, check, crash, record
 
 from tupli_mcap import FileStorage, FormatError, RecordEpisodes, Recording, RecordingError, TupliEnvWrapper
 from tupli_mcap.recording import journal_path, writer
+from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 
 @pytest.mark.parametrize("durability", ["step", "chunk", "os"])
@@ -155,3 +160,93 @@ def test_a_damaged_seal_is_not_passed_on(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="cut off or damaged"):
         copy.write_bytes(path.read_bytes()[:100])
         Recording(copy)
+
+
+def counting(size: int, length: int = 10**9) -> gym.Env[Any, Any]:
+    space = spaces.Box(-1, 1e9, (size,), np.float32)
+    return Scripted(lambda n: np.full(size, n, np.float32), space, length=length)
+
+
+def opened(path: Path, kind: str, **options: Any) -> Any:
+    if kind == "single":
+        return RecordEpisodes(counting(100), path, chunk_size=8000, **options)
+    return RecordVector(SyncVectorEnv([lambda: counting(100)] * 2), path, **options)
+
+
+@pytest.mark.parametrize("kind", ["single", "vector"])
+def test_a_row_that_was_being_written_over_does_not_pass_for_the_old_one(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file lost its last chunks, and some sectors of the journal are as they were a while before."""
+    monkeypatch.setattr(writer, "boot_id", lambda: OTHER_BOOT)
+    path, place = tmp_path / "live.mcap", tmp_path / "r.mcap"
+    env = opened(path, kind)
+    env.reset(seed=1)
+    files, journals = {}, {}
+    env.step(env.action_space.sample())
+    area = env._writer.journal.row_area("steps")
+    start, size = env._writer.journal.offsets["steps"], area.row_size
+    for n in range(1, 2 * area.rows + 12):
+        if n < 12:
+            env.flush()
+            files[n] = path.read_bytes()
+        if n >= 2 * area.rows - 1:
+            journals[n] = journal_path(path).read_bytes()
+        env.step(env.action_space.sample())
+    before = journals[2 * area.rows - 1]
+    for n, file in files.items():
+        now = journals[2 * area.rows + n]
+        cut = -(-(start + n * size + 60) // 512) * 512  # behind the sector that the row begins in
+        for journal in (now, before[:cut] + now[cut:], now[:cut] + before[cut:]):
+            place.write_bytes(file)
+            journal_path(place).write_bytes(journal)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                recording = Recording(place)
+            for episode in recording.episodes:
+                assert (
+                    episode.states[:, -1].tolist()
+                    == episode.states[:, 0].tolist()
+                    == list(range(len(episode)))
+                )
+    env.close()
+
+
+def test_no_final_state_is_made_of_the_next_episodes_first_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Under same-step autoreset, the row that ends an episode reached the disk, and its final state did not."""
+    monkeypatch.setattr(writer, "boot_id", lambda: OTHER_BOOT)
+    path, place = tmp_path / "live.mcap", tmp_path / "r.mcap"
+    envs = SyncVectorEnv([lambda: counting(2, 3)], autoreset_mode=AutoresetMode.SAME_STEP)
+    env = RecordVector(envs, path, durability="step")
+    env.reset(seed=1)
+    for _ in range(2):
+        env.step(env.action_space.sample())
+    before = journal_path(path).read_bytes()
+    at = env._writer.journal.offsets["events"]  # type: ignore[union-attr]
+    shutil.copy(path, place)
+    env.step(env.action_space.sample())
+    journal_path(place).write_bytes(journal_path(path).read_bytes()[:at] + before[at:])
+    with Recording(place) as recording:
+        (episode,) = recording.episodes
+        assert (len(episode), episode.end, episode.final_state) == (3, "terminal", None)
+    env.close()
+
+
+def test_the_running_state_of_a_variable_layout_outlives_a_switch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "boot_id", lambda: OTHER_BOOT)
+    path, place = tmp_path / "live.mcap", tmp_path / "r.mcap"
+    env = RecordEpisodes(
+        Scripted(lambda n: f"{n:0100}", spaces.Text(100)), path, durability="step", chunk_size=500
+    )
+    env.reset(seed=1)
+    for n in range(1, 9):
+        env.step(0)
+        shutil.copy(path, place)
+        shutil.copy(journal_path(path), journal_path(place))
+        (episode,) = Recording(place).episodes
+        assert (len(episode), episode.final_state) == (n, f"{n:0100}")
+    env.close()

@@ -98,6 +98,7 @@ class SingleRows:
         self._dtype = layout.step_message.dtype
         self._area = area
         self._buffer = buffer
+        self._sequence: Array = np.frombuffer(buffer, self._dtype)["#sequence"].reshape(2, area.rows + 1)
         self._channel = channel
         self._sink = sink
         self._half = 0
@@ -141,6 +142,8 @@ class SingleRows:
         area, half = self._area, self._half
         spare = half * area.half + area.rows * area.row_size
         self._half = 1 - half
+        # a power loss may leave a part of what is written over these rows, and not the chunk they are in
+        self._sequence[self._half] = HOLE
         start = self._half * area.half
         self._buffer[start : start + self._state_end] = self._buffer[spare : spare + self._state_end]
         flushed, self._flushed = self._flushed, 0

@@ -242,14 +242,16 @@ def running_record(
             state = bytes(body[8 : MessageDecoder(layout).state(body)])
         except FormatError:
             continue
-        if not contents.torn or _last_seal(contents, _half(contents, area, half)) == zlib.crc32(state):
+        if not contents.torn or _running_seal(contents, area, sequence) == zlib.crc32(state):
             return state
     return None
 
 
-def _last_seal(contents: JournalContents, data: memoryview) -> int | None:
-    """The checksum of the state that follows the last committed record."""
-    last = None
-    for start, *_ in _whole_records(contents, data):
-        last = seal_of(data, start)[1]
-    return last
+def _running_seal(contents: JournalContents, area: LogArea, sequence: int) -> int | None:
+    """The checksum of the state of the running record, which will have `sequence`, from the record before it."""
+    for half in range(area.halves):
+        data = _half(contents, area, half)
+        for start, _, _, found, _ in _whole_records(contents, data):
+            if found == sequence - 1:
+                return seal_of(data, start)[1]
+    return None

@@ -146,6 +146,7 @@ class VectorRows:
     def _switch(self) -> None:
         half, rows, flushed = self._half, self._area.rows, self._flushed
         self._half = 1 - half
+        self._sequence[self._half] = HOLE  # see SingleRows
         end = self._state_end
         self._state_bytes[self._half, :, 0, BODY:end] = self._state_bytes[half, :, rows, BODY:end]
         self._row = self._flushed = 0
