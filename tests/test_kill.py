@@ -18,9 +18,10 @@ from killing.check import Found, problems_of
 from killing.kinds import KINDS
 from killing.moments import MOMENTS, die
 
-from tupli_mcap import RecordEpisodes, Recording
+from tupli_mcap import RecordEpisodes, Recording, recover_recording
 from tupli_mcap.recording.journal import Journal
 from tupli_mcap.recording.vector import VectorRecorder
+from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -134,6 +135,30 @@ def test_an_end_under_same_step_autoreset_keeps_its_own_final_state(tmp_path: Pa
     (episode,) = Recording(tmp_path / "r.mcap").episodes
     assert (len(episode), episode.end) == (3, "terminal")
     assert episode.final_state.tolist() == [3]
+
+
+def test_a_final_state_of_a_step_that_was_not_finished_is_not_taken(tmp_path: Path) -> None:
+    """Under same-step autoreset it is there before the step is."""
+
+    def record() -> None:
+        maker = lambda: Scripted(  # noqa: E731
+            lambda i: np.array([i], np.float32), spaces.Box(0, 9, (1,), np.float32), length=3
+        )
+        env = RecordVector(
+            SyncVectorEnv([maker], autoreset_mode=AutoresetMode.SAME_STEP), tmp_path / "r.mcap"
+        )
+        env.reset(seed=1)
+        for _ in range(2):
+            env.step(env.action_space.sample())
+        VectorRows.put = lambda *_: die()  # type: ignore[method-assign]
+        env.step(env.action_space.sample())
+
+    in_a_process_that_dies(record)
+    recover_recording(tmp_path / "r.mcap", tmp_path / "recovered.mcap")
+    for name in ("r.mcap", "recovered.mcap"):
+        (episode,) = Recording(tmp_path / name).episodes
+        assert (len(episode), episode.end) == (2, "interrupted")
+        assert episode.final_state.tolist() == [2]
 
 
 def test_images_stay_with_their_steps_when_a_killed_recording_goes_on(tmp_path: Path) -> None:

@@ -105,6 +105,9 @@ class Gathered:
     pieces: dict[int, list[Piece]] = field(default_factory=dict)
     damages: list[Damage] = field(default_factory=list)
     states: dict[int, bytes] = field(default_factory=dict)
+    final_lost: bool = (
+        False  # after a power loss: a state may be the one after a final state that is not here
+    )
     journal: str = "none"
     notes: list[str] = field(default_factory=list)
     awaited: ChunkRecords | None = None  # the last chunk's, whose message index comes next

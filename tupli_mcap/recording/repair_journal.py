@@ -80,6 +80,7 @@ def _merge(gathered: Gathered, journal: JournalContents) -> None:
         if isinstance(area, LogArea):
             _add_log(gathered, journal, area)
     starts = _starts(gathered, channels)
+    gathered.final_lost = journal.torn and bool(journal.info.get("vector"))
     for env, channel in enumerate(channels.steps):
         if layout.constant:
             state = _add_rows(gathered, journal, layout, env, channel, starts)

@@ -207,9 +207,13 @@ class _Planner:
         told = self._told.ends.get(segment.episode)
         if told is not None and not told[1].has_final_state:
             return None
-        if segment.episode in self._told.finals:
+        ended = segment.terminal or segment.timeout
+        running = closing and told is None
+        # as in recovery: one that is here may be of a step that was not finished, the state of the next episode
+        unfinished = running and not ended and not self._gathered.tail.finished
+        if segment.episode in self._told.finals and not unfinished:
             return self._told.finals[segment.episode]
-        if closing and told is None and segment.env in self._gathered.states:
+        if running and segment.env in self._gathered.states and not (ended and self._gathered.final_lost):
             return -1
         self._plan.lost_finals.append(segment.episode)
         return None
