@@ -69,7 +69,7 @@ class Worker:
         number = self.now.value
         if number != self.seen:
             self.seen, self.since = number, time.monotonic()
-        return number >= 0 and time.monotonic() - self.since > 3 * SECONDS
+        return number >= 0 and time.monotonic() - self.since > 15 * SECONDS
 
 
 def run(options: argparse.Namespace) -> int:

@@ -95,6 +95,10 @@ class Catalog:
         """Tells the file of the last transaction from others that were at its path."""
         return self._database.identity
 
+    def is_current(self) -> bool:
+        """Whether nobody has replaced or deleted the file of the last transaction."""
+        return self._database.is_current()
+
     def close(self) -> None:
         """Release the file; closing twice is fine."""
         self._finalizer()

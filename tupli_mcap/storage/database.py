@@ -111,6 +111,10 @@ class Database:
         """Tells the file of the last transaction from others that were at its path."""
         return self._identity
 
+    def is_current(self) -> bool:
+        """Whether the file of the last transaction still is the one at its path."""
+        return self._identity == _identity(self.path)
+
     def _refresh(self) -> None:
         if self._closed:
             raise StorageError(f"catalog {str(self.path)!r} is closed")
@@ -139,7 +143,14 @@ class Database:
                     engine.dispose()
                 if not is_there:
                     self._create()
-        self._identity = _identity(self.path)
+        # The number of a file may be given again once nobody has it open: a connection of ours stays in the pool.
+        found = None
+        while found is None or found != _identity(self.path):
+            self._engine.dispose()
+            found = _identity(self.path)
+            with self._engine.connect():
+                pass
+        self._identity = found
 
     def _create(self) -> None:
         """Make an empty catalog beside the file and rename it: nobody ever opens half of one."""

@@ -85,7 +85,7 @@ class RecordingFiles:
             self.sync()
             with contextlib.suppress(CatalogMovedError):
                 found = ask()
-                if self._catalog.identity == self._synced:
+                if self._catalog.identity == self._synced and self._catalog.is_current():
                     return found
         raise StorageError(f"the catalog of {str(self._root)!r} is replaced all the time; try again later")
 
