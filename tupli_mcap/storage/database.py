@@ -23,6 +23,7 @@ from tupli_mcap.storage.tables import APPLICATION_ID, METADATA, VERSION
 from tupli_mcap.system import refused
 
 _BUSY_MS: Final = 30_000
+_ATTEMPTS: Final = 100  # to open a file that others replace
 _CACHE_KIB: Final = 32 * 1024  # rows come in no order of a declared key: its index has to stay in memory
 _UNUSABLE: Final = (
     sqlite3.SQLITE_FULL,
@@ -134,23 +135,33 @@ class Database:
 
     def _open(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if not _is_catalog(self._engine, self.path):
-            with _exclusive(self.path):
-                engine = _engine(self.path)
-                try:
-                    is_there = _is_catalog(engine, self.path)  # another process was first
-                finally:
-                    engine.dispose()
-                if not is_there:
-                    self._create()
-        # The number of a file may be given again once nobody has it open: a connection of ours stays in the pool.
-        found = None
-        while found is None or found != _identity(self.path):
-            self._engine.dispose()
+        for _ in range(_ATTEMPTS):
+            if not _is_catalog(self._engine, self.path):
+                self._make()
+            # The number of a file may be given again once nobody has it open: a connection of ours stays in the pool.
             found = _identity(self.path)
-            with self._engine.connect():
-                pass
-        self._identity = found
+            try:
+                with self._engine.connect():
+                    pass
+            except DBAPIError:
+                if found is not None and found == _identity(self.path):
+                    raise
+            if found is not None and found == _identity(self.path):
+                self._identity = found
+                return
+            self._engine.dispose()  # it was replaced or deleted meanwhile
+        raise CatalogMovedError(f"catalog {str(self.path)!r} is replaced all the time")
+
+    def _make(self) -> None:
+        """Make the catalog, unless another process is first."""
+        with _exclusive(self.path):
+            engine = _engine(self.path)
+            try:
+                is_there = _is_catalog(engine, self.path)
+            finally:
+                engine.dispose()
+            if not is_there:
+                self._create()
 
     def _create(self) -> None:
         """Make an empty catalog beside the file and rename it: nobody ever opens half of one."""
