@@ -19,6 +19,7 @@ from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.durability import sync_file
 from tupli_mcap.recording.journal import journal_info, journal_path, recorded_journal
 from tupli_mcap.recording.recover import belongs, head, misplaced_journal
+from tupli_mcap.recording.signed import SIGNATURE_NAME
 from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.summary import check_magic, has_summary
 
@@ -51,6 +52,11 @@ def resume(writer: RecordingWriter) -> None:
         if asked and asked != found:
             raise RecordingError(
                 f"{writer.path} holds episodes of benchmark {found or 'none'!r}, not {asked!r}; record to another file"
+            )
+        if SIGNATURE_NAME in contents.attachments:
+            raise RecordingError(
+                f"{writer.path} is signed, and would be another recording than the one that was signed; record to "
+                "another file"
             )
         _check_nothing_behind(writer, contents, source)
         _check_aligned(writer, contents)
