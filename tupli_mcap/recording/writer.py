@@ -268,17 +268,11 @@ class RecordingWriter:
     def start_episode(self, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
         """Writes `/episode_start`; it is taken back by `drop_start` if no step follows."""
         if env in self.lost_streams:
-            self.lost_streams.discard(env)
-            if reset.goes_on:
-                self._append_start(env, first_row, ResetFacts(None, None, "", "{}", reset.time_ns, True))
-        started = self._append_start(env, first_row, reset)
-        self.next_episode += 1
-        return started
-
-    def _append_start(self, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
+            self._mark_lost_stream(env, first_row, reset)
         seed = reset.seed if reset.seed is not None else reset.drawn_seed
+        number, events, channel = self.next_episode, self._events(), self.channels.start
         message = EpisodeStart(
-            self.next_episode,
+            number,
             env,
             first_row,
             reset.seed is not None,
@@ -287,10 +281,17 @@ class RecordingWriter:
             reset.options,
             reset.info,
         )
-        events, channel = self._events(), self.channels.start
         row = events.sequences[channel]
         start_time = events.append(reset.time_ns, (channel, message.encode()))
-        return StartedEpisode(self.next_episode, env, first_row, start_time, seed, row)
+        self.next_episode = number + 1
+        return StartedEpisode(number, env, first_row, start_time, seed, row)
+
+    def _mark_lost_stream(self, env: int, first_row: int, reset: ResetFacts) -> None:
+        """A start without a step says that the random stream of this episode is not that of the one before."""
+        self.lost_streams.discard(env)
+        if reset.goes_on:
+            self.start_episode(env, first_row, ResetFacts(None, None, "", "{}", reset.time_ns, True))
+            self.keep_start()
 
     def drop_start(self) -> None:
         """Takes back the last `/episode_start`, the last event: a reset without a step is no episode."""
