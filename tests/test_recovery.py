@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.recording import recover
+from tupli_mcap.recording.container import Container
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)
@@ -430,3 +433,62 @@ def test_replacing_a_recording_removes_its_journal(tmp_path: Path) -> None:
         warnings.simplefilter("error")
         cart_pole(path, mode="w").close()
     assert list(tmp_path.iterdir()) == []
+
+
+def killed(work: Callable[[], Any]) -> None:
+    """Runs `work` in a child that is killed at its end, if not before; what it returns is not closed."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            _held = work()
+        finally:
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(pid, 0)
+
+
+def test_killed_again_while_appending_nothing_changes(tmp_path: Path) -> None:
+    """Wherever the appending process came with what it took from the journal."""
+
+    def recorder(path: Path, **kwargs: Any) -> Any:
+        envs = gym.vector.SyncVectorEnv(
+            [lambda i=i: Sampler(spaces.Text(9), spaces.Discrete(9), length=50 + i) for i in range(3)]
+        )
+        return RecordVector(envs, path, **kwargs)
+
+    def told(path: Path) -> list[Any]:
+        with Recording(path) as recording:
+            return [(e.number, e.env, e.end, len(e), e.start_time, e.end_time) for e in recording.episodes]
+
+    first = tmp_path / "first.mcap"
+
+    def record() -> Any:
+        env = recorder(first)
+        env.reset(seed=1)
+        for _ in range(20):
+            env.step(env.action_space.sample())
+        return env
+
+    killed(record)
+    known = told(first)
+    assert [how for _, _, how, *_ in known] == ["interrupted"] * 3
+    for chunks in range(8):
+        path = tmp_path / f"{chunks}.mcap"
+        for source, target in ((first, path), (journal_path(first), journal_path(path))):
+            shutil.copy(source, target)
+
+        def append(path: Path = path, chunks: int = chunks) -> Any:
+            left, real = [chunks], Container.add_chunk
+
+            def add_chunk(self: Container, rows: Any) -> None:
+                if not left[0]:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                left[0] -= 1
+                real(self, rows)
+
+            Container.add_chunk = add_chunk  # type: ignore[method-assign]
+            return recorder(path, mode="a")
+
+        killed(append)
+        assert told(path) == known
+        recorder(path, mode="a").close()
+        assert told(path) == known

@@ -83,26 +83,25 @@ class _Episodes:
         return beyond
 
     def make_start(self, start: EpisodeStart, time: int) -> None:
-        row, time = self._make(time, (_START, start.encode()))
+        row, time = self._make(time, _START, start.encode())
         self.starts[start.episode] = (row, time, start)
 
     def make_end(self, end: EpisodeEnd, time: int, final_state: bytes | None) -> None:
         """`final_state`: the body of the message, if there is none yet."""
-        if final_state is None:
-            row, time = self._make(time, (_END, end.encode()))
-        else:
-            self.finals[end.episode] = self._counts[_FINAL]
-            row, time = self._make(time, (_FINAL, final_state), (_END, end.encode()))
+        if final_state is not None:
+            self.finals[end.episode], _ = self._make(time, _FINAL, final_state)
+        row, time = self._make(time, _END, end.encode())
         self.ends[end.episode] = (row, time, end)
 
-    def _make(self, time: int, *messages: tuple[str, bytes]) -> tuple[int, int]:
-        """The row of the last message, and the time of all: theirs, or the latest of their channels."""
-        time = max(time, *(self._times[topic] for topic, _ in messages))
-        row = 0
-        for topic, body in messages:
-            channel, row = self._channels[topic], self._counts[topic]
-            self.made.append((channel, row, time, record(channel, row, time, body)))
-            self._counts[topic], self._times[topic] = row + 1, time
+    def _make(self, time: int, topic: str, body: bytes) -> tuple[int, int]:
+        """The row of a message, and its time: that asked for, or the latest of its channel.
+
+        Each channel by itself: how far an earlier recovery came with the others must change nothing.
+        """
+        channel, row = self._channels[topic], self._counts[topic]
+        time = max(time, self._times[topic])
+        self.made.append((channel, row, time, record(channel, row, time, body)))
+        self._counts[topic], self._times[topic] = row + 1, time
         return row, time
 
 
