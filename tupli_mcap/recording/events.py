@@ -20,6 +20,8 @@ __all__ = [
     "TIMEOUT",
     "EpisodeEnd",
     "EpisodeStart",
+    "encode_end",
+    "encode_start",
     "read_strings",
     "record",
 ]
@@ -105,11 +107,7 @@ class EpisodeStart(NamedTuple):
         return int(self.seed) if _SEED.fullmatch(self.seed) else None
 
     def encode(self) -> bytes:
-        fixed = _START.pack(*self[:5])
-        texts = (self.seed, self.options, self.reset_info)
-        if texts == ("", "", "{}"):
-            return fixed + _PLAIN_START
-        return fixed + _strings(_START.size, *(text.encode() for text in texts))
+        return encode_start(*self)
 
     @classmethod
     def decode(cls, body: memoryview) -> EpisodeStart:
@@ -120,6 +118,23 @@ class EpisodeStart(NamedTuple):
 
 
 _PLAIN_START = _strings(_START.size, b"", b"", b"{}")
+
+
+def encode_start(
+    episode: int,
+    env: int,
+    first_row: int,
+    seed_given: bool,
+    continued: bool,
+    seed: str,
+    options: str,
+    info: str,
+) -> bytes:
+    """The CDR body of an `EpisodeStart` of these fields."""
+    fixed = _START.pack(episode, env, first_row, seed_given, continued)
+    if seed == "" and options == "" and info == "{}":
+        return fixed + _PLAIN_START
+    return fixed + _strings(_START.size, seed.encode(), options.encode(), info.encode())
 
 
 class EpisodeEnd(NamedTuple):
@@ -135,8 +150,7 @@ class EpisodeEnd(NamedTuple):
     metadata: str
 
     def encode(self) -> bytes:
-        fixed = _END.pack(*self[:7])
-        return fixed + (_PLAIN_END if self.metadata == "{}" else _strings(_END.size, self.metadata.encode()))
+        return encode_end(*self)
 
     @classmethod
     def decode(cls, body: memoryview) -> EpisodeEnd:
@@ -149,3 +163,18 @@ class EpisodeEnd(NamedTuple):
 
 
 _PLAIN_END = _strings(_END.size, b"{}")
+
+
+def encode_end(
+    episode: int,
+    env: int,
+    first_row: int,
+    length: int,
+    total: float,
+    end: int,
+    has_final: bool,
+    metadata: str,
+) -> bytes:
+    """The CDR body of an `EpisodeEnd` of these fields."""
+    fixed = _END.pack(episode, env, first_row, length, total, end, has_final)
+    return fixed + (_PLAIN_END if metadata == "{}" else _strings(_END.size, metadata.encode()))

@@ -52,6 +52,7 @@ class EpisodeRow(NamedTuple):
     end: int
 
 
+_Fields = tuple[int, int, float, int, int, int | None, int, int, int, int, int, int]  # of an EpisodeRow
 _ROW = struct.Struct("<QQdqqqQQqQIIIBB2x")
 
 
@@ -63,7 +64,7 @@ class IndexBuilder:
         self.metadata = bytearray()
         self.count = 0
 
-    def add(self, row: EpisodeRow, metadata: str) -> None:
+    def add(self, row: EpisodeRow | _Fields, metadata: str) -> None:
         text = b"" if metadata == "{}" else metadata.encode()
         first, length, total, start, end, seed, start_row, end_row, final_row, number, env, how = row
         if seed is None or not -(2**63) <= seed < 2**63:  # larger ones are in `/episode_start`

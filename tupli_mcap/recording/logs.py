@@ -23,11 +23,13 @@ from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.journal import LogArea
 
-__all__ = ["EventLog", "StepLog", "group_records", "iter_records", "leaf_encoders"]
+__all__ = ["Encoder", "EventLog", "StepLog", "group_records", "iter_records", "leaf_encoders"]
 
 Sink = Callable[[Rows], None]
 Encoder = Callable[[Any, bytearray, int], None]
-_Record = tuple[int, int, int, bytes]  # channel, sequence, log_time, the whole record
+_Groups = dict[
+    int, tuple[int, list[bytes], list[int]]
+]  # by channel: the first sequence, whole records, log_times
 _HEADER = 64
 _FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
 
@@ -54,27 +56,23 @@ def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, i
 def group_records(data: memoryview, *, sealed: bool = False) -> list[Rows]:
     """The records in `data` by channel, in their order; of a journal (`sealed`), with their `publish_time`."""
     whole = bytes(data)
-    records = iter_records(data)
-    return _grouped(
-        [(channel, sequence, time, whole[start:end]) for start, end, channel, sequence, time in records],
-        sealed=sealed,
-    )
+    groups: _Groups = {}
+    for start, end, channel, sequence, time_ns in iter_records(data):
+        _, records, times = groups.setdefault(channel, (sequence, [], []))
+        records.append(whole[start:end])
+        times.append(time_ns)
+    return _rows_of(groups, sealed=sealed)
 
 
-def _grouped(records: Sequence[_Record], *, sealed: bool) -> list[Rows]:
-    groups: dict[int, tuple[list[bytes], list[int], int]] = {}
-    for channel, sequence, log_time, record in records:
-        if channel not in groups:
-            groups[channel] = ([], [], sequence)
-        parts, times, _ = groups[channel]
-        parts.append(record)
-        times.append(log_time)
+def _rows_of(groups: _Groups, *, sealed: bool) -> list[Rows]:
     rows = []
-    for channel, (parts, times, first) in groups.items():
-        sizes = [len(part) for part in parts]
+    for channel, (first, records, times) in groups.items():
+        if not records:
+            continue
+        sizes = [len(record) for record in records]
         offsets = np.zeros(len(sizes), dtype=np.uint64)
         np.cumsum(sizes[:-1], out=offsets[1:])
-        joined = bytearray().join(parts)
+        joined = bytearray().join(records)
         at = np.array(times, dtype="<u8")
         if sealed:
             _publish(joined, offsets, at)
@@ -100,8 +98,9 @@ class EventLog:
         self.sequences = sequences
         self._sink = sink
         self._time = time_ns
-        self._kept: list[_Record] = []  # what the journal holds, so that a flush need not take it apart
+        self._groups: _Groups = {}  # what the journal holds, so that a flush need not take it apart
         self._last = 0  # where the last message began
+        self._last_channel = 0
         self._can_drop = False
         self.move(area, buffer)
 
@@ -117,27 +116,33 @@ class EventLog:
         """Adds messages (channel, CDR body), all or none of them after a crash; returns their log_time."""
         if time_ns > self._time:
             self._time = time_ns
-        time_ns, data, sequences = self._time, b"", self.sequences
-        records: list[_Record] = []
+        else:
+            time_ns = self._time
+        end = self._position
+        for _, body in messages:
+            end += BODY + len(body)
+        if end > self._capacity:
+            end -= self._position
+            self.flush()
+        data, sequences, groups, channel = b"", self.sequences, self._groups, 0
         for channel, body in messages:
             sequence = sequences[channel]
             sequences[channel] = sequence + 1
             front = _FRONT.pack(5, BODY - 9 + len(body), channel, sequence, time_ns)
             tail = CDR_HEADER + body
             record = front + crc32(tail, crc32(front)).to_bytes(8, "little") + tail
-            records.append((channel, sequence, time_ns, record))
             data += record
-        end = self._position + len(data)
-        if end > self._capacity:
-            self.flush()
-            end = len(data)
-            if end > self._capacity:
-                for rows in _grouped(records, sealed=True):
-                    self._sink(rows)
-                self._can_drop = False
-                return time_ns
-        self._kept += records
-        self._last, self._can_drop = self._position, True
+            group = groups.get(channel)
+            if group is None:
+                groups[channel] = (sequence, [record], [time_ns])
+            else:
+                group[1].append(record)
+                group[2].append(time_ns)
+        if end > self._capacity:  # more than the journal holds
+            self._write_groups()
+            self._can_drop = False
+            return time_ns
+        self._last, self._last_channel, self._can_drop = self._position, channel, True
         self._records[self._last : end] = data
         self._position = end
         self._commit[0] = end
@@ -147,24 +152,34 @@ class EventLog:
         """Takes back the message of the last `append`, which was one of `channel`, unless it is in the file already."""
         if not self._can_drop:
             return
-        self._kept.pop()
+        self._pop(channel)
         self._position = self._last
         self._commit[0] = self._last
         self.sequences[channel] -= 1
 
+    def _pop(self, channel: int) -> tuple[bytes, int]:
+        _, records, times = self._groups[channel]
+        return records.pop(), times.pop()
+
     def flush(self, *, keep_last: bool = False) -> None:
         """Writes the records to the file; with `keep_last` the last one stays, so that it can still be dropped."""
         keep_last = keep_last and self._can_drop
-        end = self._last if keep_last else self._position
-        last = bytes(self._records[end : self._position])
-        kept = self._kept[-1:] if keep_last else []
-        for rows in _grouped(self._kept[: len(self._kept) - len(kept)], sealed=True):
-            self._sink(rows)
-        self._kept = kept
+        last, kept = b"", {}
+        if keep_last:
+            channel = self._last_channel
+            last, time_ns = self._pop(channel)
+            kept[channel] = (self.sequences[channel] - 1, [last], [time_ns])
+        self._write_groups()
+        self._groups = kept
         self._commit[0] = 0
         self._records[: len(last)] = last
         self._last, self._position, self._can_drop = 0, len(last), keep_last
         self._commit[0] = len(last)
+
+    def _write_groups(self) -> None:
+        for rows in _rows_of(self._groups, sealed=True):
+            self._sink(rows)
+        self._groups = {}
 
 
 def leaf_encoders(layout: StepLayout, leaves: Sequence[Leaf]) -> list[tuple[Leaf, Encoder]]:

@@ -87,13 +87,17 @@ class SingleRecorder:
             self._reset = (copy.deepcopy(state), facts)
             self.put = self._first
             return
-        with self._writer.whole:
-            rows.begin_episode(self._writer.next_episode)
+        writer = self._writer
+        try:  # as `writer.whole`, which costs a call more
+            rows.begin_episode(writer.next_episode)
             rows.put_state(state)
-            self._episode = self._writer.start_episode(0, rows.count, facts)
+            self._episode = writer.start_episode(0, rows.count, facts)
             self.put = rows.put
-        if self._writer.syncs_steps:
-            self._writer.sync_step()
+        except BaseException as err:
+            writer.stop(err)
+            raise
+        if writer.syncs_steps:
+            writer.sync_step()
 
     def _keep_start_for(self, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""
@@ -106,8 +110,11 @@ class SingleRecorder:
     def end(self, end: int, metadata: str = "{}", *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
         if self._episode is not None and self._writer.failed is None:
-            with self._writer.whole:
+            try:  # as `writer.whole`, which costs a call more
                 self._end(end, metadata, has_final_state)
+            except BaseException as err:
+                self._writer.stop(err)
+                raise
 
     def _end(self, end: int, metadata: str, has_final_state: bool) -> None:
         episode, rows = self._episode, self._writer.rows
@@ -121,7 +128,9 @@ class SingleRecorder:
         total = rows.cursor.total if hasattr(rows, "cursor") else rows.total
         final = None
         if has_final_state:
-            final = rows.pending_state() + b"".join(sinks[0].pending() for sinks in self._writer.images)
+            final = rows.pending_state()
+            for sinks in self._writer.images:
+                final += sinks[0].pending()
         self._writer.end_episode(episode, end, length, total, final, metadata)
         self.put = self._continue
 

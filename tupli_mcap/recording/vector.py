@@ -18,10 +18,11 @@ from gymnasium.vector.utils import batch_space, iterate
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.exact import decide_dtype, leaf_value, shorten
+from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder
-from tupli_mcap.recording.logs import StepLog, leaf_encoders
+from tupli_mcap.recording.logs import Encoder, StepLog, leaf_encoders
 from tupli_mcap.recording.single import decide_layout
 from tupli_mcap.recording.vector_infos import info_of
 from tupli_mcap.recording.vector_rows import VectorRows
@@ -66,6 +67,7 @@ class VectorRecorder:
         self._texts = ["{}"] * num_envs
         self._was_reset = False
         self._refused = False
+        self._final_encoders: list[tuple[Leaf, Encoder]] | None = None
         self._final_rows: dict[int, int] = {}  # of final states that are in no row of steps
 
     # ---- resets
@@ -340,10 +342,10 @@ class VectorRecorder:
 
     def _put_finals(self, finals: dict[int, bytes]) -> None:
         """Ahead of the steps: the states that these bring are the next episodes' first ones."""
-        for i, final in finals.items():
-            episode = self._episodes[i]
-            if episode is not None:
-                self._final_rows[i] = self._writer.put_final_state(episode, final)
+        running = [(i, episode) for i in finals if (episode := self._episodes[i]) is not None]
+        if running:
+            row = self._writer.put_final_states([(episode, finals[i]) for i, episode in running])
+            self._final_rows.update((i, row + k) for k, (i, _) in enumerate(running))
 
     def _check_images(self, states: Any) -> list[tuple[Any, Any]]:
         found = []
@@ -356,9 +358,11 @@ class VectorRecorder:
 
     def _encode_final(self, state: Any) -> bytes:
         """A final state that is in no row, as it follows `episode` and `env` in `/final_state`."""
-        layout = self._writer.layout
+        if self._final_encoders is None:
+            layout = self._writer.layout
+            self._final_encoders = leaf_encoders(layout, layout.final_leaves)  # type: ignore[arg-type, union-attr]
         out = bytearray(8)
-        for leaf, encode in leaf_encoders(layout, layout.final_leaves):  # type: ignore[arg-type, union-attr]
+        for leaf, encode in self._final_encoders:
             encode(leaf_value(state, leaf), out, 0)
         return bytes(out[8:])
 

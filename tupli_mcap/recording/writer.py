@@ -26,11 +26,8 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.durability import Durability, boot_id, check_durability, sync_directory, sync_file
-from tupli_mcap.recording.events import (
-    EpisodeEnd,
-    EpisodeStart,
-)
-from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
+from tupli_mcap.recording.events import encode_end, encode_start
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_info, journal_path
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog, StepLog
@@ -271,7 +268,7 @@ class RecordingWriter:
             self._mark_lost_stream(env, first_row, reset)
         seed = reset.seed if reset.seed is not None else reset.drawn_seed
         number, events, channel = self.next_episode, self._events(), self.channels.start
-        message = EpisodeStart(
+        body = encode_start(
             number,
             env,
             first_row,
@@ -282,7 +279,7 @@ class RecordingWriter:
             reset.info,
         )
         row = events.sequences[channel]
-        start_time = events.append(reset.time_ns, (channel, message.encode()))
+        start_time = events.append(reset.time_ns, (channel, body))
         self.next_episode = number + 1
         return StartedEpisode(number, env, first_row, start_time, seed, row)
 
@@ -319,9 +316,8 @@ class RecordingWriter:
         sequences = events.sequences
         total = total if type(total) is float else float(np.sum(total))
         number, env, first_row = episode.number, episode.env, episode.first_row
-        message = EpisodeEnd(
-            number, env, first_row, length, total, end, final_state is not None or final_row >= 0, metadata
-        ).encode()
+        has_final = final_state is not None or final_row >= 0
+        message = encode_end(number, env, first_row, length, total, end, has_final, metadata)
         end_row = sequences[channels.end]
         now = time.time_ns()
         if final_state is None:
@@ -330,18 +326,19 @@ class RecordingWriter:
             final_row = sequences[channels.final_state]
             body = _NUMBERS.pack(number, env) + final_state
             now = events.append(now, (channels.final_state, body), (channels.end, message))
-        row = (
-            first_row, length, total, episode.start_time, now, episode.seed, episode.start_row, end_row, final_row,
-            number, env, end,
+        self.index.add(
+            (first_row, length, total, episode.start_time, now, episode.seed, episode.start_row, end_row, final_row,
+             number, env, end),
+            metadata,
         )  # fmt: skip
-        self.index.add(EpisodeRow._make(row), metadata)
         self.flush_if_due()
 
-    def put_final_state(self, episode: StartedEpisode, final_state: bytes) -> int:
-        """Writes `/final_state` ahead of the step that ends the episode; returns its row."""
+    def put_final_states(self, finals: Sequence[tuple[StartedEpisode, bytes]]) -> int:
+        """Writes `/final_state` ahead of the step that ends the episodes; returns the first one's row."""
         channel, events = self.channels.final_state, self._events()
         row = events.sequences[channel]
-        events.append(time.time_ns(), (channel, _NUMBERS.pack(episode.number, episode.env) + final_state))
+        pack = _NUMBERS.pack
+        events.append(time.time_ns(), *[(channel, pack(e.number, e.env) + final) for e, final in finals])
         return row
 
     def flush_if_due(self) -> None:
@@ -383,8 +380,11 @@ class RecordingWriter:
                 self.journal.sync()
 
     def stop(self, err: BaseException) -> None:
-        """After something that was left half done: nothing more is accepted, and the journal keeps what it holds."""
-        if self.failed is not None:
+        """After something that was left half done: nothing more is accepted, and the journal keeps what it holds.
+
+        A refused step leaves nothing half done.
+        """
+        if self.failed is not None or isinstance(err, StepError):
             return
         if isinstance(err, RecordingError):
             self.failed = err
@@ -568,7 +568,7 @@ class _Whole:
     def __exit__(
         self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if err is not None and not isinstance(err, StepError):
+        if err is not None:
             self._writer.stop(err)
 
 
