@@ -7,12 +7,12 @@ Clock and UUID are made up, so that two runs write the same bytes where nothing 
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import copy
 import hashlib
 import itertools
 import shutil
-import sys
 import tempfile
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -427,7 +427,9 @@ def make(name: str, directory: Path) -> None:
 
 
 def main() -> None:
-    directory = Path(sys.argv[1]) if len(sys.argv) > 1 else DIRECTORY
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("directory", nargs="?", type=Path, default=DIRECTORY)
+    directory = parser.parse_args().directory
     directory.mkdir(parents=True, exist_ok=True)
     for old in directory.iterdir():
         if old.is_file():  # those below are of earlier writers, and stay
