@@ -26,8 +26,9 @@ from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.container import PROFILE
 from tupli_mcap.recording.contents import read_contents
+from tupli_mcap.recording.options import WriterOptions
 from tupli_mcap.recording.source import PathSource
-from tupli_mcap.recording.writer import RecordingWriter, WriterOptions
+from tupli_mcap.recording.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"

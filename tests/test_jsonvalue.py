@@ -265,4 +265,4 @@ def test_a_damaged_text_is_a_value_or_a_format_error(text, data):
         value = loads(damaged)
     except FormatError:
         return
-    dumps(value)
+    assert same(loads(dumps(value)), value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import stat
 import time
@@ -15,6 +14,7 @@ from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.lock import FileLock
+from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.source import PathSource, Source
 
 __all__ = ["add_attachments"]
@@ -51,25 +51,9 @@ def add_attachments(path: str | os.PathLike[str], attachments: Mapping[str, tupl
 def _replace(
     path: Path, source: Source, contents: Contents, attachments: Mapping[str, tuple[str, bytes]]
 ) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-    except OSError as err:
-        raise RecordingError(f"{path} cannot be written: {err.strerror}; choose a writable place") from err
-    try:
-        try:
-            _write(fd, path, source, contents, attachments)
-            os.fchmod(fd, stat.S_IMODE(path.stat().st_mode))
-            os.fsync(fd)
-        finally:
-            os.close(fd)
-        temporary.replace(path)
-    except BaseException as err:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        if isinstance(err, OSError):
-            raise RecordingError(f"{path} cannot be written: {err.strerror}") from err
-        raise
+    with replacing(path, 0o600) as (fd, _):
+        _write(fd, path, source, contents, attachments)
+        os.fchmod(fd, stat.S_IMODE(path.stat().st_mode))
 
 
 def _write(

@@ -15,8 +15,9 @@ from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.events import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder
+from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.single import SingleRecorder
-from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
+from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 
 __all__ = ["EpisodeData", "write_recording"]
 

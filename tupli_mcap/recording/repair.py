@@ -22,6 +22,7 @@ from tupli_mcap.recording.repair_journal import add_journal
 from tupli_mcap.recording.repair_plan import Plan, make_plan
 from tupli_mcap.recording.repair_segments import Channels
 from tupli_mcap.recording.repair_write import RepairWriter
+from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.survey import Damage, attachment_name
@@ -147,7 +148,7 @@ def recover_recording(
         if dry_run:
             with _nowhere() as fd:
                 return _recover(opened, fd, compression)
-        with _replacing(goal) as (fd, temporary):
+        with replacing(goal) as (fd, temporary):
             report = _recover(opened, fd, compression)
             if report.kind == "recording" and not _signature_fits(temporary):
                 os.ftruncate(fd, os.lseek(fd, 0, os.SEEK_SET))
@@ -180,27 +181,6 @@ def _check(path: Path, goal: Path, *, overwrite: bool, dry_run: bool) -> None:
         raise RecordingError(
             f"{goal} exists and is not overwritten; give another file, or allow it with --force"
         )
-
-
-@contextlib.contextmanager
-def _replacing(goal: Path) -> Iterator[tuple[int, Path]]:
-    """A descriptor and the path of a file that takes the place of `goal` once it is whole."""
-    temporary = goal.with_name(f".{goal.name}.{os.getpid()}.tmp")
-    try:
-        fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-    except OSError as err:
-        raise RecordingError(f"{goal} cannot be written: {err.strerror}; choose a writable place") from err
-    try:
-        try:
-            yield fd, temporary
-            os.fsync(fd)
-        finally:
-            os.close(fd)
-        temporary.replace(goal)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
 
 
 @contextlib.contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
 import uuid
@@ -13,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.contents import RECORDING_METADATA
@@ -21,6 +19,7 @@ from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.rows import even_rows
 from tupli_mcap.recording.signed import SIGNATURE_NAME, stays_signed
 
@@ -52,24 +51,10 @@ def rewrite_recording(
         FormatError: the source is damaged.
     """
     target = Path(target)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-    except OSError as err:
-        raise RecordingError(f"{target} cannot be written: {err.strerror}; choose a writable place") from err
-    try:
-        try:
-            _Rewriter(source, Container(fd, str(target), compression)).run(
-                episodes, attachments or {}, benchmark_id
-            )
-            os.fsync(fd)
-        finally:
-            os.close(fd)
-        temporary.replace(target)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
+    with replacing(target) as (fd, _):
+        _Rewriter(source, Container(fd, str(target), compression)).run(
+            episodes, attachments or {}, benchmark_id
+        )
 
 
 class _Rewriter:

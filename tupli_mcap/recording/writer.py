@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,45 +25,27 @@ from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.container import Container, Rows
-from tupli_mcap.recording.durability import Durability, boot_id, check_durability, sync_directory, sync_file
+from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
 from tupli_mcap.recording.events import encode_end, encode_start
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_info, journal_path
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog, StepLog
+from tupli_mcap.recording.options import WriterOptions, check_options
 from tupli_mcap.recording.recover import head
-from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
+from tupli_mcap.recording.rows import ImageRows, SingleRows
 from tupli_mcap.recording.source import PathSource
+from tupli_mcap.recording.stores import Stores
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.worker import ChunkWorker
 from tupli_mcap.system import refused
 
-__all__ = ["FORMAT_VERSION", "RECORDING_METADATA", "Mode", "RecordingWriter", "WriterOptions"]
+__all__ = ["FORMAT_VERSION", "RECORDING_METADATA", "RecordingWriter", "ResetFacts", "StartedEpisode"]
 
 FORMAT_VERSION = "1"
 RECORDING_METADATA = "tupli_mcap.recording"
-Mode = Literal["x", "w", "a"]
 _NUMBERS = struct.Struct("<II")
-_LARGE_ROW = 16 * 1024  # bytes from which a thread writes the chunks
 LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
-
-
-class WriterOptions(NamedTuple):
-    """How to write: `chunk_size` in bytes before compression, `flush_seconds` None flushes by size only.
-
-    A new recording that no step came into is removed when it is closed, unless `keep_empty`.
-    `durability` says what a power loss leaves: what the system happened to write, every chunk, or every step.
-    """
-
-    compression: str = "zstd"
-    mode: Mode = "x"
-    benchmark_id: str = ""
-    attachments: Mapping[str, tuple[str, bytes]] | None = None
-    journal_dir: str | os.PathLike[str] | None = None
-    chunk_size: int = 256 * 1024
-    flush_seconds: float | None = None
-    keep_empty: bool = False
-    durability: Durability = "os"
 
 
 _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
@@ -76,7 +58,7 @@ class RecordingWriter:
         self.path = Path(path)
         # the process may change its directory before the journal is made
         self._place = Path(os.path.realpath(path))
-        self.options = options = _checked(path, options)
+        self.options = options = check_options(path, options)
         self.closed = False
         self.failed: RecordingError | None = None
         self._broken_off = False
@@ -86,6 +68,7 @@ class RecordingWriter:
         self.index = IndexBuilder()
         self.next_episode = 0
         self.journal: Journal | None = None
+        self._stores: Stores | None = None
         self.rows: SingleRows | StepLog | None = None
         self.vector: VectorRows | list[StepLog] | None = None
         self._durable = options.durability != "os"
@@ -210,55 +193,14 @@ class RecordingWriter:
 
     def _make_stores(self, areas: Sequence[Area]) -> None:
         layout, channels = self._laid(), self.channels
-        counts, before_ns = self.container.counts, self.container.end_time
         self.journal = self._new_journal(areas)
         self.journal.publish(durable=self._durable)
-        rows_area, log_area = self.journal.row_area, self.journal.log_area
-        buffer = self.journal.buffer
-        self.images = []
-        for leaf, ids in zip(layout.images, channels.images, strict=True):
-            self.images.append(
-                [
-                    ImageRows(
-                        leaf, layout.image_messages[leaf.name], rows_area(f"{leaf.name}/{i}"),
-                        buffer(f"{leaf.name}/{i}"), channel, self.add_chunk, counts[channel], before_ns,
-                        self.worker if leaf.size >= _LARGE_ROW else None, sealed=self._sealed,
-                    )
-                    for i, channel in enumerate(ids)
-                ]
-            )  # fmt: skip
-        if not layout.constant:
-            logs = [
-                StepLog(
-                    layout, log_area(f"steps/{i}"), buffer(f"steps/{i}"), channel, self.add_chunk,
-                    [sinks[i] for sinks in self.images], counts[channel], before_ns,
-                )
-                for i, channel in enumerate(channels.steps)
-            ]  # fmt: skip
-            for log in logs:
-                log.grow = self._grow
-            if self.is_vector:
-                self.vector = logs
-            else:
-                self.rows = logs[0]
-        elif self.is_vector:
-            before = np.array([counts[c] for c in channels.steps], dtype=np.int64)
-            derivers = [RowDeriver(time_ns=before_ns) for _ in channels.steps]
-            self.vector = VectorRows(
-                layout, rows_area("steps"), buffer("steps"), channels.steps, self._write_chunk, before, derivers,
-                settle=self._settle if self._durable else None, sealed=self._sealed,
-            )  # fmt: skip
-        else:
-            self.rows = SingleRows(
-                layout, rows_area("steps"), buffer("steps"), channels.steps[0], self.add_chunk,
-                [sinks[0] for sinks in self.images], counts[channels.steps[0]], RowDeriver(time_ns=before_ns),
-                sealed=self._sealed,
-            )  # fmt: skip
-        events = {c: counts[c] for c in (channels.final_state, channels.start, channels.end)}
-        self.events = EventLog(log_area("events"), buffer("events"), self.add_chunk, events, before_ns)
-        if channels.info is not None:
-            info = {channels.info: counts[channels.info]}
-            self.infos = EventLog(log_area("info"), buffer("info"), self.add_chunk, info, before_ns)
+        self._stores = stores = Stores(
+            layout, channels, self.container, self.journal, self.worker, self.add_chunk, self._write_chunk,
+            vector=self.is_vector, sealed=self._sealed, settle=self._settle if self._durable else None, grow=self._grow,
+        )  # fmt: skip
+        self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
+        self.events, self.infos = stores.events, stores.infos
 
     # ---- episodes
 
@@ -396,13 +338,6 @@ class RecordingWriter:
             )
         self.on_abandon()
 
-    def _step_stores(self) -> list[Any]:
-        if self.vector is None:
-            stores: list[Any] = [] if self.rows is None else [self.rows]
-        else:
-            stores = list(self.vector) if isinstance(self.vector, list) else [self.vector]
-        return stores
-
     def check_spaces(self, spaces: StepLayout, num_envs: int, *, vector: bool) -> None:
         """On append: raises SpaceError unless the environment is one the file can go on with."""
         if self.layout is None or self.recorded_envs is None:
@@ -428,29 +363,16 @@ class RecordingWriter:
 
     def _flush(self, *, keep_last: bool) -> None:
         self._flushed_at = time.monotonic()
-        stores = [*self._step_stores(), *(sink for sinks in self.images for sink in sinks), self.infos]
-        for store in stores:
-            if store is not None:
-                store.flush()
-        if self.events is not None:
-            self.events.flush(keep_last=keep_last)
+        if self._stores is not None:
+            self._stores.flush(keep_last=keep_last)
 
     def _grow(self, size: int) -> None:
         """Makes a larger journal for steps of `size` bytes; the running states move into it."""
         self._flush(keep_last=False)
         areas = self._areas(2 * size)
         journal = self._new_journal(areas)
-        logs = self.vector if isinstance(self.vector, list) else [self.rows]
-        for i, log in enumerate(logs):
-            if isinstance(log, StepLog):
-                log.move(journal.log_area(f"steps/{i}"), journal.buffer(f"steps/{i}"))
-        for leaf, sinks in zip(self.layout.images if self.layout else [], self.images, strict=True):
-            for i, sink in enumerate(sinks):
-                name = f"{leaf.name}/{i}"
-                sink.move(journal.row_area(name), journal.buffer(name))
-        for name, events in (("events", self.events), ("info", self.infos)):
-            if events is not None:
-                events.move(journal.log_area(name), journal.buffer(name))
+        if self._stores is not None:
+            self._stores.move(journal)
         journal.publish(durable=self._durable)
         self.journal = journal
 
@@ -579,24 +501,6 @@ def _uuid_of(path: Path) -> str:
     with contextlib.suppress(RecordingError, FormatError), contextlib.closing(PathSource(path)) as source:
         return head(source).get("uuid", "")
     return ""
-
-
-def _checked(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:
-    """The options, with a place for the journal that does not depend on the process's directory."""
-    if "://" in os.fspath(path):
-        raise RecordingError(
-            f"{path}: expected a local path to record to, found a URL; record to a path, and copy the file"
-        )
-    if options.chunk_size < 1:
-        raise RecordingError(f"chunk_size: expected at least 1 byte, found {options.chunk_size!r}")
-    check_durability(options.durability)
-    if options.journal_dir is None:
-        return options
-    if not Path(options.journal_dir).is_dir():
-        raise RecordingError(
-            f"journal_dir: expected a directory, found {str(options.journal_dir)!r}; make it"
-        )
-    return options._replace(journal_dir=os.path.realpath(options.journal_dir))
 
 
 class ResetFacts(NamedTuple):

@@ -17,8 +17,8 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.infos import RecordInfo
+from tupli_mcap.recording.options import Mode
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.recording.writer import Mode
 from tupli_mcap.wrappers.benchmark import benchmark_attachments
 from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes

@@ -20,8 +20,9 @@ from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.events import TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
+from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.single import SingleRecorder
-from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
+from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import benchmark_attachments
 from tupli_mcap.wrappers.seeds import drawn_seed

@@ -20,9 +20,10 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
+from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.vector_infos import final_info_of, info_of
-from tupli_mcap.recording.writer import Mode, RecordingWriter, ResetFacts, WriterOptions
+from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
 from tupli_mcap.wrappers.seeds import drawn_seed

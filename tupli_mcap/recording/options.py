@@ -1,0 +1,51 @@
+"""How a recording is written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.recording.durability import Durability, check_durability
+
+__all__ = ["Mode", "WriterOptions", "check_options"]
+
+Mode = Literal["x", "w", "a"]
+
+
+class WriterOptions(NamedTuple):
+    """How to write: `chunk_size` in bytes before compression, `flush_seconds` None flushes by size only.
+
+    A new recording that no step came into is removed when it is closed, unless `keep_empty`.
+    `durability` says what a power loss leaves: what the system happened to write, every chunk, or every step.
+    """
+
+    compression: str = "zstd"
+    mode: Mode = "x"
+    benchmark_id: str = ""
+    attachments: Mapping[str, tuple[str, bytes]] | None = None
+    journal_dir: str | os.PathLike[str] | None = None
+    chunk_size: int = 256 * 1024
+    flush_seconds: float | None = None
+    keep_empty: bool = False
+    durability: Durability = "os"
+
+
+def check_options(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:
+    """The options, with a place for the journal that does not depend on the process's directory."""
+    if "://" in os.fspath(path):
+        raise RecordingError(
+            f"{path}: expected a local path to record to, found a URL; record to a path, and copy the file"
+        )
+    if options.chunk_size < 1:
+        raise RecordingError(f"chunk_size: expected at least 1 byte, found {options.chunk_size!r}")
+    check_durability(options.durability)
+    if options.journal_dir is None:
+        return options
+    if not Path(options.journal_dir).is_dir():
+        raise RecordingError(
+            f"journal_dir: expected a directory, found {str(options.journal_dir)!r}; make it"
+        )
+    return options._replace(journal_dir=os.path.realpath(options.journal_dir))
