@@ -28,7 +28,7 @@ from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.document import restored
 from tupli_mcap.storage.sidecar import Sidecar
 
-__all__ = ["DatasetError", "FilesSource", "Source", "StorageSource"]
+__all__ = ["DatasetError", "FilesSource", "Source", "StorageSource", "episode_headers"]
 
 _ENDS = ("terminal", "timeout", "interrupted")
 _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two blocks share it
@@ -141,7 +141,7 @@ class FilesSource:
             with Recording(name) as recording:
                 if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                     continue
-                headers = list(_episode_headers(recording, name, deleted))
+                headers = list(episode_headers(recording, name, deleted))
             copies = [header for header in headers if header.id in files]
             if copies:
                 warnings.warn(
@@ -186,7 +186,7 @@ def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
     return files
 
 
-def _episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:
+def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:
     """Headers as a storage would list them; `recording` of each is the name the file was opened by."""
     index = recording.index
     times = np.datetime_as_string(index["end_time"].astype("datetime64[ns]"), unit="us", casting="unsafe")

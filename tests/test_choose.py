@@ -1,0 +1,103 @@
+"""Which episodes a command means."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from tupli_mcap.dataset.choose import choose_episodes
+from tupli_mcap.errors import FilterError, RecordingError
+from tupli_mcap.recording import EpisodeData, Recording, write_recording
+from tupli_mcap.schema import F, parse_filter
+from tupli_mcap.storage.sidecar import Sidecar
+
+RETURNS = [3.0, 9.0, -2.0, 9.0, float("nan"), -2.0]
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "returns.mcap"
+    episodes = [
+        EpisodeData(
+            states=np.zeros((2, 1), np.float32),
+            actions=np.zeros(2, np.int64),
+            rewards=np.array([value, 0.0]),
+            terminals=np.array([False, True]),
+            timeouts=np.zeros(2, np.bool_),
+            metadata={"odd": bool(i % 2)},
+        )
+        for i, value in enumerate(RETURNS)
+    ]
+    space = gym.spaces.Box(-1.0, 1.0, (1,))
+    write_recording(path, episodes, observation_space=space, action_space=gym.spaces.Discrete(2))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [
+        ("all", [0, 1, 2, 3, 4, 5]),
+        ("first", [0]),
+        ("last", [5]),
+        ("best", [1]),
+        ("worst", [2]),
+        ("3", [3]),
+        (" 5, 0,5 ", [5, 0]),
+        ("Best,first,1,worst", [1, 0, 2]),
+    ],
+)
+def test_words_and_numbers(file: Path, text: str, numbers: list[int]) -> None:
+    with Recording(file) as recording:
+        assert [episode.number for episode in choose_episodes(recording, text)] == numbers
+
+
+def test_a_filter_is_what_the_choice_is_among(file: Path) -> None:
+    with Recording(file) as recording:
+        odd = parse_filter("metadata.odd = true")
+        assert [e.number for e in choose_episodes(recording, filter=odd)] == [1, 3, 5]
+        assert [e.number for e in choose_episodes(recording, "last,worst,best", odd)] == [5, 1]
+        with pytest.raises(
+            RecordingError, match=r"has no episode 2 that .*odd.* is true of; choose from 3 episodes"
+        ):
+            choose_episodes(recording, "2", odd)
+        with pytest.raises(RecordingError, match=r"has no episode that .*n_tuples.* is true of"):
+            choose_episodes(recording, "best", F("n_tuples") > 2)
+        with pytest.raises(FilterError, match="length"):
+            choose_episodes(recording, "all", F("length") > 2)
+
+
+def test_deleted_episodes_are_not_there(file: Path) -> None:
+    Sidecar(deleted={0, 1, 4}).write(file)
+    with Recording(file) as recording:
+        assert [e.number for e in choose_episodes(recording, "first,best,all")] == [2, 3, 5]
+        with pytest.raises(RecordingError, match="has no episode 1; choose from 3 episodes between 2 and 5"):
+            choose_episodes(recording, "1")
+        odd = F("metadata.odd") == True  # noqa: E712 - the filter's own equality
+        assert [e.number for e in choose_episodes(recording, "all", odd)] == [3, 5]
+
+
+def test_a_number_out_of_range_names_the_range(file: Path) -> None:
+    with (
+        Recording(file) as recording,
+        pytest.raises(RecordingError, match=r"returns\.mcap has no episode 6; choose from 0 to 5$"),
+    ):
+        choose_episodes(recording, "2,6")
+    Sidecar(deleted=set(range(5))).write(file)
+    with Recording(file) as recording, pytest.raises(RecordingError, match="choose from episode 5 only"):
+        choose_episodes(recording, "0")
+    Sidecar(deleted=set(range(6))).write(file)
+    with Recording(file) as recording, pytest.raises(RecordingError, match="has no episode$"):
+        choose_episodes(recording, "all")
+
+
+@pytest.mark.parametrize("text", ["", "3,", "beste", "-1", "1.0", "0x1", "3-5", "9" * 5000, "²", "1;2"])
+def test_other_words_are_refused(file: Path, text: str) -> None:
+    with (
+        Recording(file) as recording,
+        pytest.raises(FilterError, match=re.escape("'3,7,9', or best, worst, first, last or all, found")),
+    ):
+        choose_episodes(recording, text)
