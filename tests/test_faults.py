@@ -126,6 +126,15 @@ def test_a_journal_that_cannot_be_read_is_not_passed_over(tmp_path: Path) -> Non
     live.close()
 
 
+@pytest.mark.parametrize("name", ["growing", "append", "append-text", "journal-elsewhere"])
+def test_what_cannot_be_asked_about_a_file_leaves_nothing_open(tmp_path: Path, name: str) -> None:
+    calls = run_case(name, tmp_path / "whole", Case(-1, errno.EIO, False)).calls
+    asked = [case for case in cases(calls) if calls[case.at][0] == "stat" and not case.lasting]
+    assert asked
+    for i, case in enumerate(asked):
+        assert run_case(name, tmp_path / str(i), case).hit, case
+
+
 def test_opening_to_append_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     with RecordEpisodes(sampler(), path) as env:

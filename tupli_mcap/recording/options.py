@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording.durability import Durability, check_durability
+from tupli_mcap.system import refused
 
 __all__ = ["Mode", "WriterOptions", "check_options"]
 
@@ -44,8 +45,10 @@ def check_options(path: str | os.PathLike[str], options: WriterOptions) -> Write
     check_durability(options.durability)
     if options.journal_dir is None:
         return options
-    if not Path(options.journal_dir).is_dir():
-        raise RecordingError(
-            f"journal_dir: expected a directory, found {str(options.journal_dir)!r}; make it"
-        )
+    expected = f"{path}: expected a directory as journal_dir, found {str(options.journal_dir)!r}"
+    try:
+        if not Path(options.journal_dir).is_dir():
+            raise RecordingError(f"{expected}; make it")
+    except OSError as err:
+        raise RecordingError(f"{expected}: {refused(err)}") from err
     return options._replace(journal_dir=os.path.realpath(options.journal_dir))

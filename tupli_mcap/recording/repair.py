@@ -27,6 +27,7 @@ from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.survey import Damage, attachment_name
 from tupli_mcap.recording.tail import read_tail
+from tupli_mcap.system import refused
 
 __all__ = ["CutEpisode", "DamagedPlace", "LostSteps", "RecoveryReport", "recover_recording", "recovered_path"]
 
@@ -142,7 +143,10 @@ def recover_recording(
     """
     path = Path(source)
     goal = recovered_path(path) if target is None else Path(target)
-    _check(path, goal, overwrite=overwrite, dry_run=dry_run)
+    try:
+        _check(path, goal, overwrite=overwrite, dry_run=dry_run)
+    except OSError as err:
+        raise RecordingError(f"{path} cannot be recovered to {goal}: {refused(err)}") from err
     opened = PathSource(path)
     try:
         if dry_run:

@@ -40,7 +40,11 @@ def open_regular(path: Path) -> int:
     """A descriptor to read a regular file; OSError for anything else, a pipe without a writer is not waited for."""
     waiting = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
     fd = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | waiting)
-    mode = os.fstat(fd).st_mode
+    try:
+        mode = os.fstat(fd).st_mode
+    except BaseException:
+        os.close(fd)
+        raise
     if stat.S_ISREG(mode):
         return fd
     os.close(fd)
