@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from viewing import HeadlessViewer
 
 
 @pytest.fixture(autouse=True)
@@ -13,6 +19,21 @@ def _private_config(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytes
     directory = tmp_path_factory.mktemp("config")
     monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(directory))
     return directory
+
+
+@pytest.fixture(scope="session")
+def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HeadlessViewer]:
+    """One Rerun viewer for all tests; `show` closes what was open. Skips where this machine cannot draw."""
+    from viewing import HeadlessViewer, NoViewerError
+
+    try:
+        viewer = HeadlessViewer(tmp_path_factory.mktemp("viewer"))
+    except NoViewerError as err:
+        if os.environ.get("CI"):
+            raise
+        pytest.skip(f"{err}; `tools/setup-viewer` says what is missing")
+    with viewer:
+        yield viewer
 
 
 def pytest_configure() -> None:

@@ -1,0 +1,172 @@
+"""The real Rerun viewer without a screen: opened, asked what it shows, photographed, and ended for certain."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import rerun_cli
+from PIL import Image
+from rerun.experimental import View, ViewerClient, ViewerState
+
+VIEWER = Path(rerun_cli.__file__).parent / "rerun"  # the program itself: its Python shim would orphan it
+SIZE = (1400, 900)
+_ADDRESS = re.compile(r"gRPC connections on 127\.0\.0\.1:(\d+)")
+_OPTIONS = ("--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen")
+_GRIDS = ("TimeSeries", "StateTimeline", "BarChart")
+_TITLE = 30  # rows of pixels
+_ENVIRONMENT = {"RUST_LOG": "info", "NO_COLOR": "1", "RERUN_APP_ONLY": "true", "DISPLAY": ""}
+
+
+class NoViewerError(RuntimeError):
+    """The viewer cannot run here; its own words say why."""
+
+
+class HeadlessViewer:
+    """A viewer process on 127.0.0.1 that opens files one after another.
+
+    Args:
+        folder: where the process may leave its log and its settings.
+        size: of the window, in pixels.
+    """
+
+    def __init__(self, folder: Path, size: tuple[int, int] = SIZE) -> None:
+        self._log = folder / "viewer.log"
+        self._size = size
+        home = {name: str(folder) for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME")}
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                [VIEWER, "--headless", "--window-size", f"{size[0]}x{size[1]}", *_OPTIONS],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env=os.environ | home | _ENVIRONMENT,
+                start_new_session=True,  # so that ending the group ends all it started
+            )
+        try:
+            self.client = ViewerClient.connect(f"rerun+http://127.0.0.1:{self._port()}/proxy")
+            self._seen = self._last_log()
+        except (ConnectionError, TimeoutError) as err:  # it listens before it looks for a graphics adapter
+            self.close()
+            raise NoViewerError(f"the viewer did not start: {self._words()}") from err
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def _port(self) -> int:
+        for _ in patiently(30.0):
+            if found := _ADDRESS.search(self._words()):
+                return int(found[1])
+            if self._process.poll() is not None:
+                break
+        raise NoViewerError(f"the viewer did not start: {self._words()}")
+
+    def _words(self) -> str:
+        """The end of what it wrote."""
+        return self._log.read_text(encoding="utf-8", errors="replace")[-2000:]
+
+    def show(self, *paths: Path) -> ViewerState:
+        """Close what is open, open these files in order, wait until they are drawn; the last one is in front."""
+        if self.client.get_state().recordings:
+            self.client.close("all")
+        self._seen = self._last_log()
+        self.client.open([str(path) for path in paths])
+        return self.settled()
+
+    def settled(self) -> ViewerState:
+        """The state once nothing loads any more and every view has been drawn at least once."""
+        for _ in patiently(20.0):
+            state = self.client.get_state()
+            if state.recordings and not state.loading:
+                break
+        else:
+            raise TimeoutError(f"the viewer is still loading: {state.loading or 'no recording appeared'}")
+        if any(recording.timelines for recording in state.recordings):
+            self.client.set_time(play_state="paused")  # else every picture waits for the next ones
+        self.screenshot()  # reports are those of the last time a view was drawn
+        return self.client.get_state()
+
+    def seek(self, timeline: str, step: int) -> None:
+        """Stop at a step of a sequence timeline."""
+        self.client.set_time(timeline, sequence=step, play_state="paused")
+
+    def filled(self) -> dict[str, bool]:
+        """Every visible view's name, and whether it shows any data."""
+        return {view.name: self.ink(view) > 0.002 for view in self.client.get_state().views if view.visible}
+
+    def problems(self) -> list[str]:
+        """What views and the viewer complained of since the last `show`."""
+        state = self.client.get_state()
+        views = [
+            f"{view.name}: {report.severity}: {report.summary} {report.details or ''}"
+            for view in state.views
+            for report in view.reports
+        ]
+        logs = [
+            f"{entry.level} {entry.target}: {entry.message}"
+            for entry in self.client.get_logs(self._seen)
+            if entry.level in ("WARN", "ERROR") and not _of_the_machine(entry.message)
+        ]
+        return views + logs
+
+    def _last_log(self) -> int | None:
+        entries = self.client.get_logs()
+        return entries[-1].sequence if entries else None
+
+    def screenshot(self, view: View | None = None) -> np.ndarray:
+        """What the window, or one of its views, shows: height x width x 3 bytes."""
+        png = self.client.take_screenshot(None if view is None else view.view_id)
+        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+    def ink(self, view: View) -> float:
+        """The part of a view's pixels that show data: coloured ones in plots (grids are grey), else all but black."""
+        pixels = self.screenshot(view)[_TITLE:].astype(int)
+        brightest = pixels.max(axis=2)
+        if view.view_class in _GRIDS:
+            return float((brightest - pixels.min(axis=2) > 60).mean())
+        return float((brightest > 60).mean())
+
+    def close(self) -> None:
+        """End the viewer and everything it started."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGTERM)
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait(5)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _of_the_machine(message: str) -> bool:
+    """Whether a message is about this machine's graphics rather than about what is shown."""
+    return "software rasterizer" in message.lower() or "adapter" in message.lower()
+
+
+def patiently(seconds: float, pause: float = 0.05) -> Iterator[None]:
+    """Yield again and again until the time is over."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        yield
+        time.sleep(pause)
