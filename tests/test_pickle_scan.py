@@ -8,7 +8,9 @@ import os
 import pickle
 import pickletools
 import random
+import resource
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -195,9 +197,21 @@ class _Watched(pickle.Unpickler):
 
 def _really_imported(data: bytes) -> set[tuple[str, str]]:
     watched = _Watched(data)
-    with contextlib.suppress(Exception):  # a damaged pickle fails in any way
+    with contextlib.suppress(Exception), little_memory():  # a damaged pickle fails in any way
         watched.load()
     return watched.imported
+
+
+@contextlib.contextmanager
+def little_memory() -> Iterator[None]:
+    """64 MiB more than there is: a damaged number would make the unpickler clear a list of gigabytes."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (64 << 20), before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def test_whatever_the_unpickler_imports_is_listed_or_a_problem_is_said() -> None:
