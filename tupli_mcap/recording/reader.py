@@ -15,6 +15,7 @@ from mcap.records import Channel
 from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.claims import EPISODE_TOPICS, check_episodes
@@ -210,6 +211,21 @@ class Recording:
             known = ", ".join(self._contents.attachments) or "none"
             raise RecordingError(f"{self.name} has no attachment {name!r}; it has {known}")
         return read_attachment(self._source, self._contents.attachments[name])
+
+    @property
+    def labels(self) -> Labels:
+        """Names of dimensions and values, and the seconds of a step, as far as the recording says them.
+
+        Raises:
+            FormatError: they do not fit the recording.
+        """
+        info = self.attachments.get(LABELS_NAME)
+        if info is None or self._layout is None:
+            return Labels.none()
+        where = f"{self.name}: {LABELS_NAME}"
+        if info.size > MAX_LABELS:
+            raise FormatError(f"{where}: expected at most {MAX_LABELS} bytes, found {info.size}")
+        return Labels.from_json(self.read_attachment(LABELS_NAME), self._layout.leaves, where)
 
     @property
     def benchmark(self) -> RecordedBenchmark:

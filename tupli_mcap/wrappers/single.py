@@ -6,7 +6,7 @@ import copy
 import os
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
 
@@ -25,6 +25,7 @@ from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import benchmark_attachments
+from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
 
 __all__ = ["RecordEpisodes", "metadata_text"]
@@ -48,7 +49,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         compression: "zstd", "lz4" or "none".
         reward_space: for rewards that are arrays.
         benchmark_id: the benchmark the episodes belong to.
-        attachments: name -> (media type, bytes), written before the first step.
+        attachments: name -> (media type, bytes), written before the first step; by default the environment.
+        labels: names for viewers and plots, by leaf: {"state": ["x", "angle"], "action": ["left", "right"]}, one a
+            dimension, or one a value of a Discrete. By default what the environment's documentation says.
         flush_seconds: also write chunks this many seconds after the last ones, full or not.
         journal_dir: where the journal goes, if not beside the recording (a local disk for a network path).
         chunk_size: bytes of a chunk before compression.
@@ -76,6 +79,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         reward_space: gym.Space[Any] | None = None,
         benchmark_id: str = "",
         attachments: Mapping[str, tuple[str, bytes]] | None = None,
+        labels: Mapping[str, Sequence[str]] | None = None,
         flush_seconds: float | None = None,
         journal_dir: str | os.PathLike[str] | None = None,
         chunk_size: int = 256 * 1024,
@@ -89,20 +93,20 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             attachments = benchmark_attachments(env)
         wanted = record_info is not False or step_callback is not None
         self._infos = InfoRecorder(record_info) if wanted else None
+        spaces = StepLayout(
+            env.observation_space, env.action_space, reward_space
+        )  # refused before a file is made
+        spaces.to_metadata()
         options = WriterOptions(
             compression,
             mode,
             benchmark_id,
-            attachments,
+            with_labels(attachments, env, spaces, labels),
             journal_dir,
             chunk_size,
             flush_seconds,
             durability=durability,
         )
-        spaces = StepLayout(
-            env.observation_space, env.action_space, reward_space
-        )  # refused before a file is made
-        spaces.to_metadata()
         self._writer = RecordingWriter(path, options)
         try:
             self._writer.check_spaces(spaces, 1, vector=False)

@@ -26,6 +26,7 @@ from tupli_mcap.recording.vector_infos import final_info_of, info_of
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
+from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
 from tupli_mcap.wrappers.single import metadata_text
 
@@ -55,6 +56,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         reward_space: gym.Space[Any] | None = None,
         benchmark_id: str = "",
         attachments: Mapping[str, tuple[str, bytes]] | None = None,
+        labels: Mapping[str, Sequence[str]] | None = None,
         flush_seconds: float | None = None,
         journal_dir: str | os.PathLike[str] | None = None,
         chunk_size: int = 256 * 1024,
@@ -83,7 +85,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             compression,
             mode,
             benchmark_id,
-            attachments,
+            with_labels(attachments, env, spaces, labels),
             journal_dir,
             chunk_size,
             flush_seconds,

@@ -1,0 +1,176 @@
+"""Names of dimensions and values: read from documentation, chosen, stored, read back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import FrameStackObservation, RescaleAction
+from jsonschema import Draft202012Validator
+
+from tupli_mcap import FormatError, RecordEpisodes, Recording, SpaceError
+from tupli_mcap.environment import documented_labels
+from tupli_mcap.messages.labels import LABELS_NAME, Labels
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+SCHEMA = json.loads((Path(__file__).parent.parent / "schemas" / "labels.schema.json").read_text())
+CART_POLE = ("Cart Position", "Cart Velocity", "Pole Angle", "Pole Angular Velocity")
+PUSHES = ("Push cart to the left", "Push cart to the right")
+
+
+def record(env: Any, path: Path, **kwargs: Any) -> Recording:
+    with RecordEpisodes(env, path, **kwargs) as recorder:
+        recorder.reset(seed=1)
+        recorder.step(recorder.action_space.sample())
+    return Recording(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "dimensions", "values", "seconds"),
+    [
+        ("CartPole-v1", {"state": CART_POLE}, {"action": PUSHES}, 0.02),
+        (
+            "Pendulum-v1",
+            {"state": ("x = cos(theta)", "y = sin(theta)", "Angular Velocity"), "action": ("Torque",)},
+            {},
+            0.05,
+        ),
+        (
+            "Acrobot-v1",
+            {
+                "state": (
+                    *(f"{f} of theta{i}" for i in (1, 2) for f in ("Cosine", "Sine")),
+                    *(f"Angular velocity of theta{i}" for i in (1, 2)),
+                )
+            },
+            {"action": tuple(f"apply {i} torque to the actuated joint" for i in (-1, 0, 1))},
+            0.2,
+        ),
+        (
+            "FrozenLake-v1",
+            {},
+            {"action": ("Move left", "Move down", "Move right", "Move up")},
+            0.25,
+        ),
+    ],
+)
+def test_gymnasium_documents_its_environments(
+    name: str, dimensions: Any, values: Any, seconds: float, tmp_path: Path
+) -> None:
+    labels = record(gym.make(name), tmp_path / "r.mcap").labels
+    assert labels == Labels(dimensions, values, pytest.approx(seconds))
+    Draft202012Validator(SCHEMA).validate(json.loads(labels.to_json()))
+
+
+def test_a_wrapper_may_change_what_a_dimension_is() -> None:
+    stacked = FrameStackObservation(gym.make("CartPole-v1"), 3)
+    assert documented_labels(stacked) == Labels({}, {"action": PUSHES}, 0.02)
+    scaled = RescaleAction(gym.make("Pendulum-v1"), np.float32(-1), np.float32(1))
+    assert documented_labels(scaled).dimensions["action"] == ("Torque",)
+
+
+class Arm(gym.Env[Any, Any]):
+    """An arm.
+
+    ## Observation Space
+    | Num | Observation |
+    |-----|-------------|
+    | 0   | shoulder    |
+    | 2   | elbow       |
+
+    ## Action Space
+    - 0: `open`
+    - 1: **close**
+    """
+
+    observation_space = spaces.Dict(
+        {"joints": spaces.Box(-1, 1, (2,)), "held": spaces.Discrete(3, start=5), "words": spaces.Text(5)}
+    )
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+    @property
+    def dt(self) -> float:
+        raise RuntimeError("not known yet")
+
+
+def test_only_what_is_whole_is_taken(tmp_path: Path) -> None:
+    assert record(Arm(), tmp_path / "r.mcap").labels == Labels({}, {"action": ("open", "close")}, None)
+
+
+def test_names_may_be_chosen(tmp_path: Path) -> None:
+    given = {"state['joints']": ["shoulder", "elbow"], "state['held']": ["a", "b", "c"], "action": ["x", "y"]}
+    labels = record(Arm(), tmp_path / "r.mcap", labels=given).labels
+    assert labels.dimensions == {"state['joints']": ("shoulder", "elbow")}
+    assert labels.values == {"state['held']": ("a", "b", "c"), "action": ("x", "y")}
+
+
+@pytest.mark.parametrize(
+    ("given", "match"),
+    [
+        ({"joints": ["a", "b"]}, r"labels: expected one of \[.*state\['joints'\].*found 'joints'"),
+        ({"state['joints']": ["a"]}, r"labels: expected 2 names for state\['joints'\] .* found 1"),
+        ({"state['held']": ["a", "b"]}, r"expected 1 or 3 names for state\['held'\]"),
+        ({"state['words']": ["a"]}, r"expected no names for state\['words'\]"),
+        ({"action": ["left", ""]}, "expected names of 1 to 200 characters for action"),
+        ({"action": ["left", "ri\nght"]}, "expected names of 1 to 200 characters for action"),
+    ],
+)
+def test_chosen_names_must_fit(given: Any, match: str, tmp_path: Path) -> None:
+    with pytest.raises(SpaceError, match=match):
+        RecordEpisodes(Arm(), tmp_path / "r.mcap", labels=given)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_of_sub_environments(tmp_path: Path) -> None:
+    envs = gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1")] * 2)
+    with RecordVector(envs, tmp_path / "r.mcap", labels={"action": ["left", "right"]}) as recorder:
+        recorder.reset(seed=1)
+        recorder.step(recorder.action_space.sample())
+    assert Recording(tmp_path / "r.mcap").labels == Labels(
+        {"state": CART_POLE}, {"action": ("left", "right")}, 0.02
+    )
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\xff",
+        b"[]",
+        b'{"dimensions": 3}',
+        b'{"dimensions": {"state": ["a"]}}',
+        b'{"values": {"action": ["a", 3]}}',
+        b'{"values": {"state": ["a", "b", "c", "d"]}}',
+        b'{"dimensions": {"action": ["a", "b"]}}',
+        b'{"values": {"action": ["a", "b\\u0000"]}}',
+        b'{"step_seconds": 0}',
+        b'{"step_seconds": NaN}',
+        b'{"step_seconds": "1"}',
+        b"[" * 10_000,
+        b'"' + b"a" * (1 << 20) + b'"',
+    ],
+    ids=range(13),
+)
+def test_others_are_refused(data: bytes, tmp_path: Path) -> None:
+    attachments = {LABELS_NAME: ("application/json", data)}
+    recording = record(gym.make("CartPole-v1"), tmp_path / "r.mcap", attachments=attachments)
+    with pytest.raises(FormatError, match=r"r\.mcap: labels\.json: expected"):
+        _ = recording.labels
+
+
+def test_of_leaves_that_are_not_there_are_ignored(tmp_path: Path) -> None:
+    data = json.dumps({"dimensions": {"state['x']": ["a"]}, "later": 1, "values": {"action": ["a", "b"]}})
+    attachments = {LABELS_NAME: ("application/json", data.encode())}
+    recording = record(gym.make("CartPole-v1"), tmp_path / "r.mcap", attachments=attachments)
+    assert recording.labels == Labels({}, {"action": ("a", "b")})

@@ -1,0 +1,101 @@
+"""Names of dimensions and actions, read from a live environment's documentation, and how long its steps take."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+
+from tupli_mcap.messages.labels import Labels
+
+__all__ = ["documented_labels"]
+
+_HEADING = re.compile(r"^\s*#+\s*(.*?)\s*$", re.MULTILINE)
+_ROW = re.compile(r"^\s*\|\s*(\d+)\s*\|([^|\n]*)\|", re.MULTILINE)
+_ITEM = re.compile(r"^\s*[-*]\s*(\d+)\s*:\s*(.+?)\s*$", re.MULTILINE)
+_MARKUP = re.compile(r"[`*_]{1,2}(?=\S)(.+?)(?<=\S)[`*_]{1,2}")
+_LONGEST = 60  # characters
+_MOST = 10_000  # names
+
+
+def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> Labels:
+    """What the environment says of itself: tables and lists with a number for each dimension or value.
+
+    Gymnasium documents its environments this way: https://gymnasium.farama.org/environments/classic_control/cart_pole.
+    """
+    inner: Any = env.unwrapped
+    if isinstance(env, gym.vector.VectorEnv):
+        state, action = env.single_observation_space, env.single_action_space
+        envs = getattr(inner, "envs", None)
+        inner = envs[0].unwrapped if envs and isinstance(envs[0], gym.Env) else inner
+    else:
+        state, action = env.observation_space, env.action_space
+    text = type(inner).__doc__ or ""
+    found = Labels({}, {}, _step_seconds(inner))
+    for name, space, unwrapped in (
+        ("state", state, getattr(inner, "observation_space", None)),
+        ("action", action, getattr(inner, "action_space", None)),
+    ):
+        if not _same_dimensions(space, unwrapped):
+            continue  # a wrapper has made something else of it
+        section = _section(text, "observation space" if name == "state" else "action space")
+        if isinstance(space, spaces.Discrete):
+            names = _names(section, int(space.n))
+            if names:
+                found.values[name] = names
+        elif isinstance(space, spaces.Box) and len(space.shape) == 1:
+            names = _names(section, space.shape[0])
+            if names:
+                found.dimensions[name] = names
+    return found
+
+
+def _same_dimensions(space: Any, unwrapped: Any) -> bool:
+    if isinstance(space, spaces.Discrete):
+        return bool(space == unwrapped)
+    return type(space) is type(unwrapped) and space.shape == unwrapped.shape
+
+
+def _section(text: str, heading: str) -> str:
+    """The text below the first heading that is `heading`, up to the next one."""
+    headings = list(_HEADING.finditer(text))
+    for i, found in enumerate(headings):
+        if found.group(1).lower().startswith(heading):
+            return text[found.end() : headings[i + 1].start() if i + 1 < len(headings) else len(text)]
+    return ""
+
+
+def _names(section: str, count: int) -> tuple[str, ...]:
+    """A name for each number from 0 to count - 1; empty unless each is there exactly once."""
+    if not 0 < count <= _MOST:
+        return ()
+    for pattern in (_ROW, _ITEM):
+        found = [(int(number), _plain(name)) for number, name in pattern.findall(section)]
+        if [number for number, _ in found] == list(range(count)) and all(name for _, name in found):
+            return tuple(name for _, name in found)
+    return ()
+
+
+def _plain(name: str) -> str:
+    """Without markup, on one line, not too long."""
+    plain = " ".join(_MARKUP.sub(r"\1", name).split())
+    plain = "".join(c for c in plain if c.isprintable())
+    return plain if len(plain) <= _LONGEST else f"{plain[: _LONGEST - 1]}…"
+
+
+def _step_seconds(env: Any) -> float | None:
+    """`dt` of MuJoCo, Pendulum and Acrobot, `tau` of CartPole, else one frame as it is rendered."""
+    for name in ("dt", "tau"):
+        with contextlib.suppress(Exception):  # a property may do anything
+            value = getattr(env, name)
+            if isinstance(value, int | float) and 0 < value < math.inf:
+                return float(value)
+    with contextlib.suppress(Exception):
+        fps = env.metadata["render_fps"]
+        if isinstance(fps, int | float) and 0 < fps < math.inf:
+            return 1 / float(fps)
+    return None

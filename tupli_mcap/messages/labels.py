@@ -1,0 +1,125 @@
+"""What people call the dimensions and values of a recording, and how long a step takes; kept as `labels.json`."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from gymnasium import spaces
+
+from tupli_mcap.errors import FormatError, SpaceError
+from tupli_mcap.messages.leaves import Leaf
+
+__all__ = ["LABELS_MEDIA_TYPE", "LABELS_NAME", "MAX_LABELS", "Labels", "chosen_labels"]
+
+LABELS_NAME = "labels.json"
+LABELS_MEDIA_TYPE = "application/json"
+MAX_LABELS = 1 << 20  # bytes of `labels.json`
+_LONGEST = 200  # characters of one label
+
+
+class Labels(NamedTuple):
+    """Names for what is in a recording; leaves without any are left out.
+
+    `dimensions`: leaf path (`state`, `state['arm']`, `action`) -> a name for each dimension of the flattened leaf.
+    `values`: path of a Discrete leaf -> a name for each value, from the space's `start` on.
+    `step_seconds`: time that passes in the environment during a step (s); None if unknown.
+    """
+
+    dimensions: dict[str, tuple[str, ...]]
+    values: dict[str, tuple[str, ...]]
+    step_seconds: float | None = None
+
+    @classmethod
+    def none(cls) -> Labels:
+        """Nothing is known."""
+        return cls({}, {})
+
+    def __bool__(self) -> bool:
+        return bool(self.dimensions or self.values or self.step_seconds)
+
+    def to_json(self) -> bytes:
+        return json.dumps(self._asdict(), ensure_ascii=False, sort_keys=True).encode()
+
+    @classmethod
+    def from_json(cls, data: bytes, leaves: Sequence[Leaf], where: str) -> Labels:
+        """The labels of the leaves that there are.
+
+        Raises:
+            FormatError: something else, or a number of labels that a leaf has no use for.
+        """
+        expected = f"{where}: expected labels as schemas/labels.schema.json has them"
+        if len(data) > MAX_LABELS:
+            raise FormatError(f"{expected}, of at most {MAX_LABELS} bytes, found {len(data)}")
+        try:
+            found = json.loads(data)
+        except (ValueError, RecursionError) as err:
+            raise FormatError(f"{expected}, found no JSON: {err}") from err
+        if not isinstance(found, dict):
+            raise FormatError(f"{expected}, found {found!r:.80}")
+        seconds = found.get("step_seconds")
+        if seconds is not None and not _is_time(seconds):
+            raise FormatError(f"{expected}, found {seconds!r:.80} as the seconds of a step")
+        parts = []
+        for key in ("dimensions", "values"):
+            part = found.get(key, {})
+            if not isinstance(part, dict) or not all(_are_texts(texts) for texts in part.values()):
+                raise FormatError(f"{expected}, found {part!r:.80} as {key!r}")
+            parts.append({path: tuple(texts) for path, texts in part.items()})
+        by_path = {leaf.path: leaf for leaf in leaves}
+        dimensions, values = ({p: t for p, t in part.items() if p in by_path} for part in parts)
+        for part, count in ((dimensions, _dimensions), (values, _values)):
+            for path, texts in part.items():
+                if len(texts) != count(by_path[path]):
+                    raise FormatError(f"{expected}, found {len(texts)} labels of {path}")
+        return cls(dimensions, values, None if seconds is None else float(seconds))
+
+
+def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], known: Labels) -> Labels:
+    """`known`, with what somebody chose in its place: leaf path -> names of its dimensions, or of its values.
+
+    Raises:
+        SpaceError: a path that is no leaf's, or another number of names than the leaf has dimensions or values.
+    """
+    by_path = {leaf.path: leaf for leaf in leaves}
+    dimensions, values = dict(known.dimensions), dict(known.values)
+    for path, names in given.items():
+        leaf = by_path.get(path)
+        if leaf is None:
+            raise SpaceError(f"labels: expected one of {sorted(by_path)}, found {path!r:.80}")
+        texts = tuple(names) if not isinstance(names, str) else (names,)
+        if not _are_texts(texts):
+            raise SpaceError(
+                f"labels: expected names of 1 to {_LONGEST} characters for {path}, found {names!r:.80}"
+            )
+        if len(texts) == _values(leaf):
+            values[path] = texts
+        elif len(texts) == _dimensions(leaf):
+            dimensions[path] = texts
+        else:
+            counts = sorted({count for count in (_dimensions(leaf), _values(leaf)) if count is not None})
+            raise SpaceError(
+                f"labels: expected {' or '.join(map(str, counts)) or 'no'} names for {path} ({leaf.space}), "
+                f"found {len(texts)}"
+            )
+    return Labels(dimensions, values, known.step_seconds)
+
+
+def _dimensions(leaf: Leaf) -> int | None:
+    return None if leaf.dtype is None else leaf.size
+
+
+def _values(leaf: Leaf) -> int | None:
+    return int(leaf.space.n) if isinstance(leaf.space, spaces.Discrete) else None
+
+
+def _are_texts(texts: Any) -> bool:
+    return isinstance(texts, list | tuple) and all(
+        isinstance(text, str) and 0 < len(text) <= _LONGEST and text.isprintable() for text in texts
+    )
+
+
+def _is_time(seconds: Any) -> bool:
+    return isinstance(seconds, int | float) and not isinstance(seconds, bool) and 0 < seconds < math.inf
