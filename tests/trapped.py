@@ -202,6 +202,7 @@ def _facts(recording: Recording) -> None:
     repr((recording, recording.metadata, recording.all_metadata(), recording.observation_space))
     check_signature(recording)
     read_certificate(recording)
+    _tolerant(lambda: recording.labels)
 
 
 def _episodes(recording: Recording) -> None:

@@ -90,6 +90,7 @@ def _read(reader: Reader, recording: Recording) -> None:
         reader.ask(f"attachment {name}", lambda name=name: recording.read_attachment(name))  # type: ignore[misc]
     if "benchmark.json" in recording.attachments:
         reader.ask("benchmark", lambda: recording.benchmark.record.to_json())
+    reader.ask("labels", lambda: recording.labels)
     reader.ask("all metadata", recording.all_metadata)
     columns = reader.ask("columns", lambda: recording.read(fields=FIELDS))
     if columns is not None:
@@ -159,7 +160,7 @@ def judge(found: Facts, truth: Facts) -> Iterator[str]:
     names = [
         name
         for name in found
-        if name.startswith("attachment ") or name in ("uuid", "facts", "spaces", "benchmark")
+        if name.startswith("attachment ") or name in ("uuid", "facts", "spaces", "benchmark", "labels")
     ]
     for name in names:
         if name not in truth or found[name] != truth[name]:
