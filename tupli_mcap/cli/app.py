@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from tupli_mcap.cli import doctor, recordings, repair, sharing, storages, trusting
+from tupli_mcap.cli import doctor, recordings, repair, sharing, storages, trusting, viewing
 from tupli_mcap.cli.output import warnings_in_one_line
 from tupli_mcap.errors import FilterError, TupliError
 
@@ -130,6 +130,7 @@ storages.register(app)
 sharing.register(app)
 trusting.register(app)
 repair.register(app)
+viewing.register(app)
 
 
 def main() -> None:

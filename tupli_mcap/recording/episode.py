@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, overload
@@ -147,6 +148,22 @@ class Episode:
     def infos(self) -> list[dict[str, Any] | None] | None:
         """The recorded info of each step (None for a step without); None if the recording has no infos."""
         return self._recording.infos(self._position)
+
+    @property
+    def position(self) -> int:
+        """Where it is in `recording.episodes`; its number, unless the recording was compacted."""
+        return self._position
+
+    def to_rerun(self, stream: Any = None) -> Any:
+        """Sends the episode and a blueprint into a `rerun.RecordingStream`, by default a new one; returns it.
+
+        Raises:
+            MissingExtraError: rerun-sdk is not installed.
+        """
+        viewer = importlib.import_module(
+            "tupli_mcap.viewer"
+        )  # a layer above, which this one is not to depend on
+        return viewer.send(self._recording, stream, [self.number])
 
     def __iter__(self) -> Iterator[Step]:
         columns, infos = self._columns, self.infos

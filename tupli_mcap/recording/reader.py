@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -436,6 +437,25 @@ class Recording:
                     shifted[ends[known]] = finals[i]
             columns.append(shifted)
         return layout.nest_state(columns)
+
+    def replay(
+        self,
+        episodes: str | Sequence[int] | None = None,
+        *,
+        save: str | os.PathLike[str] | None = None,
+        **options: Any,
+    ) -> Any:
+        """Shows episodes in the Rerun viewer, or writes them into a `.rrd` file; see `tupli_mcap.viewer`.
+
+        Raises:
+            MissingExtraError: rerun-sdk is not installed.
+        """
+        viewer = importlib.import_module(
+            "tupli_mcap.viewer"
+        )  # a layer above, which this one is not to depend on
+        if save is not None:
+            return viewer.save(self, save, episodes, **options)
+        return viewer.show(self, episodes, **options)
 
     def close(self) -> None:
         """Closes the file; what was read stays valid."""

@@ -1,0 +1,131 @@
+"""What `tupli-mcap replay` sends to Rerun, read back from the files it writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from tupli_mcap import RecordEpisodes, viewer
+from tupli_mcap.cli import app
+from tupli_mcap.recording import Recording
+
+rr = pytest.importorskip("rerun")
+from rerun.chunk import RrdReader  # noqa: E402
+
+
+def record(path: Path, env: str, steps: int, seed: int = 3, **options: Any) -> Path:
+    with RecordEpisodes(gym.make(env, **options), path) as recorder:
+        recorder.action_space.seed(seed)
+        recorder.reset(seed=seed)
+        for _ in range(steps):
+            *_, terminated, truncated, _ = recorder.step(recorder.action_space.sample())
+            if terminated or truncated:
+                recorder.reset()
+    return path
+
+
+@pytest.fixture(scope="module")
+def cartpole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("cartpole") / "cartpole.mcap", "CartPole-v1", 300)
+
+
+class Rrd:
+    """What is in a `.rrd` file: of each of its recordings, the rows of an entity's component."""
+
+    def __init__(self, path: Path) -> None:
+        reader = RrdReader(str(path))
+        self.recordings = sorted(reader.recordings(), key=lambda entry: entry.recording_id)
+        self.blueprints = reader.blueprints()
+        self._batches: list[dict[str, list[Any]]] = []
+        for entry in self.recordings:
+            found: dict[str, list[Any]] = {}
+            for chunk in reader.stream(store=entry):
+                found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+            self._batches.append(found)
+
+    def entities(self, recording: int = 0) -> set[str]:
+        return set(self._batches[recording])
+
+    def rows(self, entity: str, component: str, recording: int = 0) -> list[Any]:
+        """Of a component or a timeline, in the order they were sent."""
+        batches = [b for b in self._batches[recording][entity] if component in b.schema.names]
+        batches.sort(key=lambda batch: str(batch.column("rerun.controls.RowId")[0]))
+        return [row for batch in batches for row in batch.column(component).to_pylist()]
+
+    def scalars(self, entity: str, recording: int = 0) -> np.ndarray:
+        return np.array(self.rows(entity, "Scalars:scalars", recording))
+
+
+def test_every_step_is_sent(cartpole: Path, tmp_path: Path) -> None:
+    goal = viewer.save(cartpole, tmp_path / "out.rrd")
+    found = Rrd(goal)
+    assert len(found.recordings) == 1 and len(found.blueprints) == 1
+    with Recording(cartpole) as recording:
+        columns = recording.read(fields=["states", "actions", "rewards", "times"])
+        lengths = recording.index["length"]
+    assert np.array_equal(found.scalars("/state"), columns.states)
+    assert np.array_equal(found.scalars("/action")[:, 0], columns.actions)
+    assert np.array_equal(found.scalars("/reward")[:, 0], columns.rewards)
+    running = np.concatenate([np.arange(1.0, n + 1) for n in lengths])
+    assert np.array_equal(found.scalars("/return")[:, 0], running)
+    assert found.rows("/state", "step") == list(range(300))
+    times = np.array(found.rows("/state", "time"), "datetime64[ns]")
+    assert abs(times.astype(np.int64) - columns.times).max() < 1000  # Python's own times have microseconds
+    assert np.array_equal(found.scalars("/overview/length")[:, 0], lengths)
+
+
+def test_one_episode_starts_at_step_0(cartpole: Path, tmp_path: Path) -> None:
+    with Recording(cartpole) as recording:
+        goal = recording.replay(save=tmp_path / "out.rrd", episodes="2")
+        episode = recording.episodes[2]
+        found = Rrd(goal)
+        assert found.rows("/state", "step") == list(range(len(episode)))
+        assert np.array_equal(found.scalars("/state"), episode.states)
+        assert found.scalars("/end/terminal").tolist() == [[episode.return_]]
+
+
+def test_split_gives_a_recording_an_episode(cartpole: Path, tmp_path: Path) -> None:
+    found = Rrd(viewer.save(cartpole, tmp_path / "out.rrd", [3, 1], form="split"))
+    assert len(found.recordings) == 2 and len(found.blueprints) == 1
+    assert len({entry.application_id for entry in found.recordings}) == 1
+    with Recording(cartpole) as recording:
+        for i, number in enumerate([1, 3]):
+            assert np.array_equal(found.scalars("/state", i), recording.episodes[number].states)
+
+
+def test_compare_puts_each_episode_below_its_own_root(cartpole: Path, tmp_path: Path) -> None:
+    found = Rrd(viewer.save(cartpole, tmp_path / "out.rrd", "first,4", form="compare"))
+    assert len(found.recordings) == 1
+    with Recording(cartpole) as recording:
+        for i, number in enumerate([0, 4]):
+            episode = recording.episodes[number]
+            assert found.rows(f"/compared/{i}/state/dims_1", "step") == list(range(len(episode)))
+            assert np.array_equal(found.scalars(f"/compared/{i}/state/dims_1")[:, 0], episode.states[:, 1])
+
+
+def test_an_episode_into_a_stream_of_ones_own(cartpole: Path, tmp_path: Path) -> None:
+    stream = rr.RecordingStream("mine")
+    stream.save(tmp_path / "mine.rrd")
+    with Recording(cartpole) as recording:
+        assert recording.episodes[1].to_rerun(stream) is stream
+        stream.disconnect()
+        assert np.array_equal(Rrd(tmp_path / "mine.rrd").scalars("/state"), recording.episodes[1].states)
+
+
+def test_a_file_is_replaced_only_if_told(
+    cartpole: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    goal = tmp_path / "out.rrd"
+    goal.write_bytes(b"mine")
+    words = ["replay", str(cartpole), "--save", str(goal)]
+    assert app(words, standalone_mode=False) == 1
+    assert "out.rrd exists already; choose another name, or replace it with --force" in capfd.readouterr().err
+    assert goal.read_bytes() == b"mine"
+    assert not app([*words, "--force", "--episode", "best"], standalone_mode=False)
+    assert "open it with: rerun" in capfd.readouterr().out
+    assert len(Rrd(goal).recordings) == 1
+    assert list(tmp_path.iterdir()) == [goal]

@@ -1,0 +1,179 @@
+"""Panels: a leaf, or what follows from the steps, as entities of a Rerun recording and a view on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.viewer.blocks import Array, Block
+from tupli_mcap.viewer.sending import Times, send_scalars
+
+__all__ = ["ENDS", "Panel", "Place", "Rewards", "Series", "plot"]
+
+ENDS: Mapping[str, int] = {"terminal": 0xE4572EFF, "timeout": 0xF3A712FF, "interrupted": 0x9A9A9AFF}
+"""How an episode may end, by code, and the colour of its marker (RGBA)."""
+
+
+class Place(NamedTuple):
+    """Where a panel's entities go: below `root` in a stream. `title` and `color` tell several episodes in one view
+    apart; they are empty where there is only one."""
+
+    stream: Any
+    root: str = ""
+    title: str = ""
+    color: int | None = None
+
+    def told(self, name: str, *, alone: bool) -> str:
+        """The name of a series: of the episode where the view shows only this one of each."""
+        if not self.title:
+            return name
+        return self.title if alone else f"{name} · {self.title}"
+
+
+class Panel(Protocol):
+    """Something that is shown."""
+
+    @property
+    def title(self) -> str: ...
+
+    def declare(self, place: Place) -> None:
+        """Sends what does not change."""
+        ...
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        """Sends a block of steps."""
+        ...
+
+    def view(self, roots: Sequence[str]) -> Any:
+        """The view on the entities below each root."""
+        ...
+
+
+@dataclass(frozen=True)
+class Series:
+    """Dimensions `dims` of a leaf as one entity of scalars, a line each.
+
+    column: the field of the steps that the leaf is in. stepped: the value is held, as an action is, rather than moved.
+    """
+
+    leaf: Leaf
+    column: str
+    entity: str
+    title: str
+    dims: Sequence[int]
+    names: Sequence[str]
+    stepped: bool = False
+
+    def declare(self, place: Place) -> None:
+        import rerun as rr
+        from rerun.components import InterpolationMode
+
+        lines = rr.SeriesLines(
+            names=[place.told(name, alone=len(self.names) == 1) for name in self.names],
+            colors=None if place.color is None else [place.color] * len(self.names),
+            interpolation_mode=InterpolationMode.StepAfter if self.stepped else None,
+        )
+        place.stream.log(place.root + self.entity, lines, static=True)
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        values = flat_values(self.leaf, self.column, block)
+        if len(self.dims) < values.shape[1]:
+            values = values[:, list(self.dims)]
+        send_scalars(place.stream, place.root + self.entity, times, values)
+
+    def view(self, roots: Sequence[str]) -> Any:
+        return plot(self.title, [root + self.entity for root in roots])
+
+
+@dataclass
+class Rewards:
+    """The reward, the running return, and a marker at the end of each episode, by how it ended."""
+
+    leaves: Sequence[Leaf]
+    title: str = "reward and return"
+    _running: float = 0.0  # the return of an episode that goes on in the next block
+
+    def declare(self, place: Place) -> None:
+        import rerun as rr
+        from rerun.components import MarkerShape
+
+        colors = None if place.color is None else [place.color]
+        for name in ("reward", "return"):
+            lines = rr.SeriesLines(names=[place.told(name, alone=True)], colors=colors)
+            place.stream.log(f"{place.root}/{name}", lines, static=True)
+        shapes = (MarkerShape.Cross, MarkerShape.Diamond, MarkerShape.Square)
+        for (name, color), shape in zip(ENDS.items(), shapes, strict=True):
+            points = rr.SeriesPoints(names=[name], colors=[color], markers=[shape], marker_sizes=[5.0])
+            place.stream.log(f"{place.root}/end/{name}", points, static=True)
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        rewards = self._totals(block)
+        returns = self._returns(rewards, block)
+        send_scalars(place.stream, f"{place.root}/reward", times, rewards[:, None])
+        send_scalars(place.stream, f"{place.root}/return", times, returns[:, None])
+        ends = [piece for piece in block.pieces if piece.last]
+        if not ends:
+            return
+        how = block.recording.index["end"][[piece.position for piece in ends]]
+        rows = np.array([piece.end - 1 for piece in ends], np.int64)
+        for code, name in enumerate(ENDS):
+            at = rows[how == code]
+            if len(at):
+                send_scalars(place.stream, f"{place.root}/end/{name}", times.at(at), returns[at][:, None])
+
+    def _totals(self, block: Block) -> Array:
+        total = np.zeros(len(block))
+        for leaf in self.leaves:
+            if leaf.dtype is not None and leaf.size:
+                total += flat_values(leaf, "rewards", block).sum(axis=1, dtype=np.float64)
+        return total
+
+    def _returns(self, rewards: Array, block: Block) -> Array:
+        """The return so far, after each step."""
+        returns = np.empty(len(rewards))
+        if np.isfinite(rewards).all():
+            sums = np.cumsum(rewards)
+            first = np.array([piece.begin for piece in block.pieces])
+            lengths = np.array([piece.end - piece.begin for piece in block.pieces])
+            returns = sums - np.repeat(sums[first] - rewards[first], lengths)
+        else:  # what is not finite stays in its episode
+            for piece in block.pieces:
+                np.cumsum(rewards[piece.begin : piece.end], out=returns[piece.begin : piece.end])
+        piece = block.pieces[0]  # where an episode is in several blocks, it is alone in each
+        if piece.step:
+            returns += self._running
+        self._running = 0.0 if piece.last else float(returns[-1])
+        return returns
+
+    def view(self, roots: Sequence[str]) -> Any:
+        import rerun.blueprint as rrb
+
+        ends = [f"{root}/end/{name}" for root in roots for name in ENDS]
+        return rrb.Vertical(
+            plot("return", [*(f"{root}/return" for root in roots), *ends]),
+            plot("reward", [f"{root}/reward" for root in roots]),
+            name=self.title,
+        )
+
+
+def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
+    """A leaf's values in a block: rows x dimensions."""
+    values: Array = leaf.get(getattr(block.columns, column))
+    return values.reshape(len(block), -1)
+
+
+def plot(title: str, entities: Sequence[str]) -> Any:
+    """A view of series over time, linked with the other plots."""
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(
+        name=title,
+        origin="/",
+        contents=list(entities),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+        axis_x=rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+    )

@@ -1,0 +1,167 @@
+"""What becomes of chosen episodes: one Rerun recording on a long timeline, one each, or all of them overlaid."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import uuid
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.recording import Recording
+from tupli_mcap.viewer.about import send_about
+from tupli_mcap.viewer.arrange import blueprint_of
+from tupli_mcap.viewer.blocks import Block, blocks_of
+from tupli_mcap.viewer.panels import Place
+from tupli_mcap.viewer.scene import Scene, scene_of
+from tupli_mcap.viewer.sdk import rerun_sdk
+from tupli_mcap.viewer.sending import Times
+
+__all__ = ["Chosen", "Form", "Plan", "plans_of"]
+
+Form = Literal["joined", "split", "compare"]
+_MOST_SPLIT = 200
+_MOST_COMPARED = 16
+_COLORS = (
+    0x4C9BE8FF, 0xF28E2BFF, 0x59C36AFF, 0xE15759FF, 0xB07AD9FF, 0xEDC948FF, 0x76D7C4FF, 0xFF9DA7FF,
+)  # fmt: skip
+
+
+class Chosen(NamedTuple):
+    """Episodes of a recording, by position."""
+
+    recording: Recording
+    positions: Sequence[int]
+
+
+class Part(NamedTuple):
+    """Episodes whose panels are below one root; their rows are numbered from `first`."""
+
+    chosen: Chosen
+    scene: Scene
+    root: str = ""
+    title: str = ""
+    color: int | None = None
+    first: int = 0
+
+
+class Plan(NamedTuple):
+    """One Rerun recording: its name, its parts, its blueprint."""
+
+    name: str
+    identity: str
+    parts: Sequence[Part]
+    shown: str
+
+    @property
+    def blueprint(self) -> Any:
+        """The blueprint of the parts."""
+        return blueprint_of(self.parts[0].scene, [part.root for part in self.parts])
+
+    @property
+    def application(self) -> str:
+        """The Rerun application: what looks alike has one, since a viewer keeps a blueprint for each."""
+        first = self.parts[0]
+        recording = first.chosen.recording
+        looks = json.dumps([recording.layout.to_metadata(), [part.root for part in self.parts]])
+        return f"{name_of(recording)} {hashlib.sha256(looks.encode()).hexdigest()[:6]}"
+
+    def new_stream(self) -> Any:
+        """A Rerun recording stream without a sink."""
+        rr = rerun_sdk()
+        fresh = f"{self.identity}-{uuid.uuid4().hex[:8]}"  # sent twice into one viewer, it is there twice
+        return rr.RecordingStream(self.application, recording_id=fresh, send_properties=True)
+
+    def send(self, stream: Any) -> None:
+        """Sends everything, a block of steps at a time."""
+        stream.send_recording_name(self.name)
+        recordings = list({id(part.chosen.recording): part.chosen.recording for part in self.parts}.values())
+        send_about(stream, recordings, self.shown, self.parts[0].scene.unseen)
+        for part in self.parts:
+            place = Place(stream, part.root, part.title, part.color)
+            for panel in part.scene.panels:
+                panel.declare(place)
+            for block in blocks_of(*part.chosen, part.first):
+                times = times_of(block)
+                for panel in part.scene.panels:
+                    panel.send(place, block, times)
+
+
+def times_of(block: Block) -> Times:
+    """Where a block's rows lie on the timelines."""
+    labels = getattr(block.recording, "labels", None)
+    seconds = None if labels is None else labels.step_seconds
+    return Times(block.number, block.times, None if seconds is None else block.number * seconds)
+
+
+def name_of(recording: Recording) -> str:
+    """The environment's name, else the file's."""
+    from tupli_mcap.recording.describe import describe
+
+    return describe(recording).environment or Path(recording.name).stem
+
+
+def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
+    """The Rerun recordings that show the chosen episodes.
+
+    Raises:
+        RecordingError: too many to be told apart.
+    """
+    total = sum(len(item.positions) for item in chosen)
+    if form == "split":
+        if total > _MOST_SPLIT:
+            raise RecordingError(
+                f"expected at most {_MOST_SPLIT} episodes to show apart, found {total}; choose fewer, or join them"
+            )
+        yield from _split(chosen)
+    elif form == "compare":
+        if total > _MOST_COMPARED:
+            raise RecordingError(
+                f"expected at most {_MOST_COMPARED} episodes to compare, found {total}; choose fewer"
+            )
+        yield _compared(chosen)
+    else:
+        yield _joined(chosen)
+
+
+def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
+    for item in chosen:
+        scene = scene_of(item.recording, item.positions)
+        for position in item.positions:
+            episode = item.recording.episodes[position]
+            told = f"Episode {episode.number}: {len(episode):,} steps, return {episode.return_:.6g}, {episode.end}"
+            name = f"{Path(item.recording.name).stem} · episode {episode.number}"
+            part = Part(Chosen(item.recording, [position]), scene)
+            yield Plan(name, f"{item.recording.uuid}-{episode.number}", [part], told)
+
+
+def _joined(chosen: Sequence[Chosen]) -> Plan:
+    scene = scene_of(*chosen[0])
+    parts: list[Part] = []
+    first = 0
+    for item in chosen:
+        parts.append(Part(item, scene, first=first))
+        first += int(item.recording.index["length"][list(item.positions)].sum())
+    total = sum(len(item.positions) for item in chosen)
+    name = Path(chosen[0].recording.name).stem
+    return Plan(name, chosen[0].recording.uuid, parts, f"{total:,} episodes, {first:,} steps")
+
+
+def _compared(chosen: Sequence[Chosen]) -> Plan:
+    scene = scene_of(*chosen[0], apart=True)
+    parts: list[Part] = []
+    for item in chosen:
+        stem = Path(item.recording.name).stem
+        for position in item.positions:
+            number = item.recording.episodes[position].number
+            title = f"episode {number}" if len(chosen) == 1 else f"{stem} {number}"
+            root = f"/compared/{len(parts)}"
+            parts.append(
+                Part(
+                    Chosen(item.recording, [position]), scene, root, title, _COLORS[len(parts) % len(_COLORS)]
+                )
+            )
+    told = ", ".join(part.title for part in parts)
+    return Plan("comparison", chosen[0].recording.uuid, parts, f"Compared: {told}")
