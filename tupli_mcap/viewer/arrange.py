@@ -10,27 +10,45 @@ from tupli_mcap.viewer.scene import Scene
 __all__ = ["blueprint_of"]
 
 
+_TALL = 4  # panels that a column has room for
+
+
 def blueprint_of(scene: Scene, roots: Sequence[str] = ("",)) -> Any:
-    """The blueprint of a scene whose panels are below each of `roots`."""
+    """The blueprint of a scene whose panels are below each of `roots`: what was seen and done on the left, what came of
+    it on the right, and no side panels."""
     import rerun.blueprint as rrb
 
-    left = [panel.view(roots) for panel in [*scene.states, *scene.actions]]
-    right = [panel.view(roots) for panel in [*scene.beside, *scene.rewards]]
+    plots = [*scene.states, *scene.actions]
+    left = _stacked([panel.view(roots) for panel in plots], "state and action")
+    rewards = [panel.view(roots) for panel in scene.rewards]
     about = rrb.Tabs(
         rrb.TextDocumentView(name="recording", origin="/card"),
         rrb.BarChartView(name="returns", origin="/overview/return"),
         rrb.BarChartView(name="lengths", origin="/overview/length"),
         name="about",
     )
+    beside = [_grid([panel.view(roots) for panel in scene.beside], "seen")] if scene.beside else []
+    right = rrb.Vertical(*beside, *rewards, about, row_shares=[3] * len(beside) + [3] * len(rewards) + [2])
     return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(*left, name="state and action"),
-            rrb.Vertical(*right, about, name="reward"),
-            column_shares=[3, 2],
-        ),
+        rrb.Horizontal(left, right, column_shares=[3, 2]) if plots else right,
         rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
         rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
         rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline="step"),
         auto_layout=False,
         auto_views=False,
     )
+
+
+def _stacked(views: Sequence[Any], name: str) -> Any:
+    """Views below each other, in two columns where they would be too flat to read."""
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(*views, name=name) if len(views) <= _TALL else _grid(views, name)
+
+
+def _grid(views: Sequence[Any], name: str) -> Any:
+    """Views in columns: one, two, or more for many."""
+    import rerun.blueprint as rrb
+
+    columns = 1 if len(views) == 1 else 2 if len(views) <= 12 else 3
+    return rrb.Grid(*views, grid_columns=columns, name=name)

@@ -9,7 +9,7 @@ import numpy as np
 
 from tupli_mcap.messages.leaves import Leaf
 
-__all__ = ["dimension_names", "entity_of", "escaped"]
+__all__ = ["dimension_names", "entity_of", "escaped", "title_of"]
 
 _LONGEST = 80  # characters of a part of an entity path
 
@@ -26,6 +26,12 @@ def entity_of(leaf: Leaf) -> str:
     """The entity path of a leaf: `/state/arm/position`."""
     root = leaf.path.partition("[")[0]
     return "/".join(["", root, *(escaped(str(key)) for key in leaf.keys)])
+
+
+def title_of(leaf: Leaf) -> str:
+    """A leaf's name as people say it: `state · arm · position`."""
+    root = leaf.path.partition("[")[0]
+    return " · ".join([root, *(str(key)[:_LONGEST] for key in leaf.keys)])
 
 
 def dimension_names(leaf: Leaf, known: Sequence[str] | None) -> list[str]:

@@ -12,10 +12,17 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.viewer.blocks import Array, Block
 from tupli_mcap.viewer.sending import Times, send_scalars
 
-__all__ = ["ENDS", "Panel", "Place", "Rewards", "Series", "plot"]
+__all__ = ["ENDS", "PALETTE", "Panel", "Place", "Rewards", "Series", "plot"]
 
 ENDS: Mapping[str, int] = {"terminal": 0xE4572EFF, "timeout": 0xF3A712FF, "interrupted": 0x9A9A9AFF}
 """How an episode may end, by code, and the colour of its marker (RGBA)."""
+
+
+PALETTE = (
+    0x4C9BE8FF, 0xF28E2BFF, 0x59C36AFF, 0xE15759FF, 0xB07AD9FF, 0xEDC948FF,
+    0x3FBFB5FF, 0xFF9DA7FF, 0xB58A6BFF, 0x8FA6C8FF, 0xA8C64DFF, 0xD264B6FF,
+)  # fmt: skip
+"""Colours that are told apart next to each other, on a light and on a dark ground (RGBA)."""
 
 
 class Place(NamedTuple):
@@ -72,9 +79,12 @@ class Series:
         import rerun as rr
         from rerun.components import InterpolationMode
 
+        number = len(self.names)
+        told_apart = np.resize(np.array(PALETTE, np.uint32), number)
+        colors = told_apart if place.color is None else np.full(number, place.color, np.uint32)
         lines = rr.SeriesLines(
             names=[place.told(name, alone=len(self.names) == 1) for name in self.names],
-            colors=None if place.color is None else [place.color] * len(self.names),
+            colors=colors,
             interpolation_mode=InterpolationMode.StepAfter if self.stepped else None,
         )
         place.stream.log(place.root + self.entity, lines, static=True)
@@ -86,7 +96,8 @@ class Series:
         send_scalars(place.stream, place.root + self.entity, times, values)
 
     def view(self, roots: Sequence[str]) -> Any:
-        return plot(self.title, [root + self.entity for root in roots])
+        alone = len(roots) == 1 and len(self.names) == 1
+        return plot(self.title, [root + self.entity for root in roots], legend=not alone)
 
 
 @dataclass
@@ -101,9 +112,8 @@ class Rewards:
         import rerun as rr
         from rerun.components import MarkerShape
 
-        colors = None if place.color is None else [place.color]
-        for name in ("reward", "return"):
-            lines = rr.SeriesLines(names=[place.told(name, alone=True)], colors=colors)
+        for name, color in (("reward", PALETTE[6]), ("return", PALETTE[2])):
+            lines = rr.SeriesLines(names=[place.told(name, alone=True)], colors=[place.color or color])
             place.stream.log(f"{place.root}/{name}", lines, static=True)
         shapes = (MarkerShape.Cross, MarkerShape.Diamond, MarkerShape.Square)
         for (name, color), shape in zip(ENDS.items(), shapes, strict=True):
@@ -155,7 +165,7 @@ class Rewards:
         ends = [f"{root}/end/{name}" for root in roots for name in ENDS]
         return rrb.Vertical(
             plot("return", [*(f"{root}/return" for root in roots), *ends]),
-            plot("reward", [f"{root}/reward" for root in roots]),
+            plot("reward", [f"{root}/reward" for root in roots], legend=len(roots) > 1),
             name=self.title,
         )
 
@@ -166,14 +176,14 @@ def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
     return values.reshape(len(block), -1)
 
 
-def plot(title: str, entities: Sequence[str]) -> Any:
-    """A view of series over time, linked with the other plots."""
+def plot(title: str, entities: Sequence[str], *, legend: bool = True) -> Any:
+    """A view of series over time, linked with the other plots. A legend of what the title says would only hide it."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
         name=title,
         origin="/",
         contents=list(entities),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         axis_x=rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.about import send_about
 from tupli_mcap.viewer.arrange import blueprint_of
 from tupli_mcap.viewer.blocks import Block, blocks_of
-from tupli_mcap.viewer.panels import Place
+from tupli_mcap.viewer.panels import PALETTE, Place
 from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk
 from tupli_mcap.viewer.sending import Times
@@ -24,9 +25,6 @@ __all__ = ["Chosen", "Form", "Plan", "plans_of"]
 Form = Literal["joined", "split", "compare"]
 _MOST_SPLIT = 200
 _MOST_COMPARED = 16
-_COLORS = (
-    0x4C9BE8FF, 0xF28E2BFF, 0x59C36AFF, 0xE15759FF, 0xB07AD9FF, 0xEDC948FF, 0x76D7C4FF, 0xFF9DA7FF,
-)  # fmt: skip
 
 
 class Chosen(NamedTuple):
@@ -66,7 +64,8 @@ class Plan(NamedTuple):
         first = self.parts[0]
         recording = first.chosen.recording
         looks = json.dumps([recording.layout.to_metadata(), [part.root for part in self.parts]])
-        return f"{name_of(recording)} {hashlib.sha256(looks.encode()).hexdigest()[:6]}"
+        name = re.sub(r"[^\w-]+", "-", name_of(recording))  # the viewer warns of others
+        return f"{name} {hashlib.sha256(looks.encode()).hexdigest()[:6]}"
 
     def new_stream(self) -> Any:
         """A Rerun recording stream without a sink."""
@@ -160,7 +159,7 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
             root = f"/compared/{len(parts)}"
             parts.append(
                 Part(
-                    Chosen(item.recording, [position]), scene, root, title, _COLORS[len(parts) % len(_COLORS)]
+                    Chosen(item.recording, [position]), scene, root, title, PALETTE[len(parts) % len(PALETTE)]
                 )
             )
     told = ", ".join(part.title for part in parts)

@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
-from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, magnitudes
+from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, magnitudes, title_of
 from tupli_mcap.viewer.panels import Panel, Rewards, Series
 
 __all__ = ["Scene", "scene_of"]
@@ -56,7 +56,7 @@ def _add(
     scene: Scene, panels: list[Panel], leaf: Leaf, column: str, sample: Any, recording: Recording, most: int
 ) -> None:
     if leaf.dtype is None or not leaf.size or leaf.kind == "image":
-        scene.unseen.append(f"{leaf.path}: {leaf.space}")
+        scene.unseen.append(f"{title_of(leaf)}: {leaf.space}")
         return
     labels = getattr(recording, "labels", None)
     names = dimension_names(leaf, None if labels is None else labels.dimensions.get(leaf.path))
@@ -66,9 +66,14 @@ def _add(
     for dims in groups:
         told = [names[i] for i in dims]
         alone = len(groups) == 1
-        title = leaf.path if alone else f"{leaf.path}: {', '.join(told)}"
+        title = title_of(leaf) if alone else f"{title_of(leaf)}: {_some(told)}"
         path = entity if alone else f"{entity}/dims_{'_'.join(map(str, dims))}"
         panels.append(Series(leaf, column, path, title, dims, told, stepped=column == "actions"))
+
+
+def _some(names: Sequence[str], most: int = 4) -> str:
+    """The first names, as a title has room for."""
+    return ", ".join(names[:most]) + ("" if len(names) <= most else ", …")
 
 
 def _sample(recording: Recording, positions: Sequence[int]) -> list[Any]:

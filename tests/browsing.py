@@ -1,0 +1,78 @@
+"""A page in a real Chromium that draws by software: photographed as soon as it shows something in colour."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+from playwright.sync_api import Page, sync_playwright
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+_FLAGS = (
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+_TOP = 40  # rows of pixels of the viewer's own bar, whose signs are coloured
+
+
+class Seen(NamedTuple):
+    """What a page showed: height x width x 3 bytes, and what its scripts complained of."""
+
+    picture: np.ndarray
+    complaints: list[str]
+
+    @property
+    def ink(self) -> float:
+        """The part of the pixels below the viewer's bar that are coloured."""
+        return _ink(self.picture)
+
+
+def browse(url: str, seconds: float = 90.0, size: tuple[int, int] = (1000, 700)) -> Seen:
+    """Open a page and wait until two pictures in a row are the same and coloured, or the time is over.
+
+    It reaches this machine only: what the page asks of others is refused.
+    """
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *_FLAGS])
+        page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
+        page.add_init_script("console.debug = console.log = () => {}")  # thousands of lines on shaders
+        page.route(lambda target: not target.startswith("http://127.0.0.1:"), lambda route: route.abort())
+        complaints: list[str] = []
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.goto(url)
+        picture = _settled(page, time.monotonic() + seconds)
+        chromium.close()
+    return Seen(picture, complaints)
+
+
+def _settled(page: Page, end: float) -> np.ndarray:
+    picture = _picture(page)
+    while time.monotonic() < end:
+        page.wait_for_timeout(300)
+        before, picture = picture, _picture(page)
+        if _ink(picture) > 0.002 and _ink(before) > 0.002 and np.abs(picture - before).mean() < 2:
+            break
+    return picture
+
+
+def _picture(page: Page) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+
+
+def _ink(picture: np.ndarray) -> float:
+    below = picture[_TOP:]
+    return float((below.max(axis=2) - below.min(axis=2) > 60).mean())
+
+
+def save(seen: Seen, path: Path) -> None:
+    """Write the picture as a PNG."""
+    Image.fromarray(seen.picture.astype(np.uint8)).save(path)
