@@ -105,8 +105,20 @@ class HeadlessViewer:
         self.client.set_time(timeline, sequence=step, play_state="paused")
 
     def filled(self) -> dict[str, bool]:
-        """Every visible view's name, and whether it shows any data."""
-        return {view.name: self.ink(view) > 0.002 for view in self.client.get_state().views if view.visible}
+        """The name of every view in sight, and whether it shows any data; not those behind another tab."""
+        return {
+            view.name: self.ink(view) > 0.002 for view in self.client.get_state().views if self.in_sight(view)
+        }
+
+    def in_sight(self, view: View) -> bool:
+        """Whether a view is drawn, rather than hidden or behind another tab."""
+        try:
+            self.client.take_screenshot(view.view_id, max_size=1)
+        except ConnectionError as err:
+            if "NotFound" in str(err):
+                return False
+            raise
+        return view.visible
 
     def problems(self) -> list[str]:
         """What views and the viewer complained of since the last `show`."""
