@@ -106,7 +106,7 @@ def assert_same(found: list[dict[str, Any]], wanted: list[dict[str, Any]]) -> No
 
 def test_there_is_one_for_each_feature_and_all_are_small() -> None:
     assert set(NAMES) == set(load_tool().FEATURES)
-    assert sum(path.stat().st_size for path in GOLDEN.iterdir()) < 300 * 1024
+    assert sum(path.stat().st_size for path in GOLDEN.iterdir()) < 400 * 1024
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -242,6 +242,20 @@ def test_the_writer_writes_the_same_bytes(name: str, tmp_path: Path) -> None:
         assert journals[0] == journals[1], hint
     else:
         assert parts(tmp_path / f"{name}.mcap") == parts(GOLDEN / f"{name}.mcap"), hint
+
+
+@pytest.mark.parametrize(("name", "every"), [("frames", 2), ("unfinished_frames", 1)])
+def test_frames_show_what_was_drawn(name: str, every: int, tmp_path: Path) -> None:
+    painting = load_tool().painting
+    with Recording(place(name, tmp_path)) as recording:
+        assert recording.cameras == ("render",)
+        for number, episode in enumerate(recording.episodes):
+            steps = [s for s in range(len(episode) + 1) if s % every == 0 or s == len(episode)]
+            if episode.end == "interrupted":
+                steps = [s for s in steps if s % every == 0]
+            assert episode.frames.steps.tolist() == steps
+            for step, frame in zip(steps, episode.frames, strict=True):
+                np.testing.assert_array_equal(frame, painting(number, step))
 
 
 def test_attachments_and_benchmark() -> None:

@@ -15,9 +15,10 @@ import itertools
 import shutil
 import tempfile
 import uuid
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from unittest import mock
 
 import gymnasium as gym
@@ -105,6 +106,35 @@ class Played(gym.Env[Any, Any]):
         log["final_state"] = copy.deepcopy(self._state)
         log["end"] = "terminal" if terminal else "timeout" if timeout else "interrupted"
         return self._state, reward, terminal, timeout, info
+
+
+class Painted(Played):
+    """Played, with pictures of a formula."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
+    render_mode = "rgb_array"
+
+    def render(self) -> Any:
+        return painting(self._number, self._t)
+
+
+def painting(episode: int, t: int) -> Any:
+    return np.arange(2 * 5 * 3, dtype=np.uint8).reshape(2, 5, 3) + np.uint8(40 * episode + 7 * t)
+
+
+def stored_png(picture: Any, form: str) -> bytes:
+    """A PNG that is not compressed: what a compressor writes changes with its version."""
+    height, width, _ = picture.shape
+    lines = b"".join(b"\0" + row.tobytes() for row in picture)
+    size = len(lines).to_bytes(2, "little")
+    complement = bytes(255 - byte for byte in size)
+    data = b"\x78\x01\x01" + size + complement + lines + zlib.adler32(lines).to_bytes(4, "big")
+    head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\x08\x02\0\0\0"
+    chunks = ((b"IHDR", head), (b"IDAT", data), (b"IEND", b""))
+    parts = (
+        len(b).to_bytes(4, "big") + name + b + zlib.crc32(name + b).to_bytes(4, "big") for name, b in chunks
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 class Score(EpisodeMetadataCallback):
@@ -369,12 +399,28 @@ def bundle(path: Path) -> list[Log]:
     return expected(env)
 
 
-def unfinished(path: Path, env: Played) -> list[Log]:
+def frames(path: Path) -> list[Log]:
+    """A picture of every second state and of each final one; an episode that was cut short, and one appended."""
+    env = Painted(POLE, pole, [(3, "terminal"), (4, "timeout"), (9, "terminal")])
+    options: dict[str, Any] = {"compression": "none", "attachments": {}, "chunk_size": 300}
+    with mock.patch("tupli_mcap.recording.framing.encode_picture", stored_png):
+        for mode, lengths in (("x", [3, 4, 3]), ("a", [2])):
+            with RecordEpisodes(env, path, frames=2, mode=mode, **options) as recorder:  # type: ignore[arg-type]
+                roll(recorder, env, lengths, action)
+    return expected(env)
+
+
+def unfinished_frames(path: Path) -> list[Log]:
+    with mock.patch("tupli_mcap.recording.framing.encode_picture", stored_png):
+        return unfinished(path, Painted(POLE, pole, ENDS), frames=True)
+
+
+def unfinished(path: Path, env: Played, **more: Any) -> list[Log]:
     """What a power loss leaves at the best: a file without a summary, and its journal."""
     with tempfile.TemporaryDirectory() as directory:
         live = Path(directory, path.name)
         options: dict[str, Any] = {"compression": "none", "attachments": {}, "chunk_size": 400}
-        with RecordEpisodes(env, live, durability="step", **options) as recorder:
+        with RecordEpisodes(env, live, durability="step", **options, **more) as recorder:
             roll(recorder, env, [3, 4, 2], action)
             shutil.copy(live, path)
             journal = journal_path(live).read_bytes()
@@ -414,6 +460,8 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "unfinished_variable": lambda path: unfinished(path, Played(spaces.Text(20), words, ENDS)),
     "bundle": bundle,
     "unfinished_images": lambda path: unfinished(path, Played(CAMERA, picture, ENDS)),
+    "frames": frames,
+    "unfinished_frames": unfinished_frames,
 }
 
 

@@ -226,6 +226,8 @@ def _losses(report: RecoveryReport) -> list[str]:
             found.append(f"lost: {what} {shown}{' ...' if len(episodes) > _SHOWN else ''}")
     if report.infos_lost:
         found.append(f"lost: {counted(report.infos_lost, 'info')} of steps")
+    if report.frames_lost:
+        found.append(f"lost: {counted(report.frames_lost, 'frame')}")
     for topic, count in report.messages_lost.items():
         found.append(f"lost: {counted(count, 'message')} of {topic}")
     if report.attachments_lost:

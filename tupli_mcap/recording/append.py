@@ -142,6 +142,7 @@ def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
     counts: dict[int, int] = {}
     for row in contents.table:
         counts[int(row["channel"])] = counts.get(int(row["channel"]), 0) + int(row["rows"])
+    _check_frames_aligned(writer, contents, counts)
     for channel in contents.channels.values():
         if "leaf" not in channel.metadata:
             continue
@@ -152,6 +153,21 @@ def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
         if found != expected:
             raise RecordingError(
                 f"{writer.path} lost its end: expected {expected} images in {channel.topic}, found {found}; "
+                f'"tupli-mcap recover {writer.path}" writes what is whole to a new file, which can be appended to'
+            )
+
+
+def _check_frames_aligned(writer: RecordingWriter, contents: Contents, counts: Mapping[int, int]) -> None:
+    """What a frame shows is told by the row of the same number in another channel."""
+    topics = {channel.topic: channel.id for channel in contents.channels.values()}
+    for topic, channel in topics.items():
+        if "/frame/" not in topic:
+            continue
+        camera = topic.replace("/frame/", "/camera/", 1)
+        found, expected = counts.get(topics.get(camera, 0), 0), counts.get(channel, 0)
+        if found != expected:
+            raise RecordingError(
+                f"{writer.path} lost its end: expected {expected} frames in {camera}, found {found}; "
                 f'"tupli-mcap recover {writer.path}" writes what is whole to a new file, which can be appended to'
             )
 

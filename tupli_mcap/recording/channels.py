@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.layout import IMAGE_SCHEMA
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
+from tupli_mcap.recording.cameras import (
+    CAMERA_NAME,
+    CAMERA_SCHEMA,
+    FRAME_NAME,
+    FRAME_SCHEMA,
+    CameraTopics,
+)
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.events import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.recording.journal import Area, LogArea, RowArea
 from tupli_mcap.recording.rows import rows_per_half
 
-__all__ = ["Channels", "plan_areas", "register_channels"]
+__all__ = ["FRAMES_AREA", "Channels", "plan_areas", "register_channels"]
+
+FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name
 
 
 class Channels(NamedTuple):
@@ -25,6 +34,7 @@ class Channels(NamedTuple):
     start: int
     end: int
     info: int | None
+    cameras: list[tuple[int, int]]  # of one camera, by sub-environment: `/camera/<name>` and `/frame/<name>`
 
 
 def register_channels(
@@ -33,10 +43,12 @@ def register_channels(
     layout: StepLayout,
     sub_environments: int | None,
     info: tuple[str, Mapping[str, str]] | None,
+    cameras: Sequence[str] = (),
 ) -> Channels:
     """Adds the channels a layout needs, or finds them in a recording that is appended to.
 
     `sub_environments` is None for a single environment; `info` is the schema and the metadata of `/info`.
+    `cameras` are names; the ids of the last one's channels are returned.
 
     Raises:
         RecordingError: a channel of that topic has another schema.
@@ -74,17 +86,30 @@ def register_channels(
         ]
         for leaf in layout.images
     ]
-    return Channels(
-        steps,
-        images,
+    others = (
         channel("/final_state", FINAL_STATE_SCHEMA, layout.final_schema, description),
         channel("/episode_start", START_NAME, START_SCHEMA, {}),
         channel("/episode_end", END_NAME, END_SCHEMA, {}),
         None if info is None else channel("/info", "tupli_mcap/msg/Info", info[0], info[1]),
     )
+    pairs: list[tuple[int, int]] = []
+    for name in cameras:
+        pairs = []
+        for i in range(len(tops)):
+            topics = CameraTopics.of(name, None if sub_environments is None else i)
+            about = {"env": str(i), "camera": name}
+            pairs.append(
+                (
+                    channel(topics.camera, CAMERA_NAME, CAMERA_SCHEMA, {}),
+                    channel(topics.frame, FRAME_NAME, FRAME_SCHEMA, about),
+                )
+            )
+    return Channels(steps, images, *others, pairs)
 
 
-def plan_areas(layout: StepLayout, n: int, size: int, step_capacity: int, *, infos: bool) -> list[Area]:
+def plan_areas(
+    layout: StepLayout, n: int, size: int, step_capacity: int, *, infos: bool, frames: bool = False
+) -> list[Area]:
     """The areas of a journal for `n` sub-environments and chunks of `size` bytes.
 
     `step_capacity` is the least room (bytes) for steps of variable size.
@@ -104,4 +129,6 @@ def plan_areas(layout: StepLayout, n: int, size: int, step_capacity: int, *, inf
     areas.append(LogArea("events", 512 * 1024))
     if infos:
         areas.append(LogArea("info", size))
+    if frames:  # pictures are large: a few a chunk
+        areas += [LogArea(f"{FRAMES_AREA}{i}", 4 * size) for i in range(n)]
     return areas

@@ -12,6 +12,7 @@ from mcap.records import Channel
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.cameras import FRAME_LAYOUT
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.container import CHUNK_ROWS, Rows
 from tupli_mcap.recording.contents import Contents
@@ -123,7 +124,7 @@ def complete(
     episodes = _Episodes(store, topics)
     available = [_available(store, topics, layout, found.channels[channel]) for channel in steps]
     tail.left_out += sum(map(store.count, steps)) - sum(available)
-    contents.used_episodes = episodes.drop_ends(available)
+    contents.used_episodes = max(episodes.drop_ends(available), _beyond_frames(store, topics))
     for start, time in _unstarted(store, layout, steps, available, set(episodes.starts)):
         episodes.make_start(start, time)
     for number in sorted(set(episodes.starts) - set(episodes.ends)):
@@ -148,6 +149,16 @@ def complete(
     contents.table = chunk_table(found, tail.rows)
     contents.tail = tail.rows
     contents.index = _index(episodes, contents.table)
+
+
+def _beyond_frames(store: ChunkStore, topics: dict[str, int]) -> int:
+    """A number beyond those of the episodes that frames show: the steps of some may be lost."""
+    beyond = 0
+    for topic, channel in topics.items():
+        if "/frame/" in topic:
+            for chunk in store.chunks(channel):
+                beyond = max(beyond, int(store.rows(chunk, FRAME_LAYOUT.dtype)["episode"].max()) + 1)
+    return beyond
 
 
 def _index(episodes: _Episodes, table: np.ndarray[Any, Any]) -> EpisodeIndex:

@@ -32,7 +32,7 @@ RECORDING_KEYS = (
     "uuid", "format_version", "library", "created_ns", "benchmark_id", "journal", "rewritten", "next_episode",
 )  # fmt: skip
 CHANNEL_KEYS = (
-    "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields",
+    "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields", "camera",
 )  # fmt: skip
 _ATTEMPTS = 5
 _PAUSE = 0.01  # seconds: a writer begins, ends or goes on within that
@@ -146,7 +146,12 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
 
 
 def is_ours(topic: str) -> bool:
-    return topic in ("/final_state", "/info") or topic.endswith("/step") or "/image/" in topic
+    return (
+        topic in ("/final_state", "/info")
+        or topic.endswith("/step")
+        or "/image/" in topic
+        or "/frame/" in topic
+    )
 
 
 def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:

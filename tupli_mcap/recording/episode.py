@@ -15,6 +15,7 @@ from tupli_mcap.recording.events import END_NAMES, EpisodeStart
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.columns import Columns
+    from tupli_mcap.recording.frames import Frames
     from tupli_mcap.recording.reader import Recording
 
 __all__ = ["Episode", "Episodes", "Step", "item_getter"]
@@ -164,6 +165,12 @@ class Episode:
             "tupli_mcap.viewer"
         )  # a layer above, which this one is not to depend on
         return viewer.send(self._recording, stream, [self.number])
+
+    @cached_property
+    def frames(self) -> Frames:
+        """The recorded pictures, of the camera "render" or else the first one; `frames.steps` says what they show.
+        None were recorded where it is empty."""
+        return self._recording.frames(self._position)
 
     def __iter__(self) -> Iterator[Step]:
         columns, infos = self._columns, self.infos

@@ -18,7 +18,7 @@ class Problem:
     """Something found in a file. `severity` "error": the file is damaged; "note": worth to know.
 
     kind: "file", "record", "chunk", "message_index", "attachment", "metadata", "summary", "index", "layout", "rows",
-        "episode", "final_state", "info", "image", "benchmark", "signature", "journal", or one of a storage's.
+        "episode", "final_state", "info", "image", "frame", "benchmark", "signature", "journal", or one of a storage's.
     offset: in the file (bytes). channel: a topic. episode, step: numbers.
     follows: damage found elsewhere in the file is enough to explain it.
     """

@@ -112,6 +112,11 @@ class EventLog:
         self._position = 0
         self._commit[0] = 0
 
+    @property
+    def latest_ns(self) -> int:
+        """The log_time of the last message; that of the next one is not less."""
+        return self._time
+
     def append(self, time_ns: int, *messages: tuple[int, bytes]) -> int:
         """Adds messages (channel, CDR body), all or none of them after a crash; returns their log_time."""
         if time_ns > self._time:

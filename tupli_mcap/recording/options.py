@@ -21,6 +21,7 @@ class WriterOptions(NamedTuple):
 
     A new recording that no step came into is removed when it is closed, unless `keep_empty`.
     `durability` says what a power loss leaves: what the system happened to write, every chunk, or every step.
+    `cameras` names the one that frames will come from, if any.
     """
 
     compression: str = "zstd"
@@ -32,6 +33,7 @@ class WriterOptions(NamedTuple):
     flush_seconds: float | None = None
     keep_empty: bool = False
     durability: Durability = "os"
+    cameras: tuple[str, ...] = ()
 
 
 def check_options(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:

@@ -24,6 +24,7 @@ from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns, Run, run
 from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.events import EpisodeStart
+from tupli_mcap.recording.frames import Cameras, Frames
 from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.signed import SIGNATURE_NAME, voucher
 from tupli_mcap.recording.source import open_source
@@ -114,6 +115,7 @@ class Recording:
         self._infos: dict[int, dict[int, dict[str, Any]]] | None = None
         counts = {topic: self._store.count(self._topics.get(topic, 0)) for topic in EPISODE_TOPICS}
         check_episodes(self.index, [self._store.count(c) for c in self._step_channels], counts, self.name)
+        self._cameras = Cameras(contents, self._store, self.is_vector, len(steps), self.name)
         if steps:
             self._layout = StepLayout.from_metadata(steps[0].metadata)
             description = _spaces_of(steps[0])
@@ -340,6 +342,32 @@ class Recording:
         row = self.index[i]
         steps = self._infos.get(int(row["episode"]), {})
         return [steps.get(step) for step in range(int(row["length"]))]
+
+    # ---- frames
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that there are frames of; empty if there are none."""
+        return self._cameras.names
+
+    def frames(self, i: int, camera: str | None = None) -> Frames:
+        """The frames of episode `i`; none if the recording has no camera, or the episode no frames.
+
+        Args:
+            camera: one of `cameras`; by default "render", or else the first one.
+
+        Raises:
+            RecordingError: there is no such camera.
+        """
+        row = self.index[i]
+        env = int(row["env"])
+        if camera is None:
+            camera = "render" if "render" in self.cameras or not self.cameras else self.cameras[0]
+            if not self.cameras:
+                none = np.empty(0, np.int64)
+                return Frames(self, camera, env, none, none, none)
+        rows = self._cameras.rows(camera, env, int(row["episode"]), int(row["length"]))
+        return Frames(self, camera, env, *rows)
 
     # ---- columns
 

@@ -17,6 +17,7 @@ from mcap.records import Channel, Schema
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.channels import FRAMES_AREA
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.complete import Unwritten, chunk_table, complete
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata, step_channels
@@ -274,8 +275,8 @@ def _salvage(
         if rows is not None:
             tail.rows.append(rows)
         _salvage_images(found, journal, layout, env, total, tail)
-    for name in _EVENTS:
-        if name in journal.areas:
+    for name in journal.areas:
+        if name in _EVENTS or name.startswith(FRAMES_AREA):
             tail.rows += to_rows(log_records(journal, _log_area(journal, name), counts))
 
 

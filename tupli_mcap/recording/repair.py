@@ -17,6 +17,7 @@ from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.repair_foreign import copy_foreign
+from tupli_mcap.recording.repair_frames import OldCameras, frames_lost
 from tupli_mcap.recording.repair_gather import Gathered, gather, is_recording, may_be_recording
 from tupli_mcap.recording.repair_journal import add_journal
 from tupli_mcap.recording.repair_plan import Plan, make_plan
@@ -85,6 +86,7 @@ class RecoveryReport:
     ends_lost: list[int] = field(default_factory=list)
     final_states_lost: list[int] = field(default_factory=list)
     infos_lost: int = 0
+    frames_lost: int = 0
     damaged: list[DamagedPlace] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -271,6 +273,8 @@ def _recover_ours(
         writer.steps(layout, channels, plan, store)
         _report_plan(report, plan)
         report.infos_lost = _infos_lost(gathered, channels)
+        vector = gathered.channels[channels.steps[0]].topic != "/step"
+        report.frames_lost = frames_lost(gathered, OldCameras.of(gathered, len(channels.steps), vector))
     writer.finish()
     if gathered.metadata is None:
         report.notes.append("the recording's metadata are lost: it has a new uuid and names no benchmark")

@@ -8,6 +8,7 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.channels import FRAMES_AREA
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, read_journal, recorded_journal
@@ -75,21 +76,20 @@ def _merge(gathered: Gathered, journal: JournalContents) -> None:
         return
     layout = StepLayout.from_metadata(steps[0].metadata)
     channels = Channels.of(gathered, layout)
-    for name in ("events", "info"):
-        area = journal.areas.get(name)
-        if isinstance(area, LogArea):
-            _add_log(gathered, journal, area)
+    for name, log in journal.areas.items():
+        if isinstance(log, LogArea) and (name in ("events", "info") or name.startswith(FRAMES_AREA)):
+            _add_log(gathered, journal, log)
     starts = _starts(gathered, channels)
     gathered.final_lost = journal.torn and bool(journal.info.get("vector"))
     for env, channel in enumerate(channels.steps):
         if layout.constant:
             state = _add_rows(gathered, journal, layout, env, channel, starts)
         else:
-            log = journal.areas.get(f"steps/{env}")
-            if not isinstance(log, LogArea):
+            steps_log = journal.areas.get(f"steps/{env}")
+            if not isinstance(steps_log, LogArea):
                 raise FormatError(f"the journal has no records 'steps/{env}'")
-            _add_log(gathered, journal, log)
-            state = running_record(journal, log, _stop(gathered, channel), layout)
+            _add_log(gathered, journal, steps_log)
+            state = running_record(journal, steps_log, _stop(gathered, channel), layout)
         stop = _stop(gathered, channel)
         for leaf in layout.images:
             image = channels.images[leaf.name][env]

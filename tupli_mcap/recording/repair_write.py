@@ -9,18 +9,21 @@ import re
 import time
 import uuid
 from collections.abc import Iterable, Iterator
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.cameras import CameraTopics
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import record
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.logs import group_records
+from tupli_mcap.recording.repair_frames import OldCameras, kept_frames
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
 from tupli_mcap.recording.repair_plan import Plan, PlannedEpisode
 from tupli_mcap.recording.repair_segments import Channels, message_at, messages
@@ -91,9 +94,9 @@ class RepairWriter:
         if old.info is not None:
             schema = self._gathered.schemas.get(channels[old.info].schema_id)
             info = None if schema is None else (schema.data.decode(), channels[old.info].metadata)
-        new = register_channels(
-            self._container, "the repaired recording", layout, len(old.steps) if vector else None, info
-        )
+        cameras = OldCameras.of(self._gathered, len(old.steps), vector)
+        envs = len(old.steps) if vector else None
+        new = register_channels(self._container, "the repaired recording", layout, envs, info, cameras.names)
         self._container.define_channels()
         rows: dict[int, int] = {}  # first row of each episode in the new file
         dtype = layout.step_message.dtype if layout.constant else None
@@ -115,6 +118,19 @@ class RepairWriter:
         self._events(store, layout, old, new, plan, rows)
         if old.info is not None and new.info is not None:
             self._put(new.info, self._infos(store, old.info, plan))
+        topics = {channel.topic: channel.id for channel in self._container.channels.values()}
+        for name, pairs in zip(cameras.names, cameras.ids, strict=True):
+            for env, pair in enumerate(pairs):
+                goal = CameraTopics.of(name, env if vector else None)
+                self._frames(store, pair, (topics[goal.camera], topics[goal.frame]), of.get(env, []))
+
+    def _frames(
+        self, store: PackedStore, old: tuple[int, int], new: tuple[int, int], episodes: list[PlannedEpisode]
+    ) -> None:
+        """The frames of one camera, which keep their times."""
+        found = partial(kept_frames, self._gathered, store, old, episodes)
+        self._put(new[0], ((frame.time_ns, frame.picture) for frame in found()))
+        self._put(new[1], ((frame.time_ns, frame.pair) for frame in found()))
 
     def finish(self) -> None:
         """The index, the summary and the footer."""

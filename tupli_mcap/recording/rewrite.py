@@ -118,6 +118,7 @@ class _Rewriter:
                     self._topics[f"{topic}/image/{leaf.name}"], spans, layout.image_messages[leaf.name].dtype
                 )
         self._events(rows, firsts)
+        self._frames(rows)
         if "/info" in self._topics:
             self._infos({int(number) for number in rows["episode"]})
 
@@ -207,6 +208,22 @@ class _Rewriter:
             ends.append((end_time, end.encode()))
         for topic, messages in (("/episode_start", starts), ("/episode_end", ends), ("/final_state", finals)):
             self._write(self._topics[topic], iter(_in_time(messages)))
+
+    def _frames(self, rows: Any) -> None:
+        """The frames of episodes that stay, picture and what it shows row by row."""
+        cameras = self._source._cameras
+        for camera in cameras.names:
+            for env in range(self._source.num_envs):
+                pictures, pairs = cameras.channels(camera, env)
+                mine = rows[rows["env"] == env]
+                mine = mine[np.argsort(mine["first_row"], kind="stable")]
+                kept = [
+                    int(row)
+                    for episode in mine
+                    for row in cameras.rows(camera, env, int(episode["episode"]), int(episode["length"]))[0]
+                ]
+                for channel in (pictures, pairs):
+                    self._write(channel, (m for row in kept for m in self._messages(channel, row, 1)))
 
     def _infos(self, numbers: set[int]) -> None:
         channel = self._topics["/info"]

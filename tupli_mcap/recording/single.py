@@ -156,6 +156,11 @@ class SingleRecorder:
             return 0
         return self._writer.rows.count - self._episode.first_row
 
+    @property
+    def running(self) -> tuple[int, int]:
+        """The number of the running episode and its steps so far; (-1, 0) if there is none."""
+        return (-1, 0) if self._episode is None else (self._episode.number, self.step_index)
+
     def put_info(self, info: Mapping[str, Any]) -> None:
         """Records the info of the step just put."""
         if self._infos is not None and self._episode is not None:

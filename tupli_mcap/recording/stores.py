@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.channels import Channels
+from tupli_mcap.recording.channels import FRAMES_AREA, Channels
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.journal import Journal
 from tupli_mcap.recording.logs import EventLog, StepLog
@@ -40,6 +40,7 @@ class Stores:
         images: by image leaf, then by sub-environment.
         events: starts, ends and final states.
         infos: None where none are recorded.
+        frames: pictures and what they show, by sub-environment; empty where none are recorded.
     """
 
     def __init__(
@@ -115,6 +116,11 @@ class Stores:
         if channels.info is not None:
             info = {channels.info: counts[channels.info]}
             self.infos = EventLog(log_area("info"), buffer("info"), add_chunk, info, before_ns)
+        self.frames: list[EventLog] = []
+        for i, pair in enumerate(channels.cameras):
+            name = f"{FRAMES_AREA}{i}"
+            known = {c: counts[c] for c in pair}
+            self.frames.append(EventLog(log_area(name), buffer(name), add_chunk, known, before_ns))
 
     def flush(self, *, keep_last: bool) -> None:
         """Writes everything that is committed; with `keep_last` not the last event."""
@@ -122,7 +128,7 @@ class Stores:
             self.rows.flush()
         elif isinstance(self.vector, VectorRows):
             self.vector.flush()
-        for store in (*self._step_logs.values(), *self._image_rows.values(), self.infos):
+        for store in (*self._step_logs.values(), *self._image_rows.values(), self.infos, *self.frames):
             if store is not None:
                 store.flush()
         self.events.flush(keep_last=keep_last)
@@ -133,6 +139,7 @@ class Stores:
             steps.move(journal.log_area(name), journal.buffer(name))
         for name, images in self._image_rows.items():
             images.move(journal.row_area(name), journal.buffer(name))
-        for name, log in (("events", self.events), ("info", self.infos)):
+        frames = [(f"{FRAMES_AREA}{i}", log) for i, log in enumerate(self.frames)]
+        for name, log in (("events", self.events), ("info", self.infos), *frames):
             if log is not None:
                 log.move(journal.log_area(name), journal.buffer(name))

@@ -24,6 +24,7 @@ from tupli_mcap.recording.summary import has_summary
 from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.recording.verify_episodes import verify_episodes
 from tupli_mcap.recording.verify_foreign import verify_foreign
+from tupli_mcap.recording.verify_frames import verify_frames
 from tupli_mcap.recording.verify_structure import Structure
 
 __all__ = ["Problem", "VerifyReport", "verify_recording"]
@@ -119,6 +120,7 @@ def _contents(source: Source, structure: Structure, findings: Findings) -> None:
         _layout(recording, structure, findings)
         with findings.following(structure.missing):
             verify_episodes(recording, findings)
+            verify_frames(recording, findings)
         _carried(recording, structure, findings)
 
 
@@ -132,7 +134,7 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
     vector = None if "/step" in topics else recording.num_envs
     try:
         infos = None if info is None else (info_schema(info.metadata), info.metadata)
-        register_channels(wanted, recording.name, recording.layout, vector, infos)
+        register_channels(wanted, recording.name, recording.layout, vector, infos, recording.cameras)
     except FormatError as err:
         findings.error("layout", str(err))
         return

@@ -77,6 +77,7 @@ class RecordingWriter:
         self.worker = ChunkWorker(self.add_chunk)
         self.events: EventLog | None = None
         self.infos: EventLog | None = None
+        self.frames: list[EventLog] = []
         # set by the recorder: told of a fork (its encoder knows only its buffer), and asked whether the last event
         # is the start of an episode without a step
         self.on_abandon: Callable[[], None] = lambda: None
@@ -154,7 +155,12 @@ class RecordingWriter:
             self.lost_streams = set(range(num_envs))
         self.is_vector = vector
         self.channels = register_channels(
-            self.container, str(self.path), layout, num_envs if vector else None, info_schema
+            self.container,
+            str(self.path),
+            layout,
+            num_envs if vector else None,
+            info_schema,
+            self.options.cameras,
         )
         self._make_stores(self._areas())
         # after the journal: a file that has channels and no end has one
@@ -178,8 +184,9 @@ class RecordingWriter:
     def _areas(self, step_capacity: int = 0) -> list[Area]:
         has_infos = self.channels.info is not None
         return plan_areas(
-            self._laid(), self.num_envs, self.options.chunk_size, step_capacity, infos=has_infos
-        )
+            self._laid(), self.num_envs, self.options.chunk_size, step_capacity,
+            infos=has_infos, frames=bool(self.channels.cameras),
+        )  # fmt: skip
 
     def _laid(self) -> StepLayout:
         if self.layout is None:
@@ -200,7 +207,7 @@ class RecordingWriter:
             vector=self.is_vector, sealed=self._sealed, settle=self._settle if self._durable else None, grow=self._grow,
         )  # fmt: skip
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
-        self.events, self.infos = stores.events, stores.infos
+        self.events, self.infos, self.frames = stores.events, stores.infos, stores.frames
 
     # ---- episodes
 
@@ -385,7 +392,7 @@ class RecordingWriter:
             "boot": boot_id(),
             "seals": "rows" if self._sealed else "records",
             "vector": self.is_vector,
-            "channels": [channels.steps, channels.images, *channels[2:]],
+            "channels": [channels.steps, channels.images, *channels[2:6]],
             "definitions": {str(c): self.container.definitions(c).hex() for c in self.container.channels},
         }
         return Journal(self.journal_place, list(areas), description)

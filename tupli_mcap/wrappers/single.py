@@ -19,8 +19,10 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.events import TERMINAL, TIMEOUT
+from tupli_mcap.recording.framing import CAMERA, FrameRecorder, check_every, check_render_mode
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
 from tupli_mcap.recording.options import Mode, WriterOptions
+from tupli_mcap.recording.pictures import FrameFormat, check_format
 from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
@@ -58,6 +60,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         durability: what a power loss or a crash of the system leaves. "os": what it happened to have written (a killed
             process loses nothing in any case); "chunk": every chunk, waiting for the disk after each; "step": every
             step, waiting for the disk in each `step()`, which takes as long as the disk does (0.1 to 20 ms).
+        frames: True records what `env.render()` gives of every state, a number n every n-th and the last one; the
+            environment must be made with render_mode="rgb_array".
+        frame_format: "png" (exact) or "jpeg" (faster; smaller for photographs, not for drawings).
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
@@ -84,9 +89,15 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         journal_dir: str | os.PathLike[str] | None = None,
         chunk_size: int = 256 * 1024,
         durability: Durability = "os",
+        frames: bool | int = False,
+        frame_format: FrameFormat = "png",
     ) -> None:
         super().__init__(env)
         self.path = Path(path)
+        every = check_every(frames)
+        if every:
+            check_render_mode(env.render_mode)
+            frame_format = check_format(frame_format)
         self._metadata_callback = metadata_callback
         self._step_callback = step_callback
         if attachments is None:
@@ -106,6 +117,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             chunk_size,
             flush_seconds,
             durability=durability,
+            cameras=(CAMERA,) if every else (),
         )
         self._writer = RecordingWriter(path, options)
         try:
@@ -115,7 +127,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             raise
         self._recorder = SingleRecorder(self._writer, spaces, self._infos)
         self._recorder.resets_itself = _resets_itself(env)
-        self._watches = metadata_callback is not None or wanted
+        self._frames = FrameRecorder(self._writer, 1, every, frame_format) if every else None
+        self._watches = metadata_callback is not None or wanted or bool(every)
         # shared with the finalizer, which must not hold the wrapper
         self._episode_metadata: list[str] = ["{}"]
         self._plain = not self._watches and flush_seconds is None and durability != "step"
@@ -156,8 +169,12 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             if self._watches:
                 if self._recorder.step_index == 0:  # a step that was a reset
                     self._state = copy.deepcopy(state)
+                    self._start_frames()
                 else:
                     self._watch(action, state, reward, terminal, timeout, info)
+                    if self._frames is not None:
+                        number, step = self._recorder.running
+                        self._frames.step(0, number, step, bool(terminal or timeout), self.env.render)
         finally:  # a callback that raises changes nothing about what the environment did
             if terminal or timeout:
                 self._end(TERMINAL if terminal else TIMEOUT)
@@ -183,13 +200,20 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             if self._watches:
                 self._state = copy.deepcopy(state)
             self._recorder.reset(state, facts, self._taken_metadata())
+            self._start_frames()
         except BaseException:  # wherever the environment is now: the running episode is over
             self._recorder.forget_reset(self._taken_metadata())
+            if self._frames is not None:
+                self._frames.forget(0)
             raise
         if self._metadata_callback is not None and self._stepped:
             self._metadata_callback.reset()
         self._stepped = False
         return result
+
+    def _start_frames(self) -> None:
+        if self._frames is not None:
+            self._frames.start(0, self.env.render())
 
     def _taken_metadata(self) -> str:
         metadata, self._episode_metadata[0] = self._episode_metadata[0], "{}"

@@ -1,0 +1,113 @@
+"""Rendered frames in a file: `/camera/<name>` holds the pictures, `/frame/<name>` says row by row what they show."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.messages.layout import IMAGE_SCHEMA, MessageLayout
+from tupli_mcap.recording.events import read_strings
+
+__all__ = [
+    "CAMERA_NAME",
+    "CAMERA_SCHEMA",
+    "FRAME_LAYOUT",
+    "FRAME_NAME",
+    "FRAME_SCHEMA",
+    "CameraTopics",
+    "EncodedFrame",
+    "camera_names",
+    "check_camera",
+    "decode_frame",
+    "encode_frame",
+    "encode_pair",
+]
+
+CAMERA_NAME = "sensor_msgs/msg/CompressedImage"
+CAMERA_SCHEMA = (
+    "std_msgs/Header header\nstring format\nuint8[] data\n" + IMAGE_SCHEMA[IMAGE_SCHEMA.index("=") :]
+)
+FRAME_NAME = "tupli_mcap/msg/Frame"
+FRAME_SCHEMA = "uint32 episode\nuint32 step\n"
+FRAME_LAYOUT = MessageLayout.of([("episode", np.dtype(np.uint32), ()), ("step", np.dtype(np.uint32), ())])
+"""A row of `/frame/<name>`."""
+
+_STAMP = struct.Struct("<iI")
+_COUNT = struct.Struct("<I")
+_PAIR = struct.Struct("<II")
+_CAMERA = re.compile("[a-z](_?[a-z0-9]+)*")
+_TOPIC = re.compile("(/env_0)?/frame/([a-z](?:_?[a-z0-9]+)*)")
+
+
+class CameraTopics(NamedTuple):
+    """Where the frames of a camera are; `frame` says which state of which episode the row of `camera` shows."""
+
+    camera: str
+    frame: str
+
+    @classmethod
+    def of(cls, name: str, env: int | None) -> CameraTopics:
+        """`env` is the sub-environment of a vector recording, None in one of a single environment."""
+        top = "" if env is None else f"/env_{env}"
+        return cls(f"{top}/camera/{name}", f"{top}/frame/{name}")
+
+
+def camera_names(topics: Mapping[str, int]) -> tuple[str, ...]:
+    """The cameras of a recording, by its topics."""
+    found = (_TOPIC.fullmatch(topic) for topic in topics)
+    return tuple(sorted(match[2] for match in found if match is not None))
+
+
+def check_camera(name: str) -> str:
+    """A name a camera may have; RecordingError otherwise."""
+    if not _CAMERA.fullmatch(name):
+        raise RecordingError(
+            f"expected the name of a camera in lower-case letters, digits and single _, found {name!r:.60}"
+        )
+    return name
+
+
+class EncodedFrame(NamedTuple):
+    """A picture as it is stored: `form` is "png" or "jpeg", `time_ns` when it was rendered."""
+
+    time_ns: int
+    form: str
+    data: bytes
+
+
+def encode_frame(camera: str, frame: EncodedFrame) -> bytes:
+    """The CDR body of a `sensor_msgs/msg/CompressedImage`."""
+    out = bytearray(_STAMP.pack(*divmod(frame.time_ns, 10**9)))
+    for text in (camera.encode(), frame.form.encode()):
+        out += bytes(-len(out) % 4) + _COUNT.pack(len(text) + 1) + text + b"\0"
+    out += bytes(-len(out) % 4) + _COUNT.pack(len(frame.data))
+    return bytes(out) + frame.data
+
+
+def decode_frame(body: memoryview) -> tuple[EncodedFrame, str]:
+    """The picture in a `sensor_msgs/msg/CompressedImage`, and its `frame_id`.
+
+    Raises:
+        FormatError: lengths do not add up to the message.
+    """
+    if len(body) < _STAMP.size:
+        raise FormatError(f"expected a compressed image, found {len(body)} bytes")
+    sec, nanosec = _STAMP.unpack_from(body)
+    frame_id, form = read_strings(body, _STAMP.size, 2)
+    at = _STAMP.size
+    for text in (frame_id, form):
+        at += -at % 4 + _COUNT.size + len(text.encode()) + 1
+    at += -at % 4
+    if at + _COUNT.size > len(body) or at + _COUNT.size + _COUNT.unpack_from(body, at)[0] != len(body):
+        raise FormatError(f"expected the bytes of a picture from byte {at} to the end of a message")
+    return EncodedFrame(sec * 10**9 + nanosec, form, bytes(body[at + _COUNT.size :])), frame_id
+
+
+def encode_pair(episode: int, step: int) -> bytes:
+    """The CDR body of a `tupli_mcap/msg/Frame`."""
+    return _PAIR.pack(episode, step)

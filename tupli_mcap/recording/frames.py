@@ -1,0 +1,175 @@
+"""The recorded frames of an episode, as they are read: each is decoded when it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
+
+import numpy as np
+from mcap.records import Channel, Schema
+
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.recording.cameras import (
+    CAMERA_NAME,
+    CAMERA_SCHEMA,
+    FRAME_LAYOUT,
+    FRAME_NAME,
+    FRAME_SCHEMA,
+    CameraTopics,
+    EncodedFrame,
+    camera_names,
+    decode_frame,
+)
+from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.contents import Contents
+from tupli_mcap.recording.pictures import Picture, decode_picture
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording.reader import Recording
+
+__all__ = ["Cameras", "Frames"]
+
+Array = np.ndarray[Any, Any]
+_SHAPES = ((CAMERA_NAME, CAMERA_SCHEMA), (FRAME_NAME, FRAME_SCHEMA))
+
+
+class _Table(NamedTuple):
+    """What the rows of a camera's channel show: `rows` is sorted by episode, then by row."""
+
+    episodes: Array
+    steps: Array
+    times: Array
+    rows: Array
+
+
+class Cameras:
+    """The cameras of a recording. No frame is read before it is asked for.
+
+    Raises:
+        FormatError: a camera's channel is missing or has another schema.
+    """
+
+    def __init__(self, contents: Contents, store: ChunkStore, vector: bool, num_envs: int, name: str) -> None:
+        self._store = store
+        self._where = name
+        topics = {channel.topic: channel for channel in contents.channels.values()}
+        self.names = camera_names({topic: channel.id for topic, channel in topics.items()})
+        self._channels: dict[tuple[str, int], tuple[int, int]] = {}
+        self._tables: dict[tuple[str, int], _Table] = {}
+        for camera in self.names:
+            for env in range(num_envs):
+                pair = CameraTopics.of(camera, env if vector else None)
+                ids = [self._checked(topics.get(t), t, contents.schemas, i) for i, t in enumerate(pair)]
+                self._channels[camera, env] = (ids[0], ids[1])
+
+    def _checked(self, channel: Channel | None, topic: str, schemas: dict[int, Schema], kind: int) -> int:
+        if channel is None:
+            raise FormatError(f"{self._where}: expected a channel {topic}, found none")
+        schema = schemas.get(channel.schema_id)
+        name, text = _SHAPES[kind]
+        if schema is None or (schema.name, schema.data) != (name, text.encode()):
+            raise FormatError(f"{self._where}: the schema of {topic} is not {name}")
+        return channel.id
+
+    def channels(self, camera: str, env: int) -> tuple[int, int]:
+        """The ids of `/camera/<name>` and `/frame/<name>` of a sub-environment.
+
+        Raises:
+            RecordingError: there is no such camera.
+        """
+        if (camera, env) not in self._channels:
+            known = ", ".join(self.names) or "none: `tupli-mcap render` makes frames of a recording"
+            raise RecordingError(
+                f"{self._where}: expected one of its cameras, found {camera!r:.60}; it has {known}"
+            )
+        return self._channels[camera, env]
+
+    def rows(self, camera: str, env: int, episode: int, length: int) -> tuple[Array, Array, Array]:
+        """(rows, steps, log_times) of an episode's frames; those of steps that are not there are left out."""
+        table = self._table(camera, env)
+        low, high = np.searchsorted(table.episodes, [episode, episode + 1])
+        kept = slice(int(low), int(high))
+        here = table.steps[kept] <= length
+        return table.rows[kept][here], table.steps[kept][here], table.times[kept][here]
+
+    def frame(self, camera: str, env: int, row: int) -> EncodedFrame:
+        """One frame, not decoded."""
+        channel, _ = self.channels(camera, env)
+        (body,) = self._store.bodies(channel, row, 1)
+        frame, frame_id = decode_frame(body)
+        if frame_id != camera:
+            raise FormatError(f"{self._where}: expected a frame of camera {camera!r}, found {frame_id!r:.60}")
+        return frame
+
+    def _table(self, camera: str, env: int) -> _Table:
+        if (camera, env) not in self._tables:
+            pictures, pairs = self.channels(camera, env)
+            # a writer that is at work may have moved one of them to the file, and not yet the other
+            count = min(self._store.count(pictures), self._store.count(pairs))
+            parts = [
+                self._store.rows(span.chunk, FRAME_LAYOUT.dtype, keep=False)[span.begin : span.end]
+                for span in self._store.spans(pairs, 0, count)
+            ]
+            found = np.concatenate(parts) if parts else np.empty(0, FRAME_LAYOUT.dtype)
+            rows = np.argsort(found["episode"], kind="stable")
+            columns = [found[name].astype(np.int64)[rows] for name in ("episode", "step", "#log_time")]
+            self._tables[camera, env] = _Table(columns[0], columns[1], columns[2], rows)
+        return self._tables[camera, env]
+
+
+class Frames(Sequence[Picture]):
+    """The frames of one episode, in order; `frames[i]` is decoded from the file whenever it is asked for.
+
+    Attributes:
+        steps: int64, what each frame shows: the state after so many steps of the episode (0: after the reset).
+        times: int64, when each was rendered (ns).
+    """
+
+    def __init__(
+        self, recording: Recording, camera: str, env: int, rows: Array, steps: Array, times: Array
+    ) -> None:
+        self._recording = recording
+        self._env = env
+        self._rows = rows
+        self.camera = camera
+        self.steps = steps
+        self.times = times
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, i: int) -> Picture: ...
+    @overload
+    def __getitem__(self, i: slice) -> Frames: ...
+    def __getitem__(self, i: int | slice) -> Picture | Frames:
+        """uint8, height x width x 3.
+
+        Raises:
+            MissingExtraError: Pillow is not installed; `encoded` does without it.
+            FormatError: the bytes are no picture.
+        """
+        if isinstance(i, slice):
+            parts = (self._rows[i], self.steps[i], self.times[i])
+            return Frames(self._recording, self.camera, self._env, *parts)
+        data = self.encoded(i).data
+        return decode_picture(data, f"{self._recording.name}: frame of step {self.steps[i]}")
+
+    def encoded(self, i: int) -> EncodedFrame:
+        """The bytes of a frame (`data`) in its format (`form`: "png" or "jpeg")."""
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"expected a frame from 0 to {len(self) - 1}, found {i}")
+        return self._recording._cameras.frame(self.camera, self._env, int(self._rows[i]))
+
+    def of_step(self, step: int) -> Picture:
+        """The frame of the state after `step` steps; RecordingError if it was not recorded."""
+        found = np.flatnonzero(self.steps == step)
+        if not len(found):
+            told = ", ".join(map(str, self.steps[:8].tolist())) + (", ..." if len(self) > 8 else "")
+            raise RecordingError(
+                f"{self._recording.name}: the episode has no frame of step {step}; it has {told or 'none'}"
+            )
+        return self[int(found[0])]
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} frames of camera {self.camera!r}>"

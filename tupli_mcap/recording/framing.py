@@ -1,0 +1,90 @@
+"""Frames while a recording is written: which states are rendered, and where their pictures go."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.recording.cameras import EncodedFrame, encode_frame, encode_pair
+from tupli_mcap.recording.pictures import FrameFormat, check_picture, encode_picture
+from tupli_mcap.recording.writer import RecordingWriter
+
+__all__ = ["CAMERA", "FrameRecorder", "check_every", "check_render_mode"]
+
+CAMERA: Final = "render"
+"""The camera that `env.render()` is."""
+
+RENDER_MODE: Final = "rgb_array"
+
+
+def check_every(frames: bool | int) -> int:
+    """Every how many steps a frame is recorded, 0 for never; RecordingError for other values."""
+    if isinstance(frames, bool) or (type(frames) is int and frames >= 0):
+        return int(frames)
+    raise RecordingError(
+        f"frames: expected True, False, or a number of steps from one frame to the next, found {frames!r:.60}"
+    )
+
+
+def check_render_mode(mode: Any) -> None:
+    """Raises RecordingError unless an environment renders pictures."""
+    if mode != RENDER_MODE:
+        raise RecordingError(
+            f"frames: expected an environment with render_mode={RENDER_MODE!r}, found {mode!r:.40}; "
+            f"make it so: gymnasium.make(..., render_mode={RENDER_MODE!r})"
+        )
+
+
+class FrameRecorder:
+    """Puts the frames of one camera into a recording: of an episode's first state, of the state after every `every`-th
+    step, and of its last one if it ends by itself.
+
+    A frame is in the journal, or in the file, when `step` returns.
+    """
+
+    def __init__(self, writer: RecordingWriter, num_envs: int, every: int, form: FrameFormat) -> None:
+        self._writer = writer
+        self._every = every
+        self._form: FrameFormat = form
+        # of the state the next episode starts at: it has no number before its first step
+        self._first: list[EncodedFrame | None] = [None] * num_envs
+
+    def start(self, env: int, picture: Any) -> None:
+        """The picture of a reset's state; it is recorded if a step follows."""
+        self._first[env] = self._encoded(picture)
+
+    def forget(self, env: int) -> None:
+        """After a reset that failed: nothing is known of the state."""
+        self._first[env] = None
+
+    def step(self, env: int, episode: int, step: int, ended: bool, render: Callable[[], Any]) -> None:
+        """After `step` steps of an episode; `render` is called if their frame is wanted.
+
+        Raises:
+            RecordingError: what is rendered is no picture.
+        """
+        first, self._first[env] = self._first[env], None
+        if first is not None:
+            self._put(env, episode, 0, first)
+        if not ended and step % self._every:
+            return
+        frame = self._encoded(render())
+        self._put(env, episode, step, frame)
+        if ended:  # where no reset follows, the next episode starts here
+            self._first[env] = frame
+
+    def _encoded(self, picture: Any) -> EncodedFrame:
+        now = time.time_ns()
+        return EncodedFrame(now, self._form, encode_picture(check_picture(picture, "frames"), self._form))
+
+    def _put(self, env: int, episode: int, step: int, frame: EncodedFrame) -> None:
+        writer = self._writer
+        camera, pairs = writer.channels.cameras[env]
+        log = writer.frames[env]
+        frame = frame._replace(time_ns=max(frame.time_ns, log.latest_ns))
+        with writer.whole:
+            log.append(
+                frame.time_ns, (pairs, encode_pair(episode, step)), (camera, encode_frame(CAMERA, frame))
+            )

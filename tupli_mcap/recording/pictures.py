@@ -1,0 +1,116 @@
+"""Pictures as bytes: PNG and JPEG, by Pillow, which is in the extra `frames`."""
+
+from __future__ import annotations
+
+import io
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
+
+__all__ = [
+    "FrameFormat",
+    "Picture",
+    "check_format",
+    "check_picture",
+    "decode_picture",
+    "encode_picture",
+    "format_of",
+    "resized",
+]
+
+FrameFormat = Literal["png", "jpeg"]
+Picture = np.ndarray[Any, np.dtype[np.uint8]]
+"""uint8, height x width x 3: red, green, blue."""
+
+_MAGIC: Final = {"png": b"\x89PNG\r\n\x1a\n", "jpeg": b"\xff\xd8\xff"}
+_MAX_PIXELS: Final = 1 << 26  # of a picture in a file: its size is a claim
+_QUALITY: Final = 90
+
+
+def check_format(name: str) -> FrameFormat:
+    """A format that can be written here.
+
+    Raises:
+        RecordingError: it is neither "png" nor "jpeg".
+        MissingExtraError: Pillow is not installed.
+    """
+    for known in get_args(FrameFormat):
+        if name == known:
+            _pillow()
+            found: FrameFormat = known
+            return found
+    raise RecordingError(f"frame_format: expected 'png' or 'jpeg', found {name!r:.40}")
+
+
+def _pillow() -> Any:
+    try:
+        from PIL import Image
+    except ImportError as err:
+        raise MissingExtraError(
+            "pictures need Pillow; install the extra: pip install 'tupli-mcap[frames]'"
+        ) from err
+    return Image
+
+
+def check_picture(value: Any, where: str) -> Picture:
+    """What an environment rendered.
+
+    Raises:
+        RecordingError: it is no array of uint8, height x width x 3.
+    """
+    if isinstance(value, np.ndarray) and value.dtype == np.uint8 and value.shape[2:] == (3,) and value.size:
+        return value
+    found = f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+    raise RecordingError(
+        f"{where}: expected render() to return a picture (uint8, height x width x 3), found {found}"
+    )
+
+
+def encode_picture(picture: Picture, form: FrameFormat) -> bytes:
+    """A picture as the bytes of a PNG, which gives it back exactly, or of a JPEG, which does not."""
+    out = io.BytesIO()
+    image = _pillow().fromarray(picture)
+    if form == "png":  # higher levels take up to twice the time
+        image.save(out, "PNG", compress_level=1)
+    else:
+        image.save(out, "JPEG", quality=_QUALITY)
+    return out.getvalue()
+
+
+def decode_picture(data: bytes | memoryview, where: str) -> Picture:
+    """The picture in the bytes of a PNG or a JPEG.
+
+    Raises:
+        FormatError: they are none, or claim more than 2^26 pixels.
+        MissingExtraError: Pillow is not installed.
+    """
+    image_module = _pillow()
+    try:
+        with image_module.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+            width, height = image.size
+            if width * height > _MAX_PIXELS:
+                raise FormatError(f"{where}: the picture claims {width} x {height} pixels")
+            return np.asarray(image.convert("RGB"))
+    except FormatError:
+        raise
+    except Exception as err:  # Pillow's decoders raise many kinds
+        raise FormatError(f"{where}: expected a PNG or a JPEG, found {bytes(data[:16])!r}: {err}") from err
+
+
+def format_of(data: bytes | memoryview) -> FrameFormat | None:
+    """What the first bytes say; None if they are neither a PNG's nor a JPEG's."""
+    head = bytes(data[:8])
+    return next((name for name in get_args(FrameFormat) if head.startswith(_MAGIC[name])), None)
+
+
+def resized(picture: Picture, width: int, height: int | None = None) -> Picture:
+    """A picture of another width (pixels); the height follows unless it is given."""
+    if height is None:
+        height = max(1, round(picture.shape[0] * width / picture.shape[1]))
+    if picture.shape[:2] == (height, width):
+        return picture
+    image_module = _pillow()
+    image = image_module.fromarray(picture).resize((width, height), image_module.Resampling.LANCZOS)
+    return np.asarray(image)

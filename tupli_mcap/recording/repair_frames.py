@@ -1,0 +1,103 @@
+"""The frames of a damaged recording: those of steps that are kept, whose picture and whose row are both here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from mcap.records import Channel
+
+from tupli_mcap.recording.cameras import (
+    CAMERA_NAME,
+    CAMERA_SCHEMA,
+    FRAME_LAYOUT,
+    FRAME_NAME,
+    FRAME_SCHEMA,
+    CameraTopics,
+    camera_names,
+    encode_pair,
+)
+from tupli_mcap.recording.repair_gather import Gathered, PackedStore
+from tupli_mcap.recording.repair_plan import PlannedEpisode
+from tupli_mcap.recording.repair_segments import intersection, message_at
+
+__all__ = ["OldCameras", "frames_lost", "kept_frames"]
+
+
+class KeptFrame(NamedTuple):
+    """A picture's message and what its row has to say now."""
+
+    time_ns: int
+    picture: bytes
+    pair: bytes
+
+
+class OldCameras(NamedTuple):
+    """`ids[i]` are those of `/camera/<name>` and `/frame/<name>` of camera `names[i]`, by sub-environment."""
+
+    names: tuple[str, ...]
+    ids: tuple[tuple[tuple[int, int], ...], ...]
+
+    @classmethod
+    def of(cls, gathered: Gathered, num_envs: int, vector: bool) -> OldCameras:
+        """The cameras of which all channels are known, with the schemas they must have."""
+        topics = {channel.topic: channel for channel in gathered.channels.values()}
+        found: dict[str, tuple[tuple[int, int], ...]] = {}
+        for name in camera_names({topic: channel.id for topic, channel in topics.items()}):
+            pairs = [CameraTopics.of(name, env if vector else None) for env in range(num_envs)]
+            known = [(topics.get(pair.camera), topics.get(pair.frame)) for pair in pairs]
+            ids = tuple((a.id, b.id) for a, b in known if a is not None and b is not None)
+            if len(ids) == num_envs and all(_fits(gathered, *pair) for pair in known):
+                found[name] = ids
+        return cls(tuple(found), tuple(found.values()))
+
+
+def _fits(gathered: Gathered, camera: Channel | None, frame: Channel | None) -> bool:
+    wanted = ((camera, CAMERA_NAME, CAMERA_SCHEMA), (frame, FRAME_NAME, FRAME_SCHEMA))
+    schemas = [(gathered.schemas.get(c.schema_id), name, text) for c, name, text in wanted if c is not None]
+    return all(s is not None and (s.name, s.data) == (name, text.encode()) for s, name, text in schemas)
+
+
+def kept_frames(
+    gathered: Gathered, store: PackedStore, ids: tuple[int, int], episodes: Sequence[PlannedEpisode]
+) -> Iterator[KeptFrame]:
+    """The frames of a sub-environment's episodes, with the numbers that these have now."""
+    camera, frame = ids
+    pieces: dict[int, list[PlannedEpisode]] = {}
+    for episode in episodes:
+        pieces.setdefault(episode.segment.episode, []).append(episode)
+    for first, stop in intersection(gathered.ranges(camera), gathered.ranges(frame)):
+        for span in store.spans(frame, store.packed(frame, first), stop - first):
+            rows = store.rows(span.chunk, FRAME_LAYOUT.dtype)[span.begin : span.end]
+            numbers = rows["#sequence"].tolist()
+            values = zip(
+                numbers, rows["episode"].tolist(), rows["step"].tolist(), rows["#log_time"], strict=True
+            )
+            for row, number, step, time_ns in values:
+                found = _place(pieces.get(number, ()), step)
+                if found is not None:
+                    picture = message_at(store, camera, store.packed(camera, row))
+                    yield KeptFrame(int(time_ns), picture, encode_pair(*found))
+
+
+def _place(pieces: Sequence[PlannedEpisode], step: int) -> tuple[int, int] | None:
+    """Episode and step that a state of an old episode is of now; a piece's last state belongs to it."""
+    for last in (0, 1):
+        for episode in pieces:
+            at = step - episode.segment.step
+            if 0 <= at < episode.segment.steps + last:
+                return episode.number, at
+    return None
+
+
+def frames_lost(gathered: Gathered, cameras: OldCameras) -> int:
+    """Frames that are known to have been there and are not here whole."""
+    lost = 0
+    for pair in (pair for ids in cameras.ids for pair in ids):
+        here = intersection(*(gathered.ranges(channel) for channel in pair))
+        stops = [ranges[-1][1] for ranges in map(gathered.ranges, pair) if ranges]
+        if gathered.tail.index is not None:
+            table = gathered.tail.index.chunks
+            stops += [int(table["rows"][table["channel"] == channel].sum()) for channel in pair]
+        lost += max(stops, default=0) - sum(b - a for a, b in here)
+    return lost

@@ -1,0 +1,119 @@
+"""Frames of a recording, held against its episodes and against each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.recording.cameras import FRAME_LAYOUT, CameraTopics, decode_frame
+from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.findings import Findings
+from tupli_mcap.recording.headers import message_headers
+from tupli_mcap.recording.pictures import format_of
+from tupli_mcap.recording.reader import Recording
+
+__all__ = ["verify_frames"]
+
+Array = np.ndarray[Any, Any]
+_TOLD = 3  # rows of a channel that are named, of each defect
+
+
+def verify_frames(recording: Recording, findings: Findings) -> None:
+    """Every picture has its row, both are of one time, and what they show is told in order."""
+    for camera in recording.cameras:
+        for env in range(recording.num_envs):
+            _Pair(recording, findings, camera, env).run()
+
+
+class _Pair:
+    def __init__(self, recording: Recording, findings: Findings, camera: str, env: int) -> None:
+        self._recording = recording
+        self._findings = findings
+        self._store: ChunkStore = recording._store
+        self._camera = camera
+        self._topics = CameraTopics.of(camera, env if recording.is_vector else None)
+        self._channels = recording._cameras.channels(camera, env)
+        self._rows = recording.index[recording.index["env"] == env]
+
+    def run(self) -> None:
+        pictures, pairs = (self._store.count(channel) for channel in self._channels)
+        if pictures != pairs and self._recording.complete:
+            self._error(f"expected {pairs} frames, found {pictures}", self._topics.camera)
+        try:
+            times = self._pairs(self._channels[1])
+        except FormatError as err:
+            self._error(self._plain(err), self._topics.frame)
+            return
+        try:
+            self._pictures(self._channels[0], times)
+        except FormatError as err:
+            self._error(self._plain(err), self._topics.camera)
+
+    def _pairs(self, channel: int) -> Array:
+        """The times of the rows, which are checked."""
+        parts = [
+            self._store.rows(chunk, FRAME_LAYOUT.dtype, keep=False) for chunk in self._store.chunks(channel)
+        ]
+        rows = np.concatenate(parts) if parts else np.empty(0, FRAME_LAYOUT.dtype)
+        episodes, steps = rows["episode"].astype(np.int64), rows["step"].astype(np.int64)
+        again = (episodes[1:] == episodes[:-1]) & (steps[1:] <= steps[:-1])
+        for i in np.flatnonzero(again)[:_TOLD].tolist():
+            self._error(f"row {i + 1} is of a step before, or of the same", self._topics.frame)
+        runs = (
+            episodes[np.flatnonzero(np.append(True, episodes[1:] != episodes[:-1]))]
+            if len(rows)
+            else episodes
+        )
+        if len(np.unique(runs)) != len(runs):
+            self._error("frames of an episode are not one after another", self._topics.frame)
+        order = np.argsort(self._rows["episode"], kind="stable")
+        known = self._rows["episode"][order].astype(np.int64)
+        lengths = np.append(self._rows["length"][order].astype(np.int64), -1)
+        at = np.searchsorted(known, episodes)
+        there = np.append(known, -1)[at] == episodes
+        lost = int((~there | (steps > lengths[at])).sum())
+        if lost and self._recording.complete:
+            self._findings.note(
+                "frame",
+                f"{lost} frames of camera {self._camera!r} are of steps that are not here",
+                "nothing to be done: a power loss or a lost journal leaves such, and they are never shown",
+            )
+        return rows["#log_time"].astype(np.int64)
+
+    def _pictures(self, channel: int, times: Array) -> None:
+        row = 0
+        for chunk in self._store.chunks(channel):
+            data = memoryview(self._store.load(chunk, keep=False))
+            for header in message_headers(data):
+                start = int(header["#offset"])
+                why = self._defect(
+                    data[start + BODY : start + 9 + int(header["#length"])],
+                    int(header["#log_time"]),
+                    int(times[row]) if row < len(times) else None,
+                )
+                if why:
+                    self._error(f"row {row} {why}", self._topics.camera)
+                row += 1
+
+    def _defect(self, body: memoryview, log_time: int, pair_time: int | None) -> str:
+        """What is wrong with a picture's message; empty if nothing is."""
+        try:
+            frame, frame_id = decode_frame(body)
+        except FormatError as err:
+            return f"cannot be decoded: {err}"
+        if frame.form not in ("png", "jpeg") or format_of(frame.data) != frame.form:
+            return f"is no picture in the format that it says, {frame.form!r:.40}"
+        if frame_id != self._camera:
+            return f"is of camera {frame_id!r:.60}"
+        if frame.time_ns != log_time or pair_time not in (None, log_time):
+            return "has two times"
+        return ""
+
+    def _error(self, message: str, topic: str) -> None:
+        self._findings.error("frame", message, channel=topic)
+
+    def _plain(self, err: FormatError) -> str:
+        return str(err).removeprefix(f"{self._recording.name}: ")
