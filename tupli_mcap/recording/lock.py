@@ -21,7 +21,7 @@ from pathlib import Path
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.system import refused
 
-__all__ = ["FileLock", "close_private", "is_locked", "open_private", "writers_kept_out"]
+__all__ = ["FileLock", "drop_private", "is_locked", "open_private", "writers_kept_out"]
 
 _BUSY = (errno.EAGAIN, errno.EACCES)
 _PATIENCE = 2.0  # seconds to wait for those who only ask whether the writer lives
@@ -37,7 +37,7 @@ def open_private(path: str | os.PathLike[str], flags: int, mode: int = 0o666) ->
     return fd
 
 
-def close_private(fd: int) -> None:
+def _close_private(fd: int) -> None:
     """Unlocks and closes such a descriptor; in a child, where it is closed already, nothing happens."""
     with _guard:
         if fd not in _private:
@@ -48,6 +48,12 @@ def close_private(fd: int) -> None:
             fcntl.flock(fd, fcntl.LOCK_UN)
         finally:
             os.close(fd)
+
+
+def drop_private(fd: int) -> None:
+    """Closes a descriptor that nothing was written to: what the system says then is of no use."""
+    with contextlib.suppress(OSError):
+        _close_private(fd)
 
 
 def _drop_in_child() -> None:
@@ -110,8 +116,7 @@ class FileLock:
             _lock(fd, self._shown)
         except BaseException:
             self._close_old()
-            with contextlib.suppress(OSError):
-                close_private(fd)
+            drop_private(fd)
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise
@@ -154,14 +159,13 @@ class FileLock:
         fd, self.fd = self.fd, -1
         self._close_old()
         try:
-            close_private(fd)
+            _close_private(fd)
         except OSError as err:
             raise RecordingError(f"{self._shown} could not be closed: {refused(err)}") from err
 
     def _close_old(self) -> None:
         fd, self._old = self._old, -1
-        with contextlib.suppress(OSError):  # nothing was written to it
-            close_private(fd)
+        drop_private(fd)
 
 
 def _exists(path: Path) -> RecordingError:
@@ -196,7 +200,7 @@ def writers_kept_out(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        close_private(fd)
+        drop_private(fd)
 
 
 def _open_locked(path: Path, *, flags: int = os.O_RDWR, hint: str) -> int:
@@ -212,14 +216,12 @@ def _open_locked(path: Path, *, flags: int = os.O_RDWR, hint: str) -> int:
             if _is_at(fd, path):
                 return fd
         except BaseException as err:
-            with contextlib.suppress(OSError):
-                close_private(fd)
+            drop_private(fd)
             if isinstance(err, OSError):
                 raise RecordingError(f"{path} cannot be recorded to: {refused(err)}") from err
             raise
         # it was deleted or replaced between opening and locking: what is written to it would be lost
-        with contextlib.suppress(OSError):
-            close_private(fd)
+        drop_private(fd)
 
 
 def _lock(fd: int, path: Path) -> None:
@@ -271,7 +273,7 @@ def is_locked(path: Path) -> bool:
         try:
             return not _try_shared(fd)
         finally:
-            close_private(fd)
+            drop_private(fd)
     except (FileNotFoundError, PermissionError):
         return False
     except OSError as err:

@@ -16,7 +16,7 @@ from typing import Any, Self, TypeVar
 
 from tupli_mcap.errors import RecordingError, StorageError
 from tupli_mcap.recording import journal_path
-from tupli_mcap.recording.lock import close_private, open_private
+from tupli_mcap.recording.lock import drop_private, open_private
 from tupli_mcap.system import refused
 
 __all__ = ["Lock", "LockError", "fill", "locked", "os_errors", "refusals_told", "write_bytes"]
@@ -143,18 +143,17 @@ class Lock:
         self._depth -= 1
         if self._depth == 0:
             fd, self._fd = self._fd, -1
-            with contextlib.suppress(OSError):  # nothing is ever written to it
-                close_private(fd)
+            drop_private(fd)
         self._thread_lock.release()
 
 
 def locked(path: Path, *, exclusive: bool = True) -> int:
-    """A descriptor that holds the lock of a file (made if it is missing), for `close_private`."""
+    """A descriptor that holds the lock of a file (made if it is missing), for `drop_private`."""
     fd = open_private(path, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
     except BaseException:  # Ctrl-C while waiting
-        close_private(fd)
+        drop_private(fd)
         raise
     return fd
 

@@ -16,7 +16,7 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.schema import CreateIndex, CreateTable
 
 from tupli_mcap.errors import FilterError, StorageError
-from tupli_mcap.recording.lock import close_private
+from tupli_mcap.recording.lock import drop_private
 from tupli_mcap.storage.atomic import locked
 from tupli_mcap.storage.sqlite import register_functions
 from tupli_mcap.storage.tables import APPLICATION_ID, METADATA, VERSION
@@ -270,7 +270,7 @@ def _exclusive(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        close_private(fd)
+        drop_private(fd)
 
 
 @contextlib.contextmanager
@@ -284,7 +284,7 @@ def _shared(lock: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        close_private(fd)
+        drop_private(fd)
 
 
 @contextlib.contextmanager
