@@ -15,8 +15,10 @@ from environments import Sampler, same
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.vector.utils import iterate
+from mcap.reader import make_reader
 
 from tupli_mcap import Recording, RecordingError, SpaceError, StepError
+from tupli_mcap.messages.layout import BODY
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes
 
@@ -381,3 +383,24 @@ def test_the_seeds_of_an_unseeded_first_reset_are_found(tmp_path: Path) -> None:
         env.step([0, 1])
     for episode in Recording(tmp_path / "r.mcap").episodes:
         assert np.array_equal(gym.make("CartPole-v1").reset(seed=episode.seed)[0], episode.states[0])
+
+
+def test_padding_is_zero_where_rows_are_left_out(tmp_path: Path) -> None:
+    """The rows of a reset step are squeezed out: what copies the others must not bring other memory into the file."""
+    path = tmp_path / "r.mcap"
+    space = spaces.Dict({"flag": spaces.Box(0, 1, (3,), np.uint8), "x": spaces.Box(-1, 1, (2,), np.float64)})
+    inner = gym.vector.SyncVectorEnv([lambda: Sampler(space, space, length=3)] * 2)
+    junk = [bytes([255]) * 100 for _ in range(20_000)]
+    del junk
+    with RecordEpisodes(inner, path) as env:
+        env.reset(seed=1)
+        for _ in range(500):
+            env.step(env.action_space.sample())
+    with Recording(path) as recording:
+        fields, dtype = recording.layout.step_message.fields, recording.layout.step_message.dtype
+    used = np.zeros(dtype.itemsize, np.bool_)
+    for field in fields:
+        used[BODY + field.offset : BODY + field.offset + field.nbytes] = True
+    with path.open("rb") as file:
+        for _, _, message in make_reader(file).iter_messages(topics=["/env_0/step", "/env_1/step"]):
+            assert not np.frombuffer(message.data, np.uint8)[4:][~used[BODY:]].any()

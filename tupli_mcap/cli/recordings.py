@@ -94,6 +94,10 @@ def _record(
     durability: Annotated[
         _Durability, typer.Option(help="What a power loss leaves: step and chunk wait for the disk.")
     ] = _Durability.os,
+    live: Annotated[
+        str | None,
+        typer.Option(metavar="VIEWER", help="Show it meanwhile: rerun, foxglove, or the URL of a viewer."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Record rollouts of an environment.
@@ -117,6 +121,7 @@ def _record(
             compression=compression.value,
             record_info=record_info,
             durability=durability.value,
+            live=live,
             progress=progress,
         )
     if as_json:

@@ -153,6 +153,10 @@ class EventLog:
         self._commit[0] = end
         return time_ns
 
+    def committed(self) -> memoryview:
+        """The records in the journal, for another thread to copy from."""
+        return self._records[: self._commit[0]]
+
     def drop_last(self, channel: int) -> None:
         """Takes back the message of the last `append`, which was one of `channel`, unless it is in the file already."""
         if not self._can_drop:
@@ -338,6 +342,11 @@ class StepLog:
         RECORD_HEADER.pack_into(pending, 0, 5, 0, self._channel, self.count, 0, 0)
         pending[RECORD_HEADER.size : BODY] = CDR_HEADER
         pending[BODY : BODY + 8] = self._episode.to_bytes(4, "little") + self._step.to_bytes(4, "little")
+
+    def committed(self) -> tuple[int, memoryview]:
+        """The running half and its committed records, for another thread to copy from."""
+        half = self._half
+        return half, self._records[half][: self._ends[half][0]]
 
     def pending_state(self) -> bytes:
         """The CDR bytes of the running record's state, as they follow `episode` and `env` in `/final_state`."""

@@ -128,6 +128,12 @@ class SingleRows:
         start = self.cursor.offset
         self._buffer[start : start + len(self.cursor.prefix)] = self.cursor.prefix
 
+    def committed(self) -> tuple[int, int, Array]:
+        """The running half, its committed rows, and the rows of both halves; for another thread to copy from."""
+        half, offset = divmod(self.cursor.offset, self._area.half)
+        table: Array = np.frombuffer(self._buffer, self._dtype).reshape(2, self._area.rows + 1)
+        return half, offset // self._area.row_size, table
+
     def pending_state(self) -> bytes:
         """The CDR bytes of the running row's state, as they follow `episode` and `env` in `/final_state`."""
         start = self.cursor.offset
@@ -241,6 +247,10 @@ class ImageRows:
         if self._sealed:
             start = self._half * self._area.half + self._row * self._area.row_size
             seal(self._buffer, start, start + self._area.row_size, b"")
+
+    def rows(self) -> Array:
+        """The rows of both halves, for another thread to copy from; their `#sequence` says which they are."""
+        return self._rows
 
     def pending(self) -> bytes:
         """The running row's image."""

@@ -131,6 +131,10 @@ class VectorRows:
         if self._row == self._area.rows:
             self._switch()
 
+    def committed(self, i: int) -> tuple[int, int, Array]:
+        """As `SingleRows.committed`, of one sub-environment."""
+        return self._half, self._row, self._rows[:, i]
+
     def pending_state(self, i: int) -> bytes:
         """The CDR bytes of a sub-environment's running state, as they follow `episode` and `env` in `/final_state`."""
         data: bytes = self._state_bytes[self._half, i, self._row, BODY + 8 : self._state_end].tobytes()
@@ -165,7 +169,7 @@ class VectorRows:
         for i, channel in enumerate(self._channels):
             rows = self._rows[half, i, begin:end]
             if not whole[i]:
-                rows = rows[kept[i]]
+                rows = rows.view(f"V{rows.dtype.itemsize}")[kept[i]].view(rows.dtype)  # padding stays zero
             elif self._sealed:  # until the chunk is on the disk, the rows in the journal stay as sealed
                 rows = np.frombuffer(bytearray(rows.view(np.uint8)), rows.dtype)
             if len(rows):

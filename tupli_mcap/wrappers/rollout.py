@@ -54,6 +54,7 @@ def record_rollouts(
     compression: str = "zstd",
     record_info: RecordInfo = False,
     durability: Durability = "os",
+    live: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> RolloutSummary:
     """Records `steps` steps of a registered environment into the MCAP file `path`.
@@ -65,7 +66,7 @@ def record_rollouts(
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
-        mode, compression, record_info, durability: as `RecordEpisodes` has them.
+        mode, compression, record_info, durability, live: as `RecordEpisodes` has them.
         progress: called with the number of steps so far, a few hundred times.
 
     Raises:
@@ -88,6 +89,7 @@ def record_rollouts(
                 compression=compression,
                 record_info=record_info,
                 durability=durability,
+                live=live,
                 attachments=attachments,
             )
             with _closing(vector, mode):
@@ -100,6 +102,7 @@ def record_rollouts(
                 compression=compression,
                 record_info=record_info,
                 durability=durability,
+                live=live,
             )
             with _closing(single, mode):
                 done = _run(single, steps, seed, policy, report)

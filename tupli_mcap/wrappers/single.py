@@ -8,7 +8,7 @@ import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, SupportsFloat
+from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
@@ -30,7 +30,10 @@ from tupli_mcap.wrappers.benchmark import benchmark_attachments
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
 
-__all__ = ["RecordEpisodes", "metadata_text"]
+if TYPE_CHECKING:
+    from tupli_mcap.live import LiveSession
+
+__all__ = ["RecordEpisodes", "live_session", "metadata_text"]
 
 StepCallback = Callable[[Step], Mapping[str, Any] | None]
 
@@ -63,9 +66,13 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         frames: True records what `env.render()` gives of every state, a number n every n-th and the last one; the
             environment must be made with render_mode="rgb_array".
         frame_format: "png" (exact) or "jpeg" (faster; smaller for photographs, not for drawings).
+        live: shows the rollout while it is recorded: "rerun" (starts the viewer if none listens at 127.0.0.1:9876),
+            "rerun+http://host:port/proxy" (one that is running), "foxglove" or "foxglove://127.0.0.1:8765" (a server
+            to connect Foxglove to). A viewer that is missing, slow or closed changes nothing about the recording.
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
+        MissingExtraError: the extra that `live` needs is not installed.
         RecordingError: the file exists, is being written, or cannot be written.
 
     Not thread-safe. A forked child cannot go on recording; the parent can.
@@ -91,6 +98,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         durability: Durability = "os",
         frames: bool | int = False,
         frame_format: FrameFormat = "png",
+        live: str | None = None,
     ) -> None:
         super().__init__(env)
         self.path = Path(path)
@@ -134,7 +142,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         self._plain = not self._watches and flush_seconds is None and durability != "step"
         self._stepped = False
         self._state: Any = None
-        self._finalizer = weakref.finalize(self, _close, self._recorder, self._episode_metadata)
+        self._live = live_session(self._writer, live, env)
+        self._finalizer = weakref.finalize(self, _close, self._recorder, self._episode_metadata, self._live)
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
@@ -278,8 +287,28 @@ def metadata_text(metadata: Any) -> str:
         raise RecordingError(f"metadata_callback: {err}") from err
 
 
-def _close(recorder: SingleRecorder, metadata: list[str]) -> None:
-    recorder.close(metadata[0])
+def _close(recorder: SingleRecorder, metadata: list[str], live: LiveSession | None) -> None:
+    try:
+        recorder.close(metadata[0])
+    finally:
+        if live is not None:
+            live.close()
+
+
+def live_session(writer: RecordingWriter, live: str | None, env: Any) -> LiveSession | None:
+    """The live view of a recording that has just been opened; the recording is given up where `live` is wrong."""
+    if live is None:
+        return None
+    from tupli_mcap.live import open_session
+
+    spec = getattr(env, "spec", None)
+    try:
+        return open_session(
+            writer, live, writer.path.name if spec is None else f"{spec.id} {writer.path.name}"
+        )
+    except BaseException:
+        writer.close()
+        raise
 
 
 def _resets_itself(env: gym.Env[Any, Any]) -> bool:

@@ -8,7 +8,7 @@ import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -28,7 +28,10 @@ from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
-from tupli_mcap.wrappers.single import metadata_text
+from tupli_mcap.wrappers.single import live_session, metadata_text
+
+if TYPE_CHECKING:
+    from tupli_mcap.live import LiveSession
 
 __all__ = ["RecordEpisodes"]
 
@@ -62,6 +65,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         chunk_size: int = 256 * 1024,
         durability: Durability = "os",
         autoreset_mode: str | None = None,
+        live: str | None = None,
     ) -> None:
         super().__init__(env)
         self.path = Path(path)
@@ -101,7 +105,8 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         self._texts = ["{}"] * n
         self._states: list[Any] = []
         self._watches = wanted or metadata_callback is not None
-        self._finalizer = weakref.finalize(self, self._recorder.close)
+        self._live = live_session(self._writer, live, env)
+        self._finalizer = weakref.finalize(self, _close, self._recorder, self._live)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         try:
@@ -234,6 +239,14 @@ class RecordEpisodes(gym.vector.VectorWrapper):
 
     def __getstate__(self) -> dict[str, Any]:
         raise RecordingError(f"a wrapper that records to {self.path} cannot be pickled or copied; wrap there")
+
+
+def _close(recorder: VectorRecorder, live: LiveSession | None) -> None:
+    try:
+        recorder.close()
+    finally:
+        if live is not None:
+            live.close()
 
 
 def _autoreset(env: Any, given: str | None) -> Any:

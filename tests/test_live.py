@@ -1,0 +1,497 @@
+"""Rollouts watched while they are recorded: by real viewers, and by viewers that are missing, stopped or killed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Sampler
+from gymnasium import spaces
+from mcap_ros2._dynamic import generate_dynamic
+
+from tupli_mcap import RecordEpisodes, Recording
+from tupli_mcap.errors import MissingExtraError, RecordingError
+from tupli_mcap.live import LiveSession
+from tupli_mcap.live.target import parse_target
+from tupli_mcap.recording.options import WriterOptions
+from tupli_mcap.recording.watching import Watcher
+from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
+
+MIXED = spaces.Dict(
+    {
+        "cam": spaces.Box(0, 255, (6, 5, 3), np.uint8),
+        "x": spaces.Box(-1, 1, (2,), np.float64),
+        "mode": spaces.Discrete(3),
+    }
+)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 15.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
+
+
+def answers(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 0.2):
+        return True
+    return False
+
+
+@contextlib.contextmanager
+def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Rerun's own receiver, without a window: what it is sent goes to a file."""
+    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port), "--save", str(out)]
+    quiet = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
+    try:
+        wait_for(lambda: answers(port))
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGINT)
+        process.wait(20)
+
+
+def roll(env: gym.Env[Any, Any], steps: int, pause: float = 0.0, seed: int = 1) -> None:
+    env.action_space.seed(seed)
+    env.reset(seed=seed)
+    for _ in range(steps):
+        *_, terminal, timeout, _ = env.step(env.action_space.sample())
+        if terminal or timeout:
+            env.reset()
+        if pause:
+            time.sleep(pause)
+
+
+def assert_exact(path: Path, steps: int) -> None:
+    """The recording is the one that a rollout without a viewer gives."""
+    plain = path.with_name(f"plain-{path.name}")
+    with RecordEpisodes(gym.make("CartPole-v1"), plain) as env:
+        roll(env, steps)
+    with Recording(path) as found, Recording(plain) as wanted:
+        assert found.complete
+        for one, other in zip(found.episodes, wanted.episodes, strict=True):
+            assert one.states.tobytes() == other.states.tobytes()
+            assert (one.actions.tolist(), one.seed, one.end) == (
+                other.actions.tolist(),
+                other.seed,
+                other.end,
+            )
+
+
+def url(port: int) -> str:
+    return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def shown(path: Path, entity: str, component: str = "Scalars:scalars") -> tuple[Any, Any]:
+    """(rows, values) that a receiver was sent."""
+    from rerun.chunk import RrdReader
+
+    rows: list[int] = []
+    values: list[Any] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is streamed has no footer
+        reader = RrdReader(path)
+    for chunk in reader.stream():
+        if chunk.entity_path == entity and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            rows += batch.column("step").to_pylist()
+            values += batch.column(component).to_pylist()
+    return np.array(rows), values
+
+
+# ---- what is looked at
+
+
+@pytest.mark.parametrize(
+    "space", [MIXED, spaces.Text(8), spaces.Box(-1, 1, (3,))], ids=["mixed", "text", "box"]
+)
+@pytest.mark.parametrize("num_envs", [0, 3], ids=["single", "vector"])
+def test_a_watcher_in_another_thread_sees_what_is_recorded(
+    space: gym.Space[Any], num_envs: int, tmp_path: Path
+) -> None:
+    path, seen, done = tmp_path / "r.mcap", [], threading.Event()
+    if num_envs:
+        inner = gym.vector.SyncVectorEnv([lambda: Sampler(space, space)] * num_envs)
+        env: Any = RecordVectorEpisodes(inner, path, chunk_size=4000)
+    else:
+        env = RecordEpisodes(Sampler(space, space), path, chunk_size=4000)
+    watcher = Watcher(env._writer)
+
+    def watch() -> None:
+        while True:
+            last = done.is_set()
+            if watcher.layout is not None:
+                for new in watcher.look(2)[0]:
+                    images = {}
+                    if watcher.layout.images:
+                        images = watcher.images(0, new.env, range(new.first, new.first + len(new)))
+                    seen.append((new, images))
+            if last:
+                return
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    env.reset(seed=1)
+    for _ in range(600):
+        *_, terminal, timeout, _ = env.step(env.action_space.sample())
+        if not num_envs and (terminal or timeout):
+            env.reset()
+    done.set()
+    thread.join()
+    env.close()
+    with Recording(path) as recording:
+        layout = recording.layout
+        firsts = recording.index["first_row"].tolist()
+        episodes = list(zip(recording.episodes, firsts, strict=True))
+        rows = {(e.env, first + i): (e, i) for e, first in episodes for i in range(len(e))}
+        assert {new.env for new, _ in seen} == set(range(min(num_envs, 2) or 1))
+        assert sum(len(new) for new, _ in seen if new.env == 0) > 100
+        assert sum(len(images) for _, images in seen) > 5 or space is not MIXED
+        for new, images in seen:
+            for i, number in enumerate(new.episodes):
+                episode, step = rows[new.env, new.first + i]
+                assert (number, new.steps[i]) == (episode.number, step)
+                if new.rows is not None:
+                    for leaf in layout.step_leaves[:-1]:
+                        column = episode.states if leaf in layout.state else episode.actions
+                        assert (
+                            new.rows[leaf.name][i].tobytes() == np.asarray(leaf.get(column)[step]).tobytes()
+                        )
+            for row, record in images.items():
+                episode, step = rows[new.env, row]
+                assert record["data"].tobytes() == episode.states["cam"][step].tobytes()
+
+
+# ---- Rerun
+
+
+def test_rerun_is_sent_what_is_recorded(tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    with (
+        receiver(port, tmp_path / "r.rrd"),
+        RecordEpisodes(gym.make("CartPole-v1"), path, live=url(port)) as env,
+    ):
+        roll(env, 300, 0.002)
+    assert_exact(path, 300)
+    rows, values = shown(tmp_path / "r.rrd", "/state")
+    with Recording(path) as recording:
+        states = recording.read().states
+    assert len(rows) == 300
+    assert np.array_equal(np.array(values, np.float32), states[rows])
+
+
+def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    inner = gym.vector.SyncVectorEnv([lambda: Sampler(MIXED, MIXED)] * 2)
+    with receiver(port, tmp_path / "r.rrd"), RecordVectorEpisodes(inner, path, live=url(port)) as env:
+        env.reset(seed=1)
+        for _ in range(100):
+            env.step(env.action_space.sample())
+            time.sleep(0.01)
+    rows, values = shown(tmp_path / "r.rrd", "/state/cam", "Image:buffer")
+    with Recording(path) as recording:
+        cams = np.concatenate([e.states["cam"] for e in recording.episodes if e.env == 0])
+    assert len(rows) > 10
+    for row, value in zip(rows, values, strict=True):
+        assert np.array(value[0], np.uint8).tobytes() == cams[row].tobytes()
+
+
+def test_without_a_viewer_there_is_one_warning(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with pytest.warns(UserWarning, match="no Rerun viewer answers at") as said:
+        with RecordEpisodes(gym.make("CartPole-v1"), path, live=url(free_port())) as env:
+            roll(env, 300, 0.01)
+    assert len(said) == 1
+    assert_exact(path, 300)
+
+
+def test_a_viewer_may_come_later_be_killed_and_come_back(tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with RecordEpisodes(gym.make("CartPole-v1"), path, live=url(port)) as env:
+            roll(env, 20, 0.01)
+            with receiver(port, tmp_path / "a.rrd") as process:
+                roll(env, 200, 0.01)
+                os.killpg(process.pid, signal.SIGKILL)
+                roll(env, 100, 0.01)
+            with receiver(port, tmp_path / "b.rrd"):
+                roll(env, 250, 0.01)
+    assert len([w for w in said if w.category is UserWarning]) == 1, [str(w.message) for w in said]
+    rows, _ = shown(tmp_path / "b.rrd", "/state")
+    assert len(rows) > 100
+    assert rows.max() > 500
+    with Recording(path) as recording:
+        assert (recording.complete, recording.num_steps) == (True, 570)
+
+
+def test_a_viewer_that_stops_taking_data_holds_nothing_up(tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    with receiver(port, tmp_path / "r.rrd") as process:
+        env = RecordEpisodes(gym.make("CartPole-v1"), path, live=url(port))
+        roll(env, 100, 0.005)
+        os.killpg(process.pid, signal.SIGSTOP)
+        began = time.monotonic()
+        roll(env, 3000)
+        assert time.monotonic() - began < 5
+        began = time.monotonic()
+        env.close()
+        assert time.monotonic() - began < 6
+        os.killpg(process.pid, signal.SIGKILL)
+    with Recording(path) as recording:
+        assert (recording.complete, recording.num_steps) == (True, 3100)
+
+
+def test_something_else_listens_at_the_viewers_port(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with socket.create_server(("127.0.0.1", 0)) as server, warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        began = time.monotonic()
+        with RecordEpisodes(gym.make("CartPole-v1"), path, live=url(server.getsockname()[1])) as env:
+            roll(env, 300, 0.002)
+        assert time.monotonic() - began < 8
+    assert len(said) <= 1
+    assert_exact(path, 300)
+
+
+def test_no_display_to_start_a_viewer_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if answers(9876):
+        pytest.skip("a Rerun viewer runs on this machine")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.warns(UserWarning, match="there is no display to start a Rerun viewer on; start one") as said:
+        with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", live="rerun") as env:
+            roll(env, 300)
+    assert len(said) == 1
+    assert_exact(tmp_path / "r.mcap", 300)
+
+
+# ---- Foxglove
+
+
+class Client:
+    """Foxglove's WebSocket protocol, as far as it takes to listen to everything."""
+
+    def __init__(self, port: int) -> None:
+        self.channels: dict[int, dict[str, Any]] = {}
+        self.messages: list[tuple[str, int, bytes]] = []
+        self._port = port
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._listen()), daemon=True)
+        self._thread.start()
+
+    async def _listen(self) -> None:
+        async with aiohttp.ClientSession() as session:
+            place = f"ws://127.0.0.1:{self._port}"
+            async with session.ws_connect(
+                place, protocols=("foxglove.sdk.v1", "foxglove.websocket.v1")
+            ) as ws:
+                async for message in ws:
+                    if message.type is aiohttp.WSMsgType.TEXT:
+                        found = message.json()
+                        if found["op"] == "advertise":
+                            new = {channel["id"]: channel for channel in found["channels"]}
+                            self.channels |= new
+                            await asyncio.sleep(0.1)  # else too early for the server
+                            wanted = [{"id": i, "channelId": i} for i in new]
+                            await ws.send_json({"op": "subscribe", "subscriptions": wanted})
+                    elif message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 1:
+                        number = int.from_bytes(message.data[1:5], "little")
+                        time_ns = int.from_bytes(message.data[5:13], "little")
+                        self.messages.append((self.channels[number]["topic"], time_ns, message.data[13:]))
+
+    def join(self) -> None:
+        self._thread.join(10)
+
+
+def in_file(path: Path) -> dict[tuple[str, int, bytes], int]:
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        return {(c.topic, m.log_time, m.data): m.sequence for _, c, m in make_reader(file).iter_messages()}
+
+
+@pytest.mark.parametrize("kind", ["mixed", "text", "vector"])
+def test_foxglove_gets_the_messages_of_the_file(kind: str, tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    space: Any = spaces.Text(8) if kind == "text" else MIXED
+    live = f"foxglove://127.0.0.1:{port}"
+    if kind == "vector":
+        inner = gym.vector.SyncVectorEnv([lambda: Sampler(space, space)] * 2)
+        env: Any = RecordVectorEpisodes(inner, path, live=live)
+    else:
+        env = RecordEpisodes(Sampler(space, space), path, live=live)
+    client = Client(port)
+    with env:
+        env.reset(seed=1)
+        for i in range(200):
+            *_, terminal, timeout, _ = env.step(env.action_space.sample())
+            if kind != "vector" and (terminal or timeout):
+                env.reset()
+            time.sleep(0.2 if i == 0 else 0.005)
+    client.join()
+    with Recording(path) as recording:
+        schemas = recording._contents.schemas
+        for channel in client.channels.values():
+            text = next(s.data.decode() for s in schemas.values() if s.name == channel["schemaName"])
+            assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
+            assert channel["schema"] == text
+    topics = {topic for topic, _, _ in client.messages}
+    top = "/env_1" if kind == "vector" else ""
+    wanted = {f"{top}/step", "/episode_start", "/episode_end", "/final_state"}
+    assert topics >= (wanted if kind == "text" else {*wanted, f"{top}/image/state_cam"})
+    known = in_file(path)
+    unknown = [message for message in client.messages if message not in known]
+    assert not unknown
+    steps = [known[m] for m in client.messages if m[0] == f"{top}/step"]
+    assert len(steps) > 150
+    assert steps == sorted(set(steps))
+    schema = next(c for c in client.channels.values() if c["topic"] == f"{top}/step")
+    decode = generate_dynamic(schema["schemaName"], schema["schema"])["tupli_mcap/Step"]
+    assert decode(next(m[2] for m in client.messages if m[0] == f"{top}/step")).reward == 1.0
+
+
+def test_foxgloves_port_is_taken(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        live = f"ws://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.warns(UserWarning, match="cannot show the rollout .*it is recorded all the same") as said:
+            with RecordEpisodes(gym.make("CartPole-v1"), path, live=live) as env:
+                roll(env, 100)
+    assert len(said) == 1
+    assert_exact(path, 100)
+
+
+# ---- whatever happens
+
+
+class Broken:
+    """A view that fails at its third look."""
+
+    def __init__(self) -> None:
+        self.looks = 0
+
+    def show(self, watcher: Watcher) -> None:
+        self.looks += 1
+        if self.looks == 3:
+            raise KeyError("broken")
+
+    def close(self) -> None:
+        raise ValueError("broken too")
+
+
+def test_what_a_view_raises_ends_the_view_only(tmp_path: Path) -> None:
+    path, view = tmp_path / "r.mcap", Broken()
+    env = RecordEpisodes(gym.make("CartPole-v1"), path)
+    with pytest.warns(UserWarning, match="the live view has ended .KeyError: 'broken'.*goes on") as said:
+        session = LiveSession(env._writer, view)
+        roll(env, 300, 0.002)
+        env.close()
+        session.close()
+    assert (len(said), view.looks) == (1, 3)
+    assert_exact(path, 300)
+
+
+def test_a_forked_child_has_no_view_and_the_parent_goes_on(tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    with receiver(port, tmp_path / "r.rrd"):
+        with RecordEpisodes(gym.make("CartPole-v1"), path, live=url(port)) as env:
+            roll(env, 100, 0.005)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)
+                child = os.fork()
+            if child == 0:  # pragma: no cover
+                with contextlib.suppress(BaseException):
+                    env.close()
+                    gc.collect()
+                    os._exit(7)
+                os._exit(1)
+            began = time.monotonic()
+            assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+            assert time.monotonic() - began < 2
+            roll(env, 100, 0.005)
+    rows, _ = shown(tmp_path / "r.rrd", "/state")
+    assert len(rows) == 200
+    with Recording(path) as recording:
+        assert (recording.complete, recording.num_steps) == (True, 200)
+
+
+def test_a_collected_wrapper_ends_its_thread(tmp_path: Path) -> None:
+    env = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", live=f"ws://127.0.0.1:{free_port()}")
+    roll(env, 50)
+    assert [t.name for t in threading.enumerate()].count("tupli-mcap-live") == 1
+    del env
+    gc.collect()
+    wait_for(lambda: "tupli-mcap-live" not in [t.name for t in threading.enumerate()])
+    assert_exact(tmp_path / "r.mcap", 50)
+
+
+def test_live_costs_nothing_where_it_is_not_asked_for(tmp_path: Path) -> None:
+    code = (
+        "import sys, gymnasium as gym\nfrom tupli_mcap import RecordEpisodes\n"
+        f"env = RecordEpisodes(gym.make('CartPole-v1'), {str(tmp_path / 'r.mcap')!r})\nenv.reset()\nenv.step(0)\n"
+        "import threading\nassert threading.active_count() == 1\n"
+        "assert not {'tupli_mcap.live', 'rerun', 'foxglove'} & set(sys.modules)\nenv.close()\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@pytest.mark.parametrize(("live", "module"), [("rerun", "rerun"), ("foxglove", "foxglove")])
+def test_a_missing_extra_is_named_and_leaves_no_file(
+    live: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, f"tupli_mcap.live.{module}_view", raising=False)
+    with pytest.raises(MissingExtraError, match=rf"tupli-mcap\[{module}\]"):
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", live=live)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("live", ["", "rviz", "http://x", "ws://x:99999", "rerun+http://a:1/b", "ws://u@h:1"])
+def test_a_target_that_is_none_is_refused(live: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="live: expected 'rerun', 'foxglove', .*found"):
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", live=live)
+    assert not list(tmp_path.iterdir())
+
+
+def test_targets() -> None:
+    assert parse_target("rerun") == ("rerun", "127.0.0.1", 9876, "")
+    assert parse_target("rerun+http://10.0.0.2:1234/proxy").url == "rerun+http://10.0.0.2:1234/proxy"
+    assert parse_target("rerun://host").url == "rerun://host:9876/proxy"
+    assert (
+        parse_target("foxglove")
+        == parse_target("foxglove://127.0.0.1")
+        == ("foxglove", "127.0.0.1", 8765, "")
+    )
+    assert parse_target("ws://[::1]:7000")[:3] == ("foxglove", "[::1]", 7000)
+
+
+def test_a_writer_is_watched_from_its_first_step_on(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "r.mcap", WriterOptions())
+    assert Watcher(writer).layout is None
+    writer.close()

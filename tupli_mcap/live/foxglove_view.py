@@ -1,0 +1,89 @@
+"""A Foxglove WebSocket server on this machine: the topics, schemas and bytes of the file, as they come."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.live.target import Target
+from tupli_mcap.messages.layout import RECORD_HEADER
+from tupli_mcap.recording.watching import NewSteps, Watcher
+from tupli_mcap.recording.writer import RecordingWriter
+
+__all__ = ["FoxgloveView"]
+
+_STEPS = 500  # of a sub-environment at a time
+_IMAGES = 4
+_ENVS = 8
+_EVENTS = 500
+
+
+class FoxgloveView:
+    """Publishes what is recorded; a channel that nobody listens to costs next to nothing.
+
+    Raises:
+        MissingExtraError: the extra `foxglove` is not installed.
+        RuntimeError: the port is taken.
+    """
+
+    def __init__(self, target: Target, title: str, writer: RecordingWriter) -> None:
+        try:
+            import foxglove
+        except ImportError as err:
+            raise MissingExtraError(
+                "a live view in Foxglove needs foxglove-sdk: pip install 'tupli-mcap[foxglove]'"
+            ) from err
+        self._sdk = foxglove
+        self._context = foxglove.Context()
+        self._writer = writer
+        self._channels: dict[int, Any] = {}  # by channel id
+        self._server: Any = foxglove.start_server(
+            name=title, host=target.host, port=target.port, context=self._context
+        )
+        self.port = int(self._server.port)
+
+    def show(self, watcher: Watcher) -> None:
+        if not self._channels:
+            self._announce()
+        steps, _ = watcher.look(_ENVS)
+        channels = self._writer.channels
+        for new in steps:
+            shown = new.newest(_STEPS)
+            self._publish(channels.steps[new.env], shown.cdr())
+            self._show_images(watcher, shown)
+        for channel, time_ns, message in watcher.events()[-_EVENTS:]:
+            self._publish(channel, [(time_ns, message)])
+
+    def _announce(self) -> None:
+        """The channels that the file has, in its own order."""
+        container = self._writer.container
+        for channel in container.channels.values():
+            schema = container.schemas[channel.schema_id]
+            self._channels[channel.id] = self._sdk.Channel(
+                channel.topic,
+                schema=self._sdk.Schema(name=schema.name, encoding=schema.encoding, data=schema.data),
+                message_encoding="cdr",
+                metadata=dict(channel.metadata),
+                context=self._context,
+            )
+
+    def _publish(self, channel: int, messages: Any) -> None:
+        out = self._channels.get(channel)
+        if out is not None and out.has_sinks():
+            for time_ns, message in messages:
+                out.log(message, log_time=time_ns)
+
+    def _show_images(self, watcher: Watcher, steps: NewSteps) -> None:
+        stop = steps.first + len(steps)
+        for leaf, ids in enumerate(self._writer.channels.images):
+            out = self._channels.get(ids[steps.env])
+            if out is None or not out.has_sinks():
+                continue
+            found = watcher.images(leaf, steps.env, range(max(steps.first, stop - _IMAGES), stop))
+            for row in sorted(found):
+                out.log(found[row].tobytes()[RECORD_HEADER.size :], log_time=int(found[row]["#log_time"]))
+
+    def close(self) -> None:
+        for channel in self._channels.values():
+            channel.close()
+        self._server.stop()

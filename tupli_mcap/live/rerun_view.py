@@ -1,0 +1,147 @@
+"""A Rerun viewer, over gRPC: one that is closed or slow is left alone until it is back."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.live.target import Target
+from tupli_mcap.recording.watching import Watcher
+
+__all__ = ["Picture", "RerunView"]
+
+_TRY_AGAIN = 1.0  # seconds between two looks for a viewer that is not there
+_PATIENCE = 0.5  # seconds for a viewer to take what it was sent; then nothing more is sent until it has
+_STARTING = 20.0  # seconds for a viewer that we have started
+
+
+class Picture(Protocol):
+    """What of a rollout is sent to Rerun."""
+
+    application: str
+    blueprint: Any
+
+    def declare(self, stream: Any) -> None:
+        """Sends what does not change; again for every new connection."""
+        ...
+
+    def send(self, stream: Any, watcher: Watcher) -> None:
+        """Sends what is new."""
+        ...
+
+
+class RerunView:
+    """Connects to a Rerun viewer, or starts one and connects to it.
+
+    Args:
+        draw: makes the picture, once the layout is known.
+        warn: told once, if there is no viewer or no longer one.
+
+    Raises:
+        MissingExtraError: the extra `rerun` is not installed.
+    """
+
+    def __init__(
+        self, target: Target, title: str, draw: Callable[[Watcher], Picture], warn: Callable[[str], None]
+    ) -> None:
+        try:
+            import rerun
+        except ImportError as err:
+            raise MissingExtraError(
+                "a live view in Rerun needs rerun-sdk: pip install 'tupli-mcap[rerun]'"
+            ) from err
+        rerun.Scalars.columns(scalars=[0.0])  # imports now what would hold the rollout up later
+        self._sdk = rerun
+        self._target = target
+        self._title = title
+        self._draw = draw
+        self._warn: Callable[[str], None] | None = warn
+        self._identity = uuid.uuid4().hex
+        self._url = target.url or f"rerun+http://{target.host}:{target.port}/proxy"
+        self._picture: Picture | None = None
+        self._stream: Any = None
+        self._is_behind = False
+        self._next_try = 0.0
+        self._expected = time.monotonic()  # until when a missing viewer is no surprise
+        if not target.url and not target.answers():
+            self._start_viewer()
+
+    def _start_viewer(self) -> None:
+        if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            self._say(
+                f"there is no display to start a Rerun viewer on; start one that listens at {self._url}, or record "
+                "without live="
+            )
+            return
+        command = [
+            sys.executable,
+            "-m",
+            "rerun",
+            "--bind",
+            self._target.host,
+            "--port",
+            str(self._target.port),
+        ]
+        quiet = subprocess.DEVNULL
+        subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+        self._expected = time.monotonic() + _STARTING
+
+    def show(self, watcher: Watcher) -> None:
+        if self._picture is None:
+            self._picture = self._draw(watcher)
+        if self._stream is None and not self._connect(self._picture):
+            return
+        if self._is_behind and not self._caught_up():
+            return
+        self._picture.send(self._stream, watcher)
+        self._caught_up()
+
+    def _connect(self, picture: Picture) -> bool:
+        now = time.monotonic()
+        if now < self._next_try:
+            return False
+        self._next_try = now + _TRY_AGAIN
+        if not self._target.answers():  # the SDK would keep what it is sent, and wait for it at the end
+            if now > self._expected:
+                self._say(f"no Rerun viewer answers at {self._url}; the rollout is shown once one does")
+            return False
+        self._stream = self._sdk.RecordingStream(picture.application, recording_id=self._identity)
+        self._stream.connect_grpc(self._url, default_blueprint=picture.blueprint)
+        self._stream.send_recording_name(self._title)
+        picture.declare(self._stream)
+        self._is_behind = True
+        return True
+
+    def _caught_up(self) -> bool:
+        """True if the viewer has everything; what it cannot take yet is not added to."""
+        try:
+            self._stream.flush(timeout_sec=_PATIENCE)
+        except RuntimeError as err:
+            self._is_behind = True
+            if "timed out" not in str(err) or not self._target.answers():
+                self._lose(str(err))
+            return False
+        self._is_behind = False
+        return True
+
+    def _lose(self, reason: str) -> None:
+        self._stream = None  # without a flush, which would wait for it
+        self._say(f"the Rerun viewer at {self._url} is gone; the rollout is shown again once it is back")
+
+    def _say(self, text: str) -> None:
+        warn, self._warn = self._warn, None
+        if warn is not None:
+            warn(f"{text} (the recording goes on)")
+
+    def close(self) -> None:
+        if self._stream is not None:
+            with contextlib.suppress(RuntimeError):
+                self._stream.flush(timeout_sec=_PATIENCE)
+            self._stream = None

@@ -1,0 +1,128 @@
+"""The thread that shows a rollout: it looks at the recording's journal now and then, within a budget of time.
+
+`step()` knows nothing of it, so the rollout loses only what this thread takes of the interpreter: it measures its own
+time and rests 25 times as long. Whatever happens here, the rollout goes on; what went wrong is said once, as a warning.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+import warnings
+import weakref
+from typing import Protocol
+
+from tupli_mcap.live.target import parse_target
+from tupli_mcap.recording.watching import Watcher
+from tupli_mcap.recording.writer import RecordingWriter
+
+__all__ = ["LiveSession", "LiveView", "open_session"]
+
+_SHORTEST_REST = 1 / 30  # seconds between two looks
+_LONGEST_REST = 2.0
+_REST = 25.0  # times as long as it was at work
+_FAREWELL = 3.0  # seconds that closing waits for the thread, at most
+
+
+class LiveView(Protocol):
+    """A viewer, or a server that viewers connect to. Only the session's thread calls `show` and `close`."""
+
+    def show(self, watcher: Watcher) -> None:
+        """Shows what is new. May take a while; must return where there is nobody to see it.
+
+        Raises:
+            Exception: whatever: the session is over then.
+        """
+        ...
+
+    def close(self) -> None:
+        """Lets go of the viewer, which stays as it is."""
+        ...
+
+
+class LiveSession:
+    """Shows what `writer` records in `view`, from a thread of its own, until `close`."""
+
+    def __init__(self, writer: RecordingWriter, view: LiveView) -> None:
+        self._view = view
+        self._watcher = Watcher(writer)
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = threading.Thread(
+            target=self._run, name="tupli-mcap-live", daemon=True
+        )
+        _sessions.add(self)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            rest, last = _SHORTEST_REST, False
+            while not last:
+                last = self._stopping.wait(rest)  # what came in the meantime is shown before the end
+                began = time.thread_time()
+                if self._watcher.layout is not None:
+                    self._view.show(self._watcher)
+                rest = min(max(_SHORTEST_REST, _REST * (time.thread_time() - began)), _LONGEST_REST)
+        except Exception as err:  # noqa: BLE001 - the rollout must not notice
+            _warn(f"the live view has ended ({type(err).__name__}: {err}); the recording goes on")
+        finally:
+            with contextlib.suppress(Exception):
+                self._view.close()
+
+    def close(self) -> None:
+        """Shows the rest and ends the thread. Waits for a viewer that does not take it for a few seconds at most."""
+        self._stopping.set()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join(_FAREWELL)
+
+    def forget(self) -> None:
+        """In a forked child, which has no such thread."""
+        self._thread = None
+
+
+_sessions: weakref.WeakSet[LiveSession] = weakref.WeakSet()
+
+
+def _forget_all() -> None:
+    for session in list(_sessions):
+        session.forget()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_all)
+
+
+def open_session(writer: RecordingWriter, live: str, title: str) -> LiveSession | None:
+    """Begins to show what `writer` records; None, and a warning, where no viewer can be had.
+
+    Args:
+        live: "rerun", "foxglove", or where a viewer listens.
+        title: what the rollout is called.
+
+    Raises:
+        RecordingError: `live` names no viewer.
+        MissingExtraError: the extra `rerun` or `foxglove` is not installed.
+    """
+    target = parse_target(live)
+    view: LiveView
+    try:
+        if target.kind == "rerun":
+            from tupli_mcap.live.picture import draw
+            from tupli_mcap.live.rerun_view import RerunView
+
+            view = RerunView(target, title, draw, _warn)
+        else:
+            from tupli_mcap.live.foxglove_view import FoxgloveView
+
+            view = FoxgloveView(target, title, writer)
+    except (OSError, RuntimeError) as err:  # the port is taken, say
+        _warn(f"live={live!r} cannot show the rollout ({err}); it is recorded all the same")
+        return None
+    return LiveSession(writer, view)
+
+
+def _warn(text: str) -> None:
+    with contextlib.suppress(Warning):  # made an error by a filter: not in this thread
+        warnings.warn(text, stacklevel=3)

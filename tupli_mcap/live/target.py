@@ -1,0 +1,60 @@
+"""Which viewer `live=` names, and where it listens."""
+
+from __future__ import annotations
+
+import re
+import socket
+from typing import NamedTuple
+
+from tupli_mcap.errors import RecordingError
+
+__all__ = ["Target", "parse_target"]
+
+RERUN_PORT, FOXGLOVE_PORT = 9876, 8765
+_LOCAL = "127.0.0.1"
+_URL = re.compile(
+    r"(?P<scheme>[a-z+]+)://(?P<host>\[[0-9a-fA-F:.]+\]|[^/:\[\]@?#\s]+)(:(?P<port>\d{1,5}))?(?P<path>/\S*)?"
+)
+_RERUN, _FOXGLOVE = ("rerun", "rerun+http", "rerun+https"), ("foxglove", "ws")
+
+
+class Target(NamedTuple):
+    """A viewer's kind ("rerun" or "foxglove"), host and port; `url` to connect to, empty where we start the viewer."""
+
+    kind: str
+    host: str
+    port: int
+    url: str = ""
+
+    def answers(self, seconds: float = 0.25) -> bool:
+        """True if something listens there."""
+        try:
+            with socket.create_connection((self.host.strip("[]"), self.port), timeout=seconds):
+                return True
+        except OSError:
+            return False
+
+
+def parse_target(text: str) -> Target:
+    """The viewer that `live=` names.
+
+    Raises:
+        RecordingError: it names none.
+    """
+    if text == "rerun":
+        return Target("rerun", _LOCAL, RERUN_PORT)
+    if text == "foxglove":
+        return Target("foxglove", _LOCAL, FOXGLOVE_PORT)
+    found = _URL.fullmatch(text) if isinstance(text, str) else None
+    port = int(found["port"] or 0) if found else 0
+    if found and port < 1 << 16:
+        scheme, host, path = found["scheme"], found["host"], found["path"] or ""
+        if scheme in _RERUN and path in ("", "/", "/proxy"):
+            port = port or RERUN_PORT
+            return Target("rerun", host, port, f"{scheme}://{host}:{port}/proxy")
+        if scheme in _FOXGLOVE and path in ("", "/"):
+            return Target("foxglove", host, port if found["port"] else FOXGLOVE_PORT)
+    raise RecordingError(
+        "live: expected 'rerun', 'foxglove', 'rerun+http://host:port/proxy' or 'foxglove://host:port', "
+        f"found {text!r:.200}"
+    )

@@ -1,0 +1,222 @@
+"""Looking at a recording while it is written: the newest rows, copied out of its journal by another thread.
+
+Recording does nothing for it and waits for nobody. Rows may be written over while they are copied, so every copy is
+checked by its sequence numbers afterwards, and what was torn or overtaken is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import BODY, RECORD_HEADER
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.index import EPISODE_ROWS
+from tupli_mcap.recording.logs import EventLog, StepLog, iter_records
+from tupli_mcap.recording.rows import HOLE, SingleRows
+from tupli_mcap.recording.writer import RecordingWriter
+
+__all__ = ["NewSteps", "Watcher"]
+
+Array = np.ndarray[Any, Any]
+_EPISODES = 4096  # ended episodes looked at in one go
+_HEADER = RECORD_HEADER.size
+
+
+class NewSteps(NamedTuple):
+    """Consecutive steps of a sub-environment: rows `first`, `first + 1`, … of its channel.
+
+    `rows` are whole records of a constant layout (with `step` filled in), `messages` the CDR messages of another one.
+    `episodes`, `steps` and `times` (ns) have a number a step.
+    """
+
+    env: int
+    first: int
+    rows: Array | None
+    messages: list[tuple[int, bytes]]
+    episodes: Array
+    steps: Array
+    times: Array
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def newest(self, count: int) -> NewSteps:
+        """The last `count` of them."""
+        skip = max(0, len(self) - count)
+        rows = None if self.rows is None else self.rows[skip:]
+        env, first, _, messages, *columns = self
+        return NewSteps(env, first + skip, rows, messages[skip:], *(column[skip:] for column in columns))
+
+    def cdr(self) -> Iterator[tuple[int, bytes]]:
+        """(log_time, CDR message with its header) of each step."""
+        if self.rows is None:
+            yield from self.messages
+            return
+        data, size = self.rows.tobytes(), self.rows.dtype.itemsize
+        for i, time_ns in enumerate(self.times.tolist()):
+            yield time_ns, data[i * size + _HEADER : (i + 1) * size]
+
+
+class Watcher:
+    """Reads what `writer` has committed since the last look. For one thread, any but the writer's."""
+
+    def __init__(self, writer: RecordingWriter) -> None:
+        self._writer = writer
+        self._seen: dict[int, int] = {}  # rows of each sub-environment
+        self._starts: dict[int, tuple[int, int]] = {}  # its last row's episode, and where that began
+        self._ends: dict[int, int] = {}  # where its last ended episode ended
+        self._recent: Array = np.zeros(0, EPISODE_ROWS)
+        self._episodes = writer.index.count  # of earlier sessions: not shown
+        self._places: dict[str, tuple[int, int]] = {}  # log -> half and position
+
+    @property
+    def layout(self) -> StepLayout | None:
+        """None until the first step."""
+        writer = self._writer
+        return writer.layout if writer.rows is not None or writer.vector is not None else None
+
+    @property
+    def num_envs(self) -> int:
+        """Sub-environments; 1 for a single environment."""
+        return self._writer.num_envs
+
+    @property
+    def is_vector(self) -> bool:
+        return self._writer.is_vector
+
+    def look(self, envs: int) -> tuple[list[NewSteps], Array]:
+        """The new steps of the first `envs` sub-environments, and the episodes that have ended (EPISODE_ROWS)."""
+        found = [self._new_records(env) for env in range(min(envs, self.num_envs))]
+        ended = (
+            self._ended()
+        )  # after the rows: an episode that is not there by now has begun where the last one ended
+        return [self._placed(*new) for new in found if new is not None], ended
+
+    def images(self, leaf: int, env: int, rows: range) -> dict[int, Array]:
+        """Whole records of those of the image rows that are in the journal still."""
+        table = self._writer.images[leaf][env].rows()
+        found, sequences = {}, table["#sequence"]
+        for half, row in np.argwhere((sequences >= rows.start) & (sequences < rows.stop)).tolist():
+            copy = table[half, row].copy()
+            if table[half, row]["#sequence"] == copy["#sequence"]:
+                found[int(copy["#sequence"])] = copy
+        return found
+
+    def events(self) -> list[tuple[int, int, bytes]]:
+        """(channel, log_time, CDR message) of new starts, ends, final states and infos."""
+        found = []
+        for name, log in (("events", self._writer.events), ("infos", self._writer.infos)):
+            if log is not None:
+                found += self._new_events(name, log)
+        return found
+
+    def _new_records(self, env: int) -> tuple[int, int, Array | None, list[tuple[int, bytes]]] | None:
+        writer, seen = self._writer, self._seen.get(env, -1)
+        store: Any = writer.rows if writer.rows is not None else writer.vector
+        if isinstance(store, StepLog | list):
+            log = store if isinstance(store, StepLog) else store[env]
+            return self._new_messages(env, log, seen)
+        half, row, table = store.committed() if isinstance(store, SingleRows) else store.committed(env)
+        rows = _intact(table, half, row, seen)
+        if not len(rows):
+            return None
+        self._seen[env] = int(rows["#sequence"][-1])
+        return env, int(rows["#sequence"][0]), rows, []
+
+    def _new_messages(
+        self, env: int, log: StepLog, seen: int
+    ) -> tuple[int, int, Array | None, list[tuple[int, bytes]]] | None:
+        found: list[tuple[int, int, bytes]] = []
+        for _, sequence, time_ns, message in self._committed(f"steps/{env}", *log.committed()):
+            if sequence > seen:
+                found = found if not found or found[-1][0] == sequence - 1 else []
+                found.append((sequence, time_ns, message))
+        if not found:
+            return None
+        self._seen[env] = found[-1][0]
+        return env, found[0][0], None, [(time_ns, message) for _, time_ns, message in found]
+
+    def _new_events(self, name: str, log: EventLog) -> list[tuple[int, int, bytes]]:
+        return [(c, time_ns, message) for c, _, time_ns, message in self._committed(name, 0, log.committed())]
+
+    def _committed(self, name: str, half: int, log: memoryview) -> Iterator[tuple[int, int, int, bytes]]:
+        """(channel, sequence, log_time, CDR message) of the records after those of the last look."""
+        known, position = self._places.get(name, (half, 0))
+        if known != half or position > len(log):  # what was in between is not shown
+            position = 0
+        self._places[name] = half, len(log)
+        data = bytes(log[position:])
+        try:
+            for start, end, channel, sequence, time_ns in iter_records(memoryview(data)):
+                yield channel, sequence, time_ns, data[start + _HEADER : end]
+        except FormatError:  # written over while it was copied
+            return
+
+    def _ended(self) -> Array:
+        index = self._writer.index
+        new = index.count - self._episodes
+        size = EPISODE_ROWS.itemsize
+        first = index.count - min(new, _EPISODES)
+        # a copy: a view would keep the recorder from adding to it
+        found = np.frombuffer(
+            bytes(index.rows[first * size : (first + min(new, _EPISODES)) * size]), EPISODE_ROWS
+        )
+        self._episodes += new
+        for env in np.unique(found["env"]).tolist():
+            last = found[np.flatnonzero(found["env"] == env)[-1]]
+            self._ends[env] = int(last["first_row"] + last["length"])
+        self._recent = np.concatenate([self._recent[-_EPISODES:], found])
+        return found
+
+    def _placed(
+        self, env: int, first: int, rows: Array | None, messages: list[tuple[int, bytes]]
+    ) -> NewSteps:
+        """Numbers the steps in their episodes; `step` in the journal is filled in at a flush only."""
+        if rows is None:
+            pairs = np.array([np.frombuffer(m, "<u4", 2, BODY - _HEADER) for _, m in messages], np.int64)
+            times = np.array([time_ns for time_ns, _ in messages], np.int64)
+            return NewSteps(env, first, None, messages, pairs[:, 0], pairs[:, 1], times)
+        episodes = rows["episode"].astype(np.int64)
+        index = np.arange(first, first + len(rows))
+        begins = np.zeros(len(rows), np.int64)
+        begins[1:] = np.where(episodes[1:] != episodes[:-1], index[1:], 0)
+        begins[0] = self._begin_of(env, int(episodes[0]), first)
+        np.maximum.accumulate(begins, out=begins)
+        self._starts[env] = int(episodes[-1]), int(begins[-1])
+        steps = index - begins
+        rows["step"] = steps
+        times = np.maximum.accumulate(rows["#log_time"].astype(np.int64))
+        return NewSteps(env, first, rows, [], episodes, steps, times)
+
+    def _begin_of(self, env: int, episode: int, row: int) -> int:
+        """The first row of the episode that `row` belongs to."""
+        known, begin = self._starts.get(env, (-1, 0))
+        if known == episode:
+            return begin
+        ended = self._recent[(self._recent["episode"] == episode) & (self._recent["env"] == env)]
+        if len(ended):
+            return min(int(ended["first_row"][-1]), row)
+        return min(self._ends.get(env, 0), row)  # it is still running
+
+
+def _intact(table: Array, half: int, row: int, seen: int) -> Array:
+    """Copies of the newest consecutive rows after `seen`: those before `row` of a half, and of the other half before.
+
+    Args:
+        table: the rows of both halves in the journal, each half with its spare row.
+    """
+    whole = np.dtype(f"V{table.dtype.itemsize}")  # copied as bytes: padding stays where it is
+    copies = []
+    for view in (table[1 - half, : table.shape[1] - 1], table[half, :row]):
+        sequences = view["#sequence"]
+        wanted = np.flatnonzero((sequences > seen) & (sequences != HOLE))
+        copied = view.view(whole)[wanted]
+        rows = copied.view(table.dtype)
+        copies.append(copied[(sequences[wanted] == rows["#sequence"]) & (rows["#opcode"] == 5)])
+    found = np.concatenate(copies).view(table.dtype)
+    gaps = np.flatnonzero(np.diff(found["#sequence"].astype(np.int64)) != 1)
+    return found[gaps[-1] + 1 :] if len(gaps) else found
