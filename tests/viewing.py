@@ -20,7 +20,7 @@ from PIL import Image
 from rerun.experimental import View, ViewerClient, ViewerState
 
 VIEWER = Path(rerun_cli.__file__).parent / "rerun"  # the program itself: its Python shim would orphan it
-SIZE = (1400, 900)
+SIZE = (1000, 700)
 _ADDRESS = re.compile(r"gRPC connections on 127\.0\.0\.1:(\d+)")
 _OPTIONS = ("--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen")
 _GRIDS = ("TimeSeries", "StateTimeline", "BarChart")
@@ -106,19 +106,8 @@ class HeadlessViewer:
 
     def filled(self) -> dict[str, bool]:
         """The name of every view in sight, and whether it shows any data; not those behind another tab."""
-        return {
-            view.name: self.ink(view) > 0.002 for view in self.client.get_state().views if self.in_sight(view)
-        }
-
-    def in_sight(self, view: View) -> bool:
-        """Whether a view is drawn, rather than hidden or behind another tab."""
-        try:
-            self.client.take_screenshot(view.view_id, max_size=1)
-        except ConnectionError as err:
-            if "NotFound" in str(err):
-                return False
-            raise
-        return view.visible
+        inks = {view.name: self.ink(view) for view in self.client.get_state().views if view.visible}
+        return {name: ink > 0.002 for name, ink in inks.items() if ink is not None}
 
     def problems(self) -> list[str]:
         """What views and the viewer complained of since the last `show`."""
@@ -144,9 +133,17 @@ class HeadlessViewer:
         png = self.client.take_screenshot(None if view is None else view.view_id)
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
-    def ink(self, view: View) -> float:
-        """The part of a view's pixels that show data: coloured ones in plots (grids are grey), else all but black."""
-        pixels = self.screenshot(view)[_TITLE:].astype(int)
+    def ink(self, view: View) -> float | None:
+        """The part of a view's pixels that show data: coloured ones in plots (grids are grey), else all but black.
+
+        None where it is behind another tab.
+        """
+        try:
+            pixels = self.screenshot(view)[_TITLE:].astype(int)
+        except ConnectionError as err:
+            if "NotFound" in str(err):
+                return None
+            raise
         brightest = pixels.max(axis=2)
         if view.view_class in _GRIDS:
             return float((brightest - pixels.min(axis=2) > 60).mean())
@@ -172,8 +169,10 @@ class HeadlessViewer:
 
 
 def _of_the_machine(message: str) -> bool:
-    """Whether a message is about this machine's graphics rather than about what is shown."""
-    return "software rasterizer" in message.lower() or "adapter" in message.lower()
+    """Whether a message is about this machine's graphics, or about a picture that could not be taken."""
+    return any(
+        word in message.lower() for word in ("software rasterizer", "adapter", "not found for screenshot")
+    )
 
 
 def patiently(seconds: float, pause: float = 0.05) -> Iterator[None]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from tupli_mcap.viewer.panels import Panel
 from tupli_mcap.viewer.scene import Scene
 
 __all__ = ["blueprint_of"]
 
 
-_TALL = 4  # panels that a column has room for
+_TALL, _PAGE = 4, 12  # panels that a column, and that a window has room for
 
 
 def blueprint_of(scene: Scene, roots: Sequence[str] = ("",)) -> Any:
@@ -19,7 +20,7 @@ def blueprint_of(scene: Scene, roots: Sequence[str] = ("",)) -> Any:
     import rerun.blueprint as rrb
 
     plots = [*scene.states, *scene.actions]
-    left = _stacked([panel.view(roots) for panel in plots], "state and action")
+    left = _paged(plots, roots)
     rewards = [panel.view(roots) for panel in scene.rewards]
     about = rrb.Tabs(
         rrb.TextDocumentView(name="recording", origin="/card"),
@@ -39,16 +40,21 @@ def blueprint_of(scene: Scene, roots: Sequence[str] = ("",)) -> Any:
     )
 
 
-def _stacked(views: Sequence[Any], name: str) -> Any:
-    """Views below each other, in two columns where they would be too flat to read."""
+def _paged(panels: Sequence[Panel], roots: Sequence[str]) -> Any:
+    """Panels below each other, in two columns where they would be flat, behind tabs where there are many."""
     import rerun.blueprint as rrb
 
-    return rrb.Vertical(*views, name=name) if len(views) <= _TALL else _grid(views, name)
+    pages = []
+    for start in range(0, len(panels), _PAGE):
+        page = panels[start : start + _PAGE]
+        views = [panel.view(roots) for panel in page]
+        name = page[0].title if len(page) == 1 else f"{page[0].title} … {page[-1].title}"
+        pages.append(rrb.Vertical(*views, name=name) if len(views) <= _TALL else _grid(views, name))
+    return pages[0] if len(pages) == 1 else rrb.Tabs(*pages, name="state and action")
 
 
 def _grid(views: Sequence[Any], name: str) -> Any:
-    """Views in columns: one, two, or more for many."""
+    """Views in columns: one, or two."""
     import rerun.blueprint as rrb
 
-    columns = 1 if len(views) == 1 else 2 if len(views) <= 12 else 3
-    return rrb.Grid(*views, grid_columns=columns, name=name)
+    return rrb.Grid(*views, grid_columns=min(len(views), 2), name=name)

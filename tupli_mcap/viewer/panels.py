@@ -96,8 +96,8 @@ class Series:
         send_scalars(place.stream, place.root + self.entity, times, values)
 
     def view(self, roots: Sequence[str]) -> Any:
-        alone = len(roots) == 1 and len(self.names) == 1
-        return plot(self.title, [root + self.entity for root in roots], legend=not alone)
+        told = len(roots) == 1 and len(self.names) > 1  # compared episodes are told beside the returns, once
+        return plot(self.title, [root + self.entity for root in roots], legend=told)
 
 
 @dataclass
@@ -165,7 +165,7 @@ class Rewards:
         ends = [f"{root}/end/{name}" for root in roots for name in ENDS]
         return rrb.Vertical(
             plot("return", [*(f"{root}/return" for root in roots), *ends]),
-            plot("reward", [f"{root}/reward" for root in roots], legend=len(roots) > 1),
+            plot("reward", [f"{root}/reward" for root in roots], legend=False),
             name=self.title,
         )
 
