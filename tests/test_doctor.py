@@ -327,7 +327,7 @@ def test_frozen_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_by
         return np.full((2, 2, 3), n if n < 15 or n > 44 else 15, np.uint8)  # 15 to 44: 30 frames
 
     path = scripted(tmp_path / "a.mcap", observe, space, length=60)
-    monkeypatch.setattr("tupli_mcap.doctor.blocks.BLOCK_BYTES", block_bytes)
+    monkeypatch.setattr("tupli_mcap.recording.blocks.BLOCK_BYTES", block_bytes)
     finding = found(examine(path), "frozen-frames")
     assert (finding.severity, finding.leaf, finding.count) == (WARNING, "state", 3 * 29)
     assert places(finding) == [(0, 16)]
@@ -470,7 +470,7 @@ class EarlyReset(gym.Wrapper[Any, Any, Any, Any]):
 def test_final_states_of_the_next_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, space: gym.Space[Any], block_bytes: int
 ) -> None:
-    monkeypatch.setattr("tupli_mcap.doctor.blocks.BLOCK_BYTES", block_bytes)
+    monkeypatch.setattr("tupli_mcap.recording.blocks.BLOCK_BYTES", block_bytes)
     bad = record(tmp_path / "bad.mcap", EarlyReset(Sampler(space, spaces.Discrete(3))), 70)
     finding = found(examine(bad), "final-state-is-reset")
     assert (finding.severity, finding.count, finding.total) == (WARNING, 9, 9)
@@ -568,7 +568,7 @@ def test_findings_do_not_depend_on_blocks(
         "clock-jump",
     }
     assert expected <= {finding.check for finding in whole.findings}
-    monkeypatch.setattr("tupli_mcap.doctor.blocks.BLOCK_BYTES", block_bytes)
+    monkeypatch.setattr("tupli_mcap.recording.blocks.BLOCK_BYTES", block_bytes)
     assert examine(path) == whole
     assert found(whole, "duplicate-episodes").count == 2
 

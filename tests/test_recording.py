@@ -79,6 +79,22 @@ def test_only_the_fields_asked_for(path: Path) -> None:
         Recording(path).read([9])
 
 
+def test_images_may_be_left_out(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = record(path, "image")
+    with Recording(path) as recording:
+        images = recording._topics["/image/state"]
+        read: list[int] = []
+        load = recording._store.load
+        monkeypatch.setattr(recording._store, "load", lambda i, **kw: read.append(i) or load(i, **kw))
+        columns = recording.read(images=False)
+        part = recording.read_steps(0, 1, 4, images=False)
+        assert not set(read) & set(recording._store.chunks(images)) and read
+        assert columns.states.shape == (0, *IMAGE.shape) == part.states.shape
+        assert columns.actions.tolist() == [step[1] for step in taken]
+        with pytest.raises(RecordingError, match="expected images=True for next_states"):
+            recording.read(fields=["next_states"], images=False)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_windows_of_an_episode(path: Path, kind: str) -> None:
     record(path, kind)

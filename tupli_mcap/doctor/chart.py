@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.doctor.blocks import Array, Block, blocks
 from tupli_mcap.doctor.findings import MAX_PLACES, Place
 from tupli_mcap.doctor.gather.digests import Digests
 from tupli_mcap.doctor.gather.resets import Seams, continued
@@ -18,6 +17,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.blocks import Array, Block, blocks
 from tupli_mcap.recording.describe import state_of
 
 __all__ = ["NEEDS", "Chart"]

@@ -6,11 +6,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import Any
 
+from tupli_mcap.dataset.subjects import Examinable, Subject, subjects_of
 from tupli_mcap.doctor.chart import Chart
 from tupli_mcap.doctor.checks import CHECKS, Check
 from tupli_mcap.doctor.checks.repeats import Contents
 from tupli_mcap.doctor.findings import Diagnosis, Finding, Severity
-from tupli_mcap.doctor.subjects import Examinable, Subject, subjects_of
 from tupli_mcap.errors import FilterError, RecordingError, TupliError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys
 

@@ -101,9 +101,18 @@ class ColumnReader:
         self._decoder = None if layout.constant else MessageDecoder(layout)
 
     def read(
-        self, runs: Sequence[Run], total: int, fields: Sequence[str], threads: int, keep: bool
+        self,
+        runs: Sequence[Run],
+        total: int,
+        fields: Sequence[str],
+        threads: int,
+        keep: bool,
+        images: bool = True,
     ) -> dict[str, Any]:
-        """`fields` nested as their spaces are; `keep` puts the chunks read into the cache."""
+        """`fields` nested as their spaces are; `keep` puts the chunks read into the cache.
+
+        Without `images`, the columns of image leaves are empty.
+        """
         unknown = [field for field in fields if field not in FIELDS]
         if unknown:
             raise RecordingError(
@@ -115,7 +124,10 @@ class ColumnReader:
         }  # fmt: skip
         leaves = [leaf for field, group in wanted.items() if field in fields for leaf in group]
         flags = [name for name in ("terminal", "timeout") if f"{name}s" in fields]
-        out: dict[str, Any] = {leaf.name: self._empty(leaf, total) for leaf in leaves}
+        skipped = {leaf.name for leaf in leaves if leaf.kind == "image" and not images}
+        out: dict[str, Any] = {
+            leaf.name: self._empty(leaf, 0 if leaf.name in skipped else total) for leaf in leaves
+        }
         out.update({name: np.empty(total, np.bool_) for name in flags})
         if "times" in fields:
             out[_TIME] = np.empty(total, np.uint64)
@@ -130,7 +142,7 @@ class ColumnReader:
         elif plain:
             self._decode(runs, plain, out)
         for leaf in leaves:
-            if leaf.kind == "image":
+            if leaf.kind == "image" and leaf.name not in skipped:
                 moved = [run._replace(channel=self._images[leaf.name][run.channel]) for run in runs]
                 tasks += self._tasks(
                     moved, ["data"], {"data": out[leaf.name]}, layout.image_messages[leaf.name].dtype, keep

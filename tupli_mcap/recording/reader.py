@@ -376,6 +376,8 @@ class Recording:
         episodes: Sequence[int] | np.ndarray[Any, Any] | None = None,
         fields: Sequence[str] | None = None,
         threads: int | None = None,
+        *,
+        images: bool = True,
     ) -> Columns:
         """Columns of the given episodes (all by default), one after another in the order given.
 
@@ -384,10 +386,13 @@ class Recording:
             fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states", "times"; the first
                 five by default.
             threads: how many threads decompress; by default as many as there are cores, at most 4.
+            images: False reads no image of a state: the columns of image leaves are empty. Not for `next_states`.
 
         Where an episode's final state is not known, `next_states` repeats its last state.
         """
         fields = FIELDS[:5] if fields is None else [fields] if isinstance(fields, str) else list(fields)
+        if not images and "next_states" in fields:
+            raise RecordingError("expected images=True for next_states, found False; read states instead")
         rows = self.index
         if episodes is not None:
             rows = rows[self._positions(episodes)]
@@ -401,7 +406,7 @@ class Recording:
         needed = [field for field in fields if field != "next_states"]
         if "next_states" in fields and "states" not in needed:
             needed.append("states")
-        found = self._reader.read(runs_of(rows, self._step_channels), total, needed, threads, keep)
+        found = self._reader.read(runs_of(rows, self._step_channels), total, needed, threads, keep, images)
         if "next_states" in fields:
             columns.next_states = self._next_states(found["states"], rows, lengths)
         for field in fields:
@@ -427,7 +432,9 @@ class Recording:
             raise RecordingError(f"{self.name}: expected episodes from 0 to {n - 1}, found {episodes!r:.100}")
         return chosen.astype(np.int64)
 
-    def read_steps(self, i: int, start: int, stop: int, fields: Sequence[str] = FIELDS[:5]) -> Columns:
+    def read_steps(
+        self, i: int, start: int, stop: int, fields: Sequence[str] = FIELDS[:5], *, images: bool = True
+    ) -> Columns:
         """Columns of the steps `start:stop` of episode `i`; the chunks they lie in stay in the cache."""
         row = self.index[i]
         count = stop - start
@@ -438,7 +445,7 @@ class Recording:
         channel = self._step_channels[int(row["env"])]
         run = Run(channel, int(row["first_row"]) + start, count, 0)
         columns = Columns(np.array([count]))
-        for field, values in self._reader.read([run], count, fields, 1, True).items():
+        for field, values in self._reader.read([run], count, fields, 1, True, images).items():
             setattr(columns, field, values)
         return columns
 

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.doctor.blocks import Array
 from tupli_mcap.doctor.chart import Chart
 from tupli_mcap.doctor.findings import Finding, Severity
 from tupli_mcap.doctor.gather.values import ArrayValues
 from tupli_mcap.doctor.words import dimension_text, plural, share, unravel
+from tupli_mcap.recording.blocks import Array
 
 __all__ = ["action_imbalance", "action_range", "saturated_action", "unused_action"]
 

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tupli_mcap.doctor.blocks import Array
 from tupli_mcap.doctor.chart import Chart
 from tupli_mcap.doctor.findings import Finding, Severity
 from tupli_mcap.doctor.words import plural, share
+from tupli_mcap.recording.blocks import Array
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
 
 __all__ = [

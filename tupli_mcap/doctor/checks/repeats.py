@@ -11,10 +11,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.doctor.blocks import Array
 from tupli_mcap.doctor.chart import Chart
 from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Place, Severity
 from tupli_mcap.doctor.words import plural, share
+from tupli_mcap.recording.blocks import Array
 
 __all__ = ["Contents", "duplicate_episodes", "repeated_seed"]
 

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tupli_mcap.doctor.blocks import Array
 from tupli_mcap.doctor.chart import Chart
 from tupli_mcap.doctor.findings import Finding, Severity
 from tupli_mcap.doctor.gather.sequence import Rewards
 from tupli_mcap.doctor.words import plural
+from tupli_mcap.recording.blocks import Array
 
 __all__ = ["constant_reward", "return_outliers", "reward_outliers"]
 

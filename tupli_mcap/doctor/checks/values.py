@@ -8,10 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.doctor.blocks import Array
 from tupli_mcap.doctor.chart import Chart
 from tupli_mcap.doctor.findings import Finding, Severity
 from tupli_mcap.doctor.words import dimension_text, share, unravel
+from tupli_mcap.recording.blocks import Array
 
 __all__ = ["infinity", "nan", "outside_space", "stored_dtype"]
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tupli_mcap.doctor.blocks import Array
+from tupli_mcap.recording.blocks import Array
 
 __all__ = ["Extremes", "Run", "Sample", "runs_of_true"]
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.doctor.blocks import Array, Block
 from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.recording.blocks import Array, Block
 
 __all__ = ["Digests", "feed"]
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.doctor.blocks import Array, Block
 from tupli_mcap.doctor.findings import MAX_PLACES
 from tupli_mcap.doctor.gather.digests import feed
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.blocks import Array, Block
 
 __all__ = ["Seams", "continued"]
 

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tupli_mcap.doctor.blocks import Array, Block
 from tupli_mcap.doctor.findings import MAX_PLACES
 from tupli_mcap.doctor.gather.bounded import Extremes, Sample, runs_of_true
 from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.recording.blocks import Array, Block
 
 __all__ = ["Clock", "Flags", "Frames", "Longest", "Rewards"]
 

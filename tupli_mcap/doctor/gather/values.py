@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.doctor.blocks import Array
 from tupli_mcap.doctor.findings import MAX_PLACES
 from tupli_mcap.doctor.gather.digests import feed
 from tupli_mcap.messages.leaves import DType, Leaf
+from tupli_mcap.recording.blocks import Array
 
 __all__ = ["ArrayValues", "VariableValues", "bounds_of"]
 

@@ -1,4 +1,4 @@
-"""What is to be examined: recordings and which of their episodes, opened one at a time."""
+"""What is to be looked at: recordings and which of their episodes, opened one at a time."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import TypeAlias
 import numpy as np
 
 from tupli_mcap.dataset import TupliDataset
-from tupli_mcap.doctor.blocks import Array
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.blocks import Array
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.listing import find_recordings
@@ -29,7 +29,7 @@ _CACHE_BYTES = 64 << 20
 
 @dataclass(frozen=True)
 class Subject:
-    """A recording and how to open it; `choose` gives the positions of the episodes to examine, in their order.
+    """A recording and how to open it; `choose` gives the positions of the episodes that are meant, in their order.
 
     error: why it cannot be opened, where that is known already.
     """

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording import Columns, Recording
+from tupli_mcap.recording.columns import Columns
+from tupli_mcap.recording.reader import Recording
 
-__all__ = ["Array", "Block", "blocks"]
+__all__ = ["Array", "Block", "blocks", "step_bytes"]
 
 Array = np.ndarray[Any, Any]
 
@@ -69,12 +70,15 @@ class Block:
         return int(self.rows["episode"][at]), int(step - self.starts[at]) + self.first_step
 
 
-def blocks(recording: Recording, positions: Array) -> Iterator[Block]:
-    """The steps of the episodes at some positions, in this order, about `BLOCK_BYTES` at a time."""
+def blocks(recording: Recording, positions: Array, *, images: bool = True) -> Iterator[Block]:
+    """The steps of the episodes at some positions, in this order, about `BLOCK_BYTES` at a time.
+
+    Without `images`, no image of a state is read, and the columns of image leaves are empty.
+    """
     if not len(positions):
         return
     layout = recording.layout
-    limit = max(1, BLOCK_BYTES // _step_bytes(layout))
+    limit = max(1, BLOCK_BYTES // step_bytes(layout, images=images))
     lengths = recording.index["length"][positions].astype(np.int64)
     ends = np.cumsum(lengths)
     start = 0
@@ -82,19 +86,19 @@ def blocks(recording: Recording, positions: Array) -> Iterator[Block]:
         before = int(ends[start - 1]) if start else 0
         stop = int(np.searchsorted(ends, before + limit, side="right"))
         if stop <= start:
-            yield from _parts(recording, positions[start : start + 1], int(lengths[start]), limit)
+            yield from _parts(recording, positions[start : start + 1], int(lengths[start]), limit, images)
             start += 1
             continue
         chosen = positions[start:stop]
-        columns = recording.read(chosen, fields=_FIELDS)
+        columns = recording.read(chosen, fields=_FIELDS, images=images)
         yield _block(recording, chosen, columns, lengths[start:stop], 0, True)
         start = stop
 
 
-def _parts(recording: Recording, position: Array, length: int, limit: int) -> Iterator[Block]:
+def _parts(recording: Recording, position: Array, length: int, limit: int, images: bool) -> Iterator[Block]:
     for first in range(0, length, limit):
         stop = min(length, first + limit)
-        columns = recording.read_steps(int(position[0]), first, stop, _FIELDS)
+        columns = recording.read_steps(int(position[0]), first, stop, _FIELDS, images=images)
         yield _block(recording, position, columns, np.array([stop - first]), first, stop == length)
 
 
@@ -110,7 +114,8 @@ def _block(
     return Block(recording.layout, rows, lengths, first, whole, columns, finals, known)
 
 
-def _step_bytes(layout: StepLayout) -> int:
+def step_bytes(layout: StepLayout, *, images: bool = True) -> int:
+    """What a step takes, at least; of variable size, a guess."""
     if not layout.constant:
         return _VARIABLE_STEP_BYTES
-    return layout.step_message.record_size + sum(leaf.size for leaf in layout.images)
+    return layout.step_message.record_size + (sum(leaf.size for leaf in layout.images) if images else 0)
