@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from tupli_mcap.cli import doctor, recordings, repair, sharing, storages, trusting, viewing
+from tupli_mcap.cli import doctor, plotting, recordings, repair, sharing, storages, trusting, viewing
 from tupli_mcap.cli.output import warnings_in_one_line
 from tupli_mcap.errors import FilterError, TupliError
 
@@ -126,6 +126,7 @@ def _root(
 
 recordings.register(app)
 doctor.register(app)
+plotting.register(app)
 storages.register(app)
 sharing.register(app)
 trusting.register(app)

@@ -14,7 +14,7 @@ from tupli_mcap.recording.reader import Recording
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate
 from tupli_mcap.storage.sidecar import Sidecar
 
-__all__ = ["WORDS", "choose_episodes"]
+__all__ = ["WORDS", "choose_among", "choose_episodes"]
 
 WORDS: Final = ("best", "worst", "first", "last", "all")
 """What may stand in place of an episode's number; best and worst are by return, the first of equals."""
@@ -39,13 +39,27 @@ def choose_episodes(
         RecordingError: there is no such episode, or none at all.
     """
     among = _candidates(recording, filter)
+    return [recording.episodes[position] for position in choose_among(recording, among, text, filter)]
+
+
+def choose_among(
+    recording: Recording, among: Positions, text: str, filter: BaseFilter | None = None
+) -> list[int]:
+    """The positions that a text names, as for `choose_episodes`, among some positions in the recording.
+
+    `filter` is why there are no others; errors say so.
+
+    Raises:
+        FilterError: the text is none of this.
+        RecordingError: there is no such episode, or none at all.
+    """
     if not len(among):
         why = "no episode" if filter is None else f"no episode that {filter} is true of"
         raise RecordingError(f"{recording.name} has {why}")
     chosen: dict[int, None] = {}
     for item in text.split(","):
         chosen.update(dict.fromkeys(_positions(recording, among, item.strip().lower(), text, filter)))
-    return [recording.episodes[position] for position in chosen]
+    return list(chosen)
 
 
 def _candidates(recording: Recording, filter: BaseFilter | None) -> Positions:

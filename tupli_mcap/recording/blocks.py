@@ -70,10 +70,13 @@ class Block:
         return int(self.rows["episode"][at]), int(step - self.starts[at]) + self.first_step
 
 
-def blocks(recording: Recording, positions: Array, *, images: bool = True) -> Iterator[Block]:
+def blocks(
+    recording: Recording, positions: Array, *, images: bool = True, finals: bool = True
+) -> Iterator[Block]:
     """The steps of the episodes at some positions, in this order, about `BLOCK_BYTES` at a time.
 
-    Without `images`, no image of a state is read, and the columns of image leaves are empty.
+    Without `images`, no image of a step is read, and the columns of image leaves are empty; without `finals`, no
+    final state.
     """
     if not len(positions):
         return
@@ -86,32 +89,39 @@ def blocks(recording: Recording, positions: Array, *, images: bool = True) -> It
         before = int(ends[start - 1]) if start else 0
         stop = int(np.searchsorted(ends, before + limit, side="right"))
         if stop <= start:
-            yield from _parts(recording, positions[start : start + 1], int(lengths[start]), limit, images)
+            yield from _parts(recording, positions[start : start + 1], limit, images, finals)
             start += 1
             continue
         chosen = positions[start:stop]
         columns = recording.read(chosen, fields=_FIELDS, images=images)
-        yield _block(recording, chosen, columns, lengths[start:stop], 0, True)
+        yield _block(recording, chosen, columns, lengths[start:stop], 0, True, finals)
         start = stop
 
 
-def _parts(recording: Recording, position: Array, length: int, limit: int, images: bool) -> Iterator[Block]:
+def _parts(recording: Recording, position: Array, limit: int, images: bool, finals: bool) -> Iterator[Block]:
+    length = int(recording.index["length"][position[0]])
     for first in range(0, length, limit):
         stop = min(length, first + limit)
         columns = recording.read_steps(int(position[0]), first, stop, _FIELDS, images=images)
-        yield _block(recording, position, columns, np.array([stop - first]), first, stop == length)
+        yield _block(recording, position, columns, np.array([stop - first]), first, stop == length, finals)
 
 
 def _block(
-    recording: Recording, positions: Array, columns: Columns, lengths: Array, first: int, whole: bool
+    recording: Recording,
+    positions: Array,
+    columns: Columns,
+    lengths: Array,
+    first: int,
+    whole: bool,
+    finals: bool,
 ) -> Block:
     rows = recording.index[positions]
-    known = np.flatnonzero(rows["final_row"] >= 0) if whole else np.empty(0, np.int64)
-    finals: dict[str, Any] = {}
+    known = np.flatnonzero(rows["final_row"] >= 0) if whole and finals else np.empty(0, np.int64)
+    found: dict[str, Any] = {}
     if len(known):
         nested = recording.final_states(positions[known])
-        finals = {leaf.name: leaf.get(nested) for leaf in recording.layout.state}
-    return Block(recording.layout, rows, lengths, first, whole, columns, finals, known)
+        found = {leaf.name: leaf.get(nested) for leaf in recording.layout.state}
+    return Block(recording.layout, rows, lengths, first, whole, columns, found, known)
 
 
 def step_bytes(layout: StepLayout, *, images: bool = True) -> int:
