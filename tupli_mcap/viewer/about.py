@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
+from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe import describe
+from tupli_mcap.viewer.names import title_of
 
 __all__ = ["card", "send_about"]
 
 _MOST_BARS = 1000
+_MOST_LEAVES = 16
 
 
 def send_about(stream: Any, recordings: Sequence[Recording], shown: str, unseen: Sequence[str]) -> None:
@@ -51,25 +57,48 @@ def card(recording: Recording) -> str:
     d = describe(recording)
     rows = [
         ("environment", d.environment or "not recorded"),
-        ("episodes", f"{d.episodes:,}"),
-        ("steps", f"{d.steps:,}"),
-        *(
-            [("return", f"mean {d.returns.mean:.4g}, {d.returns.min:.4g} to {d.returns.max:.4g}")]
-            if d.returns
-            else []
-        ),
-        *(
-            [("length", f"mean {d.lengths.mean:.4g}, {d.lengths.min:.4g} to {d.lengths.max:.4g}")]
-            if d.lengths
-            else []
-        ),
-        ("observation", d.observation_space or ""),
-        ("action", d.action_space or ""),
-        ("benchmark", d.benchmark_id[:12] or "none"),
+        ("episodes", f"{d.episodes:,}, {_ends(d.ends)}"),
     ]
-    return f"### {_plain(d.name)}\n\n| | |\n|---|---|\n" + "\n".join(
-        f"| {name} | {_plain(value)} |" for name, value in rows
-    )
+    rows += [("steps", f"{d.steps:,}")]
+    for name, spread in (("return", d.returns), ("length", d.lengths)):
+        if spread:
+            rows.append((name, f"mean {spread.mean:.4g}, from {spread.min:.4g} to {spread.max:.4g}"))
+    rows += _leaf_rows(recording)
+    rows += [
+        ("benchmark", d.benchmark_id[:12] or "none"),
+        ("recorded", _when(d.created_ns)),
+        ("file", d.name),
+    ]
+    lines = [f"| {_plain(name)} | {_plain(value)} |" for name, value in rows]
+    return "\n".join([f"### {_plain(Path(d.name).stem)}", "", lines[0], "|---|---|", *lines[1:]])
+
+
+def _ends(ends: Mapping[str, int]) -> str:
+    return ", ".join(f"{number:,} {name}" for name, number in ends.items() if number) or "none has ended"
+
+
+def _when(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns // 10**9, UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def _leaf_rows(recording: Recording) -> list[tuple[str, str]]:
+    """A row for every leaf of state and action: its space is one line long, however large the whole is."""
+    if not recording.index.size:
+        return []
+    leaves = [*recording.layout.state, *recording.layout.action]
+    rows = [(title_of(leaf), _short(leaf)) for leaf in leaves[:_MOST_LEAVES]]
+    more = len(leaves) - len(rows)
+    return rows if not more else [*rows, ("…", f"{more:,} more")]
+
+
+def _short(leaf: Leaf) -> str:
+    """A leaf's space in a few words."""
+    kind = type(leaf.space).__name__
+    if isinstance(leaf.space, gym.spaces.Discrete):
+        return f"{kind}, {leaf.space.n} values"
+    if leaf.dtype is None:
+        return kind
+    return f"{kind}, {' × '.join(map(str, leaf.shape)) or 'one'} {leaf.dtype}"
 
 
 def _plain(text: str) -> str:
