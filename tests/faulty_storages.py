@@ -259,7 +259,7 @@ def run_trust_case(directory: Path, case: Case) -> Outcome:
     """Trusting and untrusting a digest with one fault: trusted, or not, and nothing else."""
     digest = "ab" * 32
     os.environ["TUPLI_MCAP_CONFIG_DIR"] = str(directory / "config")
-    directory.mkdir()
+    directory.mkdir(parents=True)
     faults = Faults(directory, case.at, case.code, lasting=case.lasting, short=case.short)
     said = []
     with faults():

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from environments import Sampler, Scripted, roll
 from gymnasium import spaces
+from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from tupli_mcap import (
@@ -763,7 +764,10 @@ def test_empty_unfinished_and_unreadable_files(tmp_path: Path) -> None:
     with Recording(good) as recording:
         rewrite_recording(recording, tmp_path / "empty.mcap", episodes=[])
     data = good.read_bytes()
-    (tmp_path / "zdamaged.mcap").write_bytes(data[:3000] + bytes([data[3000] ^ 255]) + data[3001:])
+    with good.open("rb") as file:
+        (first, *_) = make_reader(file).get_summary().chunk_indexes  # type: ignore[union-attr]
+    at = first.chunk_start_offset + first.chunk_length - 10
+    (tmp_path / "zdamaged.mcap").write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
     diagnosis = examine(tmp_path)
     assert diagnosis.files == 4
     assert found(diagnosis, "no-episodes").path == str(tmp_path / "empty.mcap")
