@@ -40,7 +40,10 @@ def test_cart_pole(viewer: HeadlessViewer, folder: Path) -> None:
         >= {"state": "TimeSeries", "return": "TimeSeries", "reward": "TimeSeries"}.items()
     )
     assert classes(viewer).items() >= ABOUT.items()
-    assert all(viewer.filled().values())
+    empty = {name for name, filled in viewer.filled().items() if not filled}
+    assert empty <= {
+        "action"
+    }  # of a thousand changes the viewer tells the number, in grey, until one zooms in
     (recording,) = state.recordings
     assert recording.current_timeline == "step"
     ranges = {timeline.name: (timeline.start, timeline.end) for timeline in recording.timelines}

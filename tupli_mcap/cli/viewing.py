@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -41,6 +42,15 @@ def _replay(
     save: Annotated[
         Path | None, typer.Option("--save", metavar="FILE.rrd", help="Write a file for the viewer instead.")
     ] = None,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve a viewer for the browser, on 127.0.0.1, until Ctrl-C.")
+    ] = False,
+    connect: Annotated[
+        str | None,
+        typer.Option(
+            "--connect", metavar="URL", help="Send to a viewer that runs: rerun+http://HOST:PORT/proxy."
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Look at recordings in the Rerun viewer.
@@ -53,7 +63,21 @@ def _replay(
     if compare and split:
         raise typer.BadParameter("--compare overlays episodes, --split shows them apart; give one of them")
     form: viewer.Form = "compare" if compare else "split" if split else "joined"
-    if save is None:
-        raise typer.BadParameter("give --save FILE.rrd")
-    path = viewer.save(sources, save, episode, filter=filter_of(filter_text), form=form, force=force)
-    print(f"{path}: {bytes_of(path.stat().st_size)}; open it with: rerun {path}")
+    if sum([web, save is not None, connect is not None]) > 1:
+        raise typer.BadParameter(
+            "--save, --web and --connect are three places to show episodes; give one of them"
+        )
+    if force and save is None:
+        raise typer.BadParameter("--force replaces the file of --save; give that too")
+    wanted = filter_of(filter_text)
+    if save is not None:
+        path = viewer.save(sources, save, episode, filter=wanted, form=form, force=force)
+        print(f"{path}: {bytes_of(path.stat().st_size)}; open it with: rerun {shlex.quote(str(path))}")
+    elif web:
+        viewer.serve(sources, episode, filter=wanted, form=form, tell=_tell)
+    else:
+        viewer.show(sources, episode, filter=wanted, form=form, connect=connect)
+
+
+def _tell(url: str) -> None:
+    print(f"{url}\nopen it in a browser; Ctrl-C ends it", flush=True)

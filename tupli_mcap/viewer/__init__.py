@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,9 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.choice import Source, chosen_from
 from tupli_mcap.viewer.plan import Form, plans_of
 from tupli_mcap.viewer.sdk import ViewerError, rerun_sdk
-from tupli_mcap.viewer.targets import to_file
+from tupli_mcap.viewer.targets import to_browser, to_file, to_viewer, to_window
 
-__all__ = ["Form", "ViewerError", "blueprint", "save", "send"]
+__all__ = ["Form", "ViewerError", "blueprint", "save", "send", "serve", "show"]
 
 
 def save(
@@ -42,6 +42,50 @@ def save(
     rerun_sdk()
     with chosen_from(sources, episodes, filter) as chosen:
         return to_file(plans_of(chosen, form), target, force=force)
+
+
+def show(
+    sources: Source | Sequence[Source],
+    episodes: str | Sequence[int] | None = None,
+    *,
+    filter: Any = None,
+    form: Form = "joined",
+    connect: str | None = None,
+) -> None:
+    """Opens the native viewer on episodes, chosen as for `save`; it stays open.
+
+    Args:
+        connect: send to this viewer instead, `rerun+http://HOST:PORT/proxy`.
+
+    Raises:
+        MissingExtraError: rerun-sdk is not installed.
+        ViewerError: there is no display, no viewer, or it does not start.
+    """
+    rerun_sdk()
+    with chosen_from(sources, episodes, filter) as chosen:
+        if connect is None:
+            to_window(plans_of(chosen, form))
+        else:
+            to_viewer(plans_of(chosen, form), connect)
+
+
+def serve(
+    sources: Source | Sequence[Source],
+    episodes: str | Sequence[int] | None = None,
+    *,
+    filter: Any = None,
+    form: Form = "joined",
+    tell: Callable[[str], None] = print,
+) -> None:
+    """Serves the web viewer and the episodes on 127.0.0.1 until Ctrl-C; `tell` is given the URL.
+
+    Raises:
+        MissingExtraError: rerun-sdk is not installed.
+        ViewerError: there is no viewer program, or it does not start.
+    """
+    rerun_sdk()
+    with chosen_from(sources, episodes, filter) as chosen:
+        to_browser(plans_of(chosen, form), tell)
 
 
 def blueprint(

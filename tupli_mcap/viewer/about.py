@@ -15,10 +15,11 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe import describe
 from tupli_mcap.viewer.names import title_of
 
-__all__ = ["card", "send_about"]
+__all__ = ["card", "plain", "send_about"]
 
 _MOST_BARS = 1000
 _MOST_LEAVES = 16
+_MOST_CARDS, _MOST_UNSEEN = 5, 20
 
 
 def send_about(stream: Any, recordings: Sequence[Recording], shown: str, unseen: Sequence[str]) -> None:
@@ -27,8 +28,12 @@ def send_about(stream: Any, recordings: Sequence[Recording], shown: str, unseen:
 
     from tupli_mcap.viewer.sending import column_of
 
-    texts = [card(recording) for recording in recordings]
-    missing = "".join(f"\n- {line}" for line in unseen)
+    texts = [card(recording) for recording in recordings[:_MOST_CARDS]]
+    if len(recordings) > _MOST_CARDS:
+        texts.append(f"and {len(recordings) - _MOST_CARDS:,} more recordings")
+    missing = "".join(f"\n- {plain(line)}" for line in unseen[:_MOST_UNSEEN])
+    if len(unseen) > _MOST_UNSEEN:
+        missing += f"\n- and {len(unseen) - _MOST_UNSEEN:,} more"
     notes = f"\n\n**Not shown**\n{missing}" if unseen else ""
     document = rr.TextDocument(f"{shown}\n\n" + "\n\n".join(texts) + notes, media_type=rr.MediaType.MARKDOWN)
     stream.log("/card", document, static=True)
@@ -69,8 +74,8 @@ def card(recording: Recording) -> str:
         ("recorded", _when(d.created_ns)),
         ("file", d.name),
     ]
-    lines = [f"| {_plain(name)} | {_plain(value)} |" for name, value in rows]
-    return "\n".join([f"### {_plain(Path(d.name).stem)}", "", lines[0], "|---|---|", *lines[1:]])
+    lines = [f"| {plain(name)} | {plain(value)} |" for name, value in rows]
+    return "\n".join([f"### {plain(Path(d.name).stem)}", "", lines[0], "|---|---|", *lines[1:]])
 
 
 def _ends(ends: Mapping[str, int]) -> str:
@@ -101,7 +106,7 @@ def _short(leaf: Leaf) -> str:
     return f"{kind}, {' × '.join(map(str, leaf.shape)) or 'one'} {leaf.dtype}"
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
     """Text from a file as Markdown that means nothing but itself."""
     kept = "".join(c if c.isprintable() else " " for c in text[:400])
     return "".join(f"\\{c}" if c in r"\`*_{}[]<>()#+!|~" else c for c in kept)

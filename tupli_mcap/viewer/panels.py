@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -12,13 +12,12 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.viewer.blocks import Array, Block
 from tupli_mcap.viewer.sending import Times, send_scalars
 
-__all__ = ["ENDS", "PALETTE", "Panel", "Place", "Rewards", "Series", "plot"]
+__all__ = ["ENDS", "PALETTE", "Panel", "Place", "Rewards", "Series", "flat_values", "plot"]
 
 ENDS: Mapping[str, int] = {"terminal": 0xE4572EFF, "timeout": 0xF3A712FF, "interrupted": 0x9A9A9AFF}
 """How an episode may end, by code, and the colour of its marker (RGBA)."""
 
-
-PALETTE = (
+PALETTE: Final = (
     0x4C9BE8FF, 0xF28E2BFF, 0x59C36AFF, 0xE15759FF, 0xB07AD9FF, 0xEDC948FF,
     0x3FBFB5FF, 0xFF9DA7FF, 0xB58A6BFF, 0x8FA6C8FF, 0xA8C64DFF, 0xD264B6FF,
 )  # fmt: skip
@@ -40,6 +39,12 @@ class Place(NamedTuple):
             return name
         return self.title if alone else f"{name} · {self.title}"
 
+    def colors(self, count: int, first: int = 0) -> Array:
+        """Colours for so many series: that of the episode, or those of the palette from `first` on."""
+        if self.color is not None:
+            return np.full(count, self.color, np.uint32)
+        return np.resize(np.roll(np.array(PALETTE, np.uint32), -first), count)
+
 
 class Panel(Protocol):
     """Something that is shown."""
@@ -55,8 +60,8 @@ class Panel(Protocol):
         """Sends a block of steps."""
         ...
 
-    def view(self, roots: Sequence[str]) -> Any:
-        """The view on the entities below each root."""
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        """The view on the entities below each root; `axis` is the time axis of plots."""
         ...
 
 
@@ -77,15 +82,13 @@ class Series:
 
     def declare(self, place: Place) -> None:
         import rerun as rr
-        from rerun.components import InterpolationMode
+        from rerun.components import AggregationPolicy, InterpolationMode
 
-        number = len(self.names)
-        told_apart = np.resize(np.array(PALETTE, np.uint32), number)
-        colors = told_apart if place.color is None else np.full(number, place.color, np.uint32)
         lines = rr.SeriesLines(
             names=[place.told(name, alone=len(self.names) == 1) for name in self.names],
-            colors=colors,
+            colors=place.colors(len(self.names)),
             interpolation_mode=InterpolationMode.StepAfter if self.stepped else None,
+            aggregation_policy=AggregationPolicy.MinMax,
         )
         place.stream.log(place.root + self.entity, lines, static=True)
 
@@ -95,9 +98,9 @@ class Series:
             values = values[:, list(self.dims)]
         send_scalars(place.stream, place.root + self.entity, times, values)
 
-    def view(self, roots: Sequence[str]) -> Any:
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
         told = len(roots) == 1 and len(self.names) > 1  # compared episodes are told beside the returns, once
-        return plot(self.title, [root + self.entity for root in roots], legend=told)
+        return plot(self.title, [root + self.entity for root in roots], axis, legend=told)
 
 
 @dataclass
@@ -110,14 +113,19 @@ class Rewards:
 
     def declare(self, place: Place) -> None:
         import rerun as rr
-        from rerun.components import MarkerShape
+        from rerun.components import AggregationPolicy, MarkerShape
 
-        for name, color in (("reward", PALETTE[6]), ("return", PALETTE[2])):
-            lines = rr.SeriesLines(names=[place.told(name, alone=True)], colors=[place.color or color])
+        for name, color in (("reward", 6), ("return", 2)):
+            told = [place.told(name, alone=True)]
+            lines = rr.SeriesLines(
+                names=told, colors=place.colors(1, color), aggregation_policy=AggregationPolicy.MinMax
+            )
             place.stream.log(f"{place.root}/{name}", lines, static=True)
         shapes = (MarkerShape.Cross, MarkerShape.Diamond, MarkerShape.Square)
         for (name, color), shape in zip(ENDS.items(), shapes, strict=True):
-            points = rr.SeriesPoints(names=[name], colors=[color], markers=[shape], marker_sizes=[5.0])
+            points = rr.SeriesPoints(
+                names=[name], colors=np.array([color], np.uint32), markers=[shape], marker_sizes=[5.0]
+            )
             place.stream.log(f"{place.root}/end/{name}", points, static=True)
 
     def send(self, place: Place, block: Block, times: Times) -> None:
@@ -159,13 +167,13 @@ class Rewards:
         self._running = 0.0 if piece.last else float(returns[-1])
         return returns
 
-    def view(self, roots: Sequence[str]) -> Any:
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
         import rerun.blueprint as rrb
 
         ends = [f"{root}/end/{name}" for root in roots for name in ENDS]
         return rrb.Vertical(
-            plot("return", [*(f"{root}/return" for root in roots), *ends]),
-            plot("reward", [f"{root}/reward" for root in roots], legend=False),
+            plot("return", [*(f"{root}/return" for root in roots), *ends], axis),
+            plot("reward", [f"{root}/reward" for root in roots], axis, legend=False),
             name=self.title,
         )
 
@@ -176,8 +184,8 @@ def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
     return values.reshape(len(block), -1)
 
 
-def plot(title: str, entities: Sequence[str], *, legend: bool = True) -> Any:
-    """A view of series over time, linked with the other plots. A legend of what the title says would only hide it."""
+def plot(title: str, entities: Sequence[str], axis: Any, *, legend: bool = True) -> Any:
+    """A view of series over time. A legend of what the title says would only hide it."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
@@ -185,5 +193,5 @@ def plot(title: str, entities: Sequence[str], *, legend: bool = True) -> Any:
         origin="/",
         contents=list(entities),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
-        axis_x=rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+        axis_x=axis,
     )

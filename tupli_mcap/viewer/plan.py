@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.viewer.about import send_about
+from tupli_mcap.viewer.about import plain, send_about
 from tupli_mcap.viewer.arrange import blueprint_of
 from tupli_mcap.viewer.blocks import Block, blocks_of
 from tupli_mcap.viewer.panels import PALETTE, Place
@@ -56,14 +56,14 @@ class Plan(NamedTuple):
     @property
     def blueprint(self) -> Any:
         """The blueprint of the parts."""
-        return blueprint_of(self.parts[0].scene, [part.root for part in self.parts])
+        return blueprint_of(self.parts[0].scene, list(dict.fromkeys(part.root for part in self.parts)))
 
     @property
     def application(self) -> str:
         """The Rerun application: what looks alike has one, since a viewer keeps a blueprint for each."""
         first = self.parts[0]
         recording = first.chosen.recording
-        looks = json.dumps([recording.layout.to_metadata(), [part.root for part in self.parts]])
+        looks = _spaces_of(recording) + repr([part.root for part in self.parts] if first.root else "")
         name = re.sub(r"[^\w-]+", "-", name_of(recording))  # the viewer warns of others
         return f"{name} {hashlib.sha256(looks.encode()).hexdigest()[:6]}"
 
@@ -90,8 +90,7 @@ class Plan(NamedTuple):
 
 def times_of(block: Block) -> Times:
     """Where a block's rows lie on the timelines."""
-    labels = getattr(block.recording, "labels", None)
-    seconds = None if labels is None else labels.step_seconds
+    seconds = block.recording.labels.step_seconds
     return Times(block.number, block.times, None if seconds is None else block.number * seconds)
 
 
@@ -122,18 +121,21 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
             )
         yield _compared(chosen)
     else:
-        yield _joined(chosen)
+        alike: dict[str, list[Chosen]] = {}
+        for item in chosen:
+            alike.setdefault(_spaces_of(item.recording), []).append(item)
+        yield from map(_joined, alike.values())  # what has other spaces has other plots
 
 
 def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
     for item in chosen:
         scene = scene_of(item.recording, item.positions)
         for position in item.positions:
-            episode = item.recording.episodes[position]
-            told = f"Episode {episode.number}: {len(episode):,} steps, return {episode.return_:.6g}, {episode.end}"
-            name = f"{Path(item.recording.name).stem} · episode {episode.number}"
+            number = item.recording.episodes[position].number
+            name = f"{Path(item.recording.name).stem} · episode {number}"
             part = Part(Chosen(item.recording, [position]), scene)
-            yield Plan(name, f"{item.recording.uuid}-{episode.number}", [part], told)
+            told = _episode_told(item.recording, position)
+            yield Plan(name, f"{item.recording.uuid}-{number}", [part], told)
 
 
 def _joined(chosen: Sequence[Chosen]) -> Plan:
@@ -145,10 +147,37 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
         first += int(item.recording.index["length"][list(item.positions)].sum())
     total = sum(len(item.positions) for item in chosen)
     name = Path(chosen[0].recording.name).stem
-    return Plan(name, chosen[0].recording.uuid, parts, f"{total:,} episodes, {first:,} steps")
+    if total == 1:
+        told = _episode_told(chosen[0].recording, chosen[0].positions[0])
+    else:
+        told = f"{total:,} episodes, {first:,} steps, on one timeline"
+    scene.rows = first
+    return Plan(name, chosen[0].recording.uuid, parts, told)
+
+
+def _episode_told(recording: Recording, position: int) -> str:
+    """An episode's facts in Markdown."""
+    episode = recording.episodes[position]
+    seed = "" if episode.seed is None else f", seed {episode.seed}"
+    facts = f"**Episode {episode.number}**: {len(episode):,} steps, return {episode.return_:.6g}, {episode.end}{seed}"
+    metadata = "".join(
+        f"\n- {plain(key)}: {plain(repr(value))}" for key, value in list(episode.metadata.items())[:20]
+    )
+    return f"{facts}\n{metadata}"
+
+
+def _spaces_of(recording: Recording) -> str:
+    return json.dumps(recording.layout.to_metadata())
 
 
 def _compared(chosen: Sequence[Chosen]) -> Plan:
+    first = chosen[0].recording
+    for item in chosen[1:]:
+        if _spaces_of(item.recording) != _spaces_of(first):
+            raise RecordingError(
+                f"expected recordings of the same spaces to compare, found {first.name} and {item.recording.name} "
+                "with different ones; show them without --compare"
+            )
     scene = scene_of(*chosen[0], apart=True)
     parts: list[Part] = []
     for item in chosen:
@@ -162,5 +191,10 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
                     Chosen(item.recording, [position]), scene, root, title, PALETTE[len(parts) % len(PALETTE)]
                 )
             )
-    told = ", ".join(part.title for part in parts)
-    return Plan("comparison", chosen[0].recording.uuid, parts, f"Compared: {told}")
+    scene.rows = max(int(item.recording.index["length"][list(item.positions)].max()) for item in chosen)
+    lines = [f"\n- {plain(part.title)}: {_episode_told(*_only(part))}" for part in parts]
+    return Plan("comparison", first.uuid, parts, f"**Compared**\n{''.join(lines)}")
+
+
+def _only(part: Part) -> tuple[Recording, int]:
+    return part.chosen.recording, part.chosen.positions[0]

@@ -1,23 +1,33 @@
-"""The scene of a recording: which panels its spaces ask for, and the blueprint that arranges them."""
+"""The scene of a recording: which panels its spaces ask for."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 
+from tupli_mcap.messages.labels import Labels
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
-from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, magnitudes, title_of
+from tupli_mcap.viewer.blocks import Array
+from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, escaped, magnitudes, title_of
 from tupli_mcap.viewer.panels import Panel, Rewards, Series
+from tupli_mcap.viewer.pictures import Camera, Grid, HeatMap, Picture
+from tupli_mcap.viewer.words import Lanes, Words, infos_of
 
 __all__ = ["Scene", "scene_of"]
 
-MOST_LINES = 12  # in one plot; more cannot be told apart
-_RATIO = 30.0  # magnitudes further apart than this do not share an axis
-_SAMPLE_EPISODES, _SAMPLE_STEPS = 8, 512
+MOST_LINES: Final = 12  # in one plot; more cannot be told apart
+_MOST_SMALL: Final = 48  # dimensions that get small plots beside their heat map
+_LINES_SMALL: Final = 6
+_MOST_LANES: Final = 12  # values of a Discrete leaf that get a colour each
+_MOST_LANE_ROWS: Final = 20_000  # the state timeline draws every change, however narrow
+_MOST_INFOS: Final = 12
+_RATIO: Final = 30.0  # magnitudes further apart than this do not share an axis
+_SAMPLE_EPISODES, _SAMPLE_STEPS, _SAMPLE_VALUES = 8, 512, 1 << 20
 
 
 @dataclass
@@ -27,12 +37,26 @@ class Scene:
     states: list[Panel] = field(default_factory=list)
     actions: list[Panel] = field(default_factory=list)
     rewards: list[Panel] = field(default_factory=list)
-    beside: list[Panel] = field(default_factory=list)
+    beside: list[Panel] = field(default_factory=list)  # what is looked at next to the plots
     unseen: list[str] = field(default_factory=list)
+    rows: int = 0
 
     @property
     def panels(self) -> list[Panel]:
         return [*self.states, *self.actions, *self.rewards, *self.beside]
+
+
+class _Material(NamedTuple):
+    """What panels are decided on: labels, some columns, how many rows will come, and whether lines stay apart."""
+
+    labels: Labels
+    sample: Sequence[Any]
+    rows: int
+    apart: bool
+
+    def values(self, leaf: Leaf, column: str) -> Array:
+        parts = [leaf.get(getattr(part, column)).reshape(-1, leaf.size) for part in self.sample]
+        return np.concatenate(parts).astype(np.float64)
 
 
 def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = False) -> Scene:
@@ -42,33 +66,68 @@ def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = Fa
         apart: each dimension gets a view of its own, for several episodes to be in it.
     """
     layout = recording.layout
-    scene = Scene(rewards=[Rewards(layout.reward)])
-    sample = _sample(recording, positions)
-    most = 1 if apart else MOST_LINES
+    rows = int(recording.index["length"][np.asarray(positions, np.int64)].sum())
+    scene = Scene(rewards=[Rewards(layout.reward)], rows=rows)
+    material = _Material(recording.labels, _sample(recording, positions), rows, apart)
+    for name in recording.cameras:
+        scene.beside.append(Camera(name, f"/camera/{escaped(name)}", f"camera {name}"))
     for leaf in layout.state:
-        _add(scene, scene.states, leaf, "states", sample, recording, most)
+        _add(scene, scene.states, leaf, "states", material)
     for leaf in layout.action:
-        _add(scene, scene.actions, leaf, "actions", sample, recording, most)
+        _add(scene, scene.actions, leaf, "actions", material)
+    infos, unseen = infos_of(recording, _spread(positions), _MOST_INFOS)
+    if infos is not None:
+        scene.beside.append(infos)
+    scene.unseen += unseen
     return scene
 
 
-def _add(
-    scene: Scene, panels: list[Panel], leaf: Leaf, column: str, sample: Any, recording: Recording, most: int
-) -> None:
-    if leaf.dtype is None or not leaf.size or leaf.kind == "image":
-        scene.unseen.append(f"{title_of(leaf)}: {leaf.space}")
-        return
-    labels = getattr(recording, "labels", None)
-    names = dimension_names(leaf, None if labels is None else labels.dimensions.get(leaf.path))
-    values = np.concatenate([leaf.get(getattr(part, column)).reshape(-1, leaf.size) for part in sample])
-    groups = by_scale(magnitudes(values.astype(np.float64)), _RATIO, most)
-    entity = entity_of(leaf)
+def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _Material) -> None:
+    entity, title = entity_of(leaf), title_of(leaf)
+    if leaf.dtype is None:
+        scene.beside.append(Words(leaf, column, entity, title))
+    elif not leaf.size:
+        scene.unseen.append(f"{title_of(leaf)} has no values")
+    elif leaf.kind == "image":
+        scene.beside.append(Picture(leaf, column, entity, title))
+    elif type(leaf.space) is spaces.Discrete:
+        panels.append(_discrete(leaf, column, material))
+    elif leaf.size <= MOST_LINES:
+        panels += _series(leaf, column, material, 1 if material.apart else MOST_LINES)
+    elif len(leaf.shape) in (2, 3):
+        panels.append(Grid(leaf, column, entity, title))
+    else:
+        panels += _many(scene, leaf, column, material)
+
+
+def _discrete(leaf: Leaf, column: str, material: _Material) -> Panel:
+    space: Any = leaf.space
+    n, start = int(space.n), int(space.start)
+    entity, names = entity_of(leaf), material.labels.values.get(leaf.path)
+    if (n <= _MOST_LANES or names is not None) and material.rows <= _MOST_LANE_ROWS:
+        labels = _distinct([str(start + i) for i in range(n)] if names is None else names)
+        return Lanes(leaf, column, entity, title_of(leaf), labels)
+    return Series(leaf, column, entity, title_of(leaf), (0,), (title_of(leaf),), stepped=True)
+
+
+def _distinct(labels: Sequence[str]) -> list[str]:
+    """Labels that differ: a viewer takes equal ones for one state."""
+    return [label if labels.index(label) == i else f"{label} ({i})" for i, label in enumerate(labels)]
+
+
+def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Panel]:
+    names = dimension_names(leaf, material.labels.dimensions.get(leaf.path))
+    groups = by_scale(magnitudes(material.values(leaf, column)), _RATIO, most)
+    stepped = column == "actions" or (leaf.dtype is not None and leaf.dtype.kind in "iub")
+    found: list[Panel] = []
     for dims in groups:
         told = [names[i] for i in dims]
         alone = len(groups) == 1
-        title = title_of(leaf) if alone else f"{title_of(leaf)}: {_some(told)}"
+        entity = entity_of(leaf)
         path = entity if alone else f"{entity}/dims_{'_'.join(map(str, dims))}"
-        panels.append(Series(leaf, column, path, title, dims, told, stepped=column == "actions"))
+        title = title_of(leaf) if alone else f"{title_of(leaf)}: {_some(told)}"
+        found.append(Series(leaf, column, path, title, dims, told, stepped))
+    return found
 
 
 def _some(names: Sequence[str], most: int = 4) -> str:
@@ -76,13 +135,36 @@ def _some(names: Sequence[str], most: int = 4) -> str:
     return ", ".join(names[:most]) + ("" if len(names) <= most else ", …")
 
 
+def _many(scene: Scene, leaf: Leaf, column: str, material: _Material) -> list[Panel]:
+    """A heat map, and where they can still be told apart, small plots."""
+    values = material.values(leaf, column)
+    finite = np.isfinite(values)
+    low = np.where(finite, values, np.inf).min(axis=0, initial=np.inf)
+    high = np.where(finite, values, -np.inf).max(axis=0, initial=-np.inf)
+    low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
+    title = f"{title_of(leaf)}: {leaf.size:,} dimensions, each from its lowest to its highest"
+    panels: list[Panel] = [HeatMap(leaf, column, f"{entity_of(leaf)}/heat_map", title, low, high)]
+    if leaf.size > _MOST_SMALL or material.apart:
+        scene.unseen.append(
+            f"{title_of(leaf)}: {leaf.size:,} dimensions are in the heat map only, without their values"
+        )
+        return panels
+    return panels + _series(leaf, column, material, _LINES_SMALL)
+
+
+def _spread(positions: Sequence[int]) -> list[int]:
+    """A few of the episodes, from all over them."""
+    chosen = np.unique(np.linspace(0, len(positions) - 1, _SAMPLE_EPISODES).astype(int))
+    return [int(positions[i]) for i in chosen]
+
+
 def _sample(recording: Recording, positions: Sequence[int]) -> list[Any]:
     """A few steps from all over the episodes: for how large the values get."""
-    chosen = np.unique(np.linspace(0, len(positions) - 1, _SAMPLE_EPISODES).astype(int))
+    row = sum(leaf.size for leaf in recording.layout.leaves if leaf.dtype is not None)
+    most = max(1, min(_SAMPLE_STEPS, _SAMPLE_VALUES // (_SAMPLE_EPISODES * max(row, 1))))
     found = []
-    for position in (positions[i] for i in chosen):
+    for position in _spread(positions):
         length = int(recording.index["length"][position])
-        start = max(0, (length - _SAMPLE_STEPS) // 2)
-        stop = min(length, start + _SAMPLE_STEPS)
-        found.append(recording.read_steps(position, start, stop, ("states", "actions")))
+        start = max(0, (length - most) // 2)
+        found.append(recording.read_steps(position, start, min(length, start + most), ("states", "actions")))
     return found

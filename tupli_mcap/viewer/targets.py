@@ -4,16 +4,30 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.viewer.binary import run_quietly, viewer_program
 from tupli_mcap.viewer.plan import Plan
+from tupli_mcap.viewer.process import (
+    LOCAL,
+    end,
+    free_port,
+    has_display,
+    scratch,
+    start,
+    stopped_by_signals,
+    wait_for_ports,
+)
+from tupli_mcap.viewer.sdk import ViewerError
 
-__all__ = ["to_file"]
+__all__ = ["to_browser", "to_file", "to_viewer", "to_window"]
+
+_FLUSH_SECONDS = 600.0  # a viewer takes some millions of steps a second
 
 
 def to_file(plans: Iterable[Plan], target: str | os.PathLike[str], *, force: bool = False) -> Path:
@@ -58,3 +72,71 @@ def _write(plan: Plan, path: Path, blueprint: Any) -> None:
         stream.flush()
     finally:
         stream.disconnect()
+
+
+def to_viewer(plans: Iterable[Plan], url: str) -> None:
+    """Sends to a viewer that runs, such as `rerun+http://127.0.0.1:9876/proxy`.
+
+    Raises:
+        ViewerError: the URL is none, or nobody there took the data.
+    """
+    for plan in plans:
+        stream = plan.new_stream()
+        try:
+            stream.connect_grpc(url, default_blueprint=plan.blueprint)
+            plan.send(stream)
+            stream.flush(timeout_sec=_FLUSH_SECONDS)
+        except (RuntimeError, ValueError) as err:
+            raise ViewerError(f"the viewer at {url} took nothing: {err}") from err
+        finally:
+            stream.disconnect()
+
+
+def to_window(plans: Iterable[Plan]) -> int:
+    """Opens the native viewer, which stays when this process ends; returns its process id.
+
+    Raises:
+        ViewerError: there is no display, or no viewer, or it does not start.
+    """
+    program = viewer_program()
+    if not has_display():
+        raise ViewerError(
+            "there is no display to open the viewer on; write a file with --save FILE.rrd, or look in a browser "
+            "with --web"
+        )
+    port = free_port()
+    with scratch() as folder, (folder / "log").open("wb") as log:
+        process = start(program, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon", log=log)
+        try:
+            wait_for_ports(process, [port], folder / "log")
+            to_viewer(plans, f"rerun+http://{LOCAL}:{port}/proxy")
+        except BaseException:
+            end(process)
+            raise
+    process.returncode = 0  # it is left to itself: nobody is to be told that it still runs
+    return process.pid
+
+
+def to_browser(plans: Iterable[Plan], tell: Callable[[str], None]) -> None:
+    """Serves the web viewer and the data on 127.0.0.1, tells the URL, and goes on until Ctrl-C.
+
+    Raises:
+        ViewerError: there is no viewer program, or it does not start, or ends.
+    """
+    program = viewer_program()
+    with scratch() as folder, stopped_by_signals():
+        path = to_file(plans, folder / "replay.rrd")
+        ports = [free_port(), free_port()]
+        words = ["--serve-web", "--port", str(ports[0]), "--web-viewer-port", str(ports[1])]
+        with (folder / "log").open("wb") as log:
+            process = start(program, *words, "--server-memory-limit", "100%", str(path), log=log)
+        try:
+            wait_for_ports(process, ports, folder / "log")
+            data = quote(f"rerun+http://{LOCAL}:{ports[0]}/proxy", safe="")
+            tell(f"http://{LOCAL}:{ports[1]}/?url={data}")
+            process.wait()
+            raise ViewerError(f"the web viewer ended by itself, with exit code {process.returncode}")
+        except KeyboardInterrupt:
+            return
+        finally:
+            end(process)

@@ -1,0 +1,174 @@
+"""Panels of what is looked at rather than read off: images, grids, heat maps, camera frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.viewer.blocks import Array, Block
+from tupli_mcap.viewer.panels import Place, flat_values
+from tupli_mcap.viewer.sending import Times, blob_array, column_of, send_blobs, send_tensors
+
+__all__ = ["Camera", "Grid", "HeatMap", "Picture"]
+
+_MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image leaf: a picture a step, as it is."""
+
+    leaf: Leaf
+    column: str
+    entity: str
+    title: str
+
+    def declare(self, place: Place) -> None:
+        import rerun as rr
+
+        height, width, channels = self.leaf.shape
+        model = {1: rr.ColorModel.L, 3: rr.ColorModel.RGB, 4: rr.ColorModel.RGBA}[channels]
+        form = rr.components.ImageFormat(width, height, color_model=model, channel_datatype="U8")
+        nearest = rr.components.MagnificationFilter.Nearest
+        image = rr.Image.from_fields(format=form, magnification_filter=nearest)
+        place.stream.log(place.root + self.entity, image, static=True)
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        import rerun as rr
+
+        values = np.ascontiguousarray(flat_values(self.leaf, self.column, block))
+        send_blobs(place.stream, place.root + self.entity, times, rr.Image.descriptor_buffer(), values)
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        return _side_by_side(self.title, [root + self.entity for root in roots])
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A leaf of two or three dimensions: a tensor a step."""
+
+    leaf: Leaf
+    column: str
+    entity: str
+    title: str
+
+    def declare(self, place: Place) -> None:
+        """Nothing: tensors say all themselves."""
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        values = self.leaf.get(getattr(block.columns, self.column))
+        kind = np.uint8 if values.dtype == np.uint8 else np.float32
+        send_tensors(
+            place.stream,
+            place.root + self.entity,
+            times,
+            list(values.astype(kind, copy=False)),
+            _AXES[values.ndim],
+        )
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        return _tensors(self.title, [root + self.entity for root in roots])
+
+
+_AXES = {3: ("row", "column"), 4: ("[0]", "[1]", "[2]")}
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """Many dimensions of a leaf over the steps of an episode: one picture an episode, at its first step.
+
+    low, high: the range of each dimension, which its colours span.
+    """
+
+    leaf: Leaf
+    column: str
+    entity: str
+    title: str
+    low: Array
+    high: Array
+
+    def declare(self, place: Place) -> None:
+        """Nothing: tensors say all themselves."""
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        values = flat_values(self.leaf, self.column, block).astype(np.float32)
+        span = np.where(self.high > self.low, self.high - self.low, 1.0).astype(np.float32)
+        with np.errstate(invalid="ignore", over="ignore"):
+            scaled = np.clip((values - self.low.astype(np.float32)) / span, 0.0, 1.0)
+        maps = [_pooled(scaled[piece.begin : piece.end].T) for piece in block.pieces]
+        at = times.at(np.array([piece.begin for piece in block.pieces]))
+        send_tensors(place.stream, place.root + self.entity, at, maps, ("dimension", "step"))
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        return _tensors(self.title, [root + self.entity for root in roots])
+
+
+def _pooled(values: Array) -> Array:
+    """Means of neighbours, so that no side is longer than a heat map can be."""
+    for axis, most in enumerate((_MOST_ROWS, _MOST_COLUMNS)):
+        length = values.shape[axis]
+        if length > most:
+            edges = np.linspace(0, length, most + 1).astype(int)
+            sums = np.add.reduceat(values, edges[:-1], axis=axis)
+            values = sums / np.expand_dims(np.diff(edges), 1 - axis)
+    return np.ascontiguousarray(values, np.float32)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The frames of a camera, as they were encoded."""
+
+    name: str
+    entity: str
+    title: str
+
+    def declare(self, place: Place) -> None:
+        """Nothing: frames say all themselves."""
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        import pyarrow as pa
+        import rerun as rr
+
+        for piece in block.pieces:
+            frames = block.recording.frames(piece.position, self.name)
+            steps = frames.steps
+            chosen = np.flatnonzero((steps >= piece.step) & (steps < piece.step + piece.end - piece.begin))
+            for few in np.array_split(chosen, -(-len(chosen) // _FRAMES_AT_ONCE)) if len(chosen) else ():
+                encoded = [frames.encoded(int(i)) for i in few]
+                at = times.at(steps[few] - piece.step + piece.begin)
+                ends = np.cumsum([0, *(len(frame.data) for frame in encoded)])
+                blobs = blob_array(np.frombuffer(b"".join(frame.data for frame in encoded), np.uint8), ends)
+                kinds = pa.array([f"image/{frame.form}" for frame in encoded], pa.utf8())
+                columns = [
+                    column_of(rr.EncodedImage.descriptor_blob(), blobs),
+                    column_of(rr.EncodedImage.descriptor_media_type(), kinds),
+                ]
+                place.stream.send_columns(place.root + self.entity, at.columns, columns)
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        return _side_by_side(self.title, [root + self.entity for root in roots])
+
+
+_FRAMES_AT_ONCE = 64
+
+
+def _side_by_side(title: str, entities: Sequence[str]) -> Any:
+    import rerun.blueprint as rrb
+
+    views = [rrb.Spatial2DView(name=title, origin=entity) for entity in entities]
+    return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)
+
+
+def _tensors(title: str, entities: Sequence[str]) -> Any:
+    import rerun.blueprint as rrb
+
+    colors = rrb.TensorScalarMapping(colormap="viridis", mag_filter="nearest")
+    views = [
+        rrb.TensorView(name=title, origin=entity, scalar_mapping=colors, view_fit="fill")
+        for entity in entities
+    ]
+    return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)

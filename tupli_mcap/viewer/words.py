@@ -1,0 +1,182 @@
+"""Panels of what is read: texts, values of variable size, states of few values, and infos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.recording import Recording
+from tupli_mcap.viewer.blocks import Block
+from tupli_mcap.viewer.names import escaped
+from tupli_mcap.viewer.panels import PALETTE, Place, plot
+from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
+
+__all__ = ["Infos", "Lanes", "Words", "infos_of"]
+
+_LONGEST = 2000  # characters of a text that is shown
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """A Discrete leaf as a lane of states, each value with its label and colour."""
+
+    leaf: Leaf
+    column: str
+    entity: str
+    title: str
+    labels: Sequence[str]  # of the values from `start` on
+
+    def declare(self, place: Place) -> None:
+        import rerun as rr
+
+        colors = np.resize(np.array(PALETTE, np.uint32), len(self.labels))
+        style = rr.StateConfiguration(values=list(self.labels), labels=list(self.labels), colors=colors)
+        place.stream.log(place.root + self.entity, style, static=True)
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        import pyarrow as pa
+        import rerun as rr
+
+        values = self.leaf.get(getattr(block.columns, self.column)).astype(np.int64)
+        changed = np.ones(len(values), np.bool_)
+        changed[1:] = values[1:] != values[:-1]
+        changed[[piece.begin for piece in block.pieces]] = True
+        rows = np.flatnonzero(changed)
+        which = values[rows] - int(self.leaf.space.start)  # type: ignore[attr-defined]
+        known = (which >= 0) & (which < len(self.labels))
+        texts = pa.array([*self.labels, None], pa.utf8()).take(
+            pa.array(np.where(known, which, len(self.labels)))
+        )
+        send_texts(
+            place.stream, place.root + self.entity, times.at(rows), rr.StateChange.descriptor_state(), texts
+        )
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        import rerun.blueprint as rrb
+
+        return rrb.StateTimelineView(
+            name=self.title,
+            origin="/",
+            contents=[root + self.entity for root in roots],
+            time_view=axis,
+        )
+
+
+@dataclass(frozen=True)
+class Words:
+    """A leaf of variable size: a text as it is, anything else as Python would print it."""
+
+    leaf: Leaf
+    column: str
+    entity: str
+    title: str
+
+    def declare(self, place: Place) -> None:
+        """Nothing: texts say all themselves."""
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        import rerun as rr
+
+        values = self.leaf.get(getattr(block.columns, self.column))
+        texts = [_shown(value) for value in values]
+        entity = place.root + self.entity
+        send_texts(place.stream, entity, times, rr.TextDocument.descriptor_text(), texts)
+        send_texts(place.stream, entity, times, rr.TextLog.descriptor_text(), texts)
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        return _texts(self.title, [root + self.entity for root in roots])
+
+
+def _texts(title: str, entities: Sequence[str]) -> Any:
+    """The text of the moment for each entity, and all of them in a log."""
+    import rerun.blueprint as rrb
+
+    moments = [rrb.TextDocumentView(name=title, origin=entity) for entity in entities]
+    log = rrb.TextLogView(name=f"{title}: log", origin="/", contents=list(entities))
+    return rrb.Tabs(*moments, log, name=title)
+
+
+def _shown(value: Any) -> str:
+    text = value if isinstance(value, str) else repr(value)
+    text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]} … ({len(text):,} characters)"
+    return text.encode("utf-8", "replace").decode()
+
+
+@dataclass(frozen=True)
+class Infos:
+    """Infos of steps: a series for each number, a log for each text."""
+
+    numbers: Mapping[str, str]  # key -> entity
+    texts: Mapping[str, str]
+    title: str = "infos"
+
+    def declare(self, place: Place) -> None:
+        import rerun as rr
+
+        for i, (key, entity) in enumerate(self.numbers.items()):
+            lines = rr.SeriesLines(names=[place.told(key, alone=False)], colors=place.colors(1, i))
+            place.stream.log(place.root + entity, lines, static=True)
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        import rerun as rr
+
+        found: dict[str, list[tuple[int, Any]]] = {key: [] for key in (*self.numbers, *self.texts)}
+        for piece in block.pieces:
+            infos = block.recording.infos(piece.position) or []
+            for row, info in enumerate(infos[piece.step : piece.step + piece.end - piece.begin], piece.begin):
+                for key, value in (info or {}).items():
+                    if key in found and (isinstance(value, str) if key in self.texts else _is_number(value)):
+                        found[key].append((row, value))
+        for key, pairs in found.items():
+            if not pairs:
+                continue
+            at = times.at(np.array([row for row, _ in pairs]))
+            if key in self.numbers:
+                values = np.array([float(np.asarray(value).reshape(())) for _, value in pairs])
+                send_scalars(place.stream, place.root + self.numbers[key], at, values[:, None])
+            else:
+                texts = [_shown(value) for _, value in pairs]
+                send_texts(
+                    place.stream, place.root + self.texts[key], at, rr.TextLog.descriptor_text(), texts
+                )
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        import rerun.blueprint as rrb
+
+        views = []
+        if self.numbers:
+            views.append(
+                plot(self.title, [root + entity for root in roots for entity in self.numbers.values()], axis)
+            )
+        if self.texts:
+            entities = [root + entity for root in roots for entity in self.texts.values()]
+            views.append(rrb.TextLogView(name=f"{self.title}: texts", origin="/", contents=entities))
+        return views[0] if len(views) == 1 else rrb.Tabs(*views, name=self.title)
+
+
+def infos_of(recording: Recording, positions: Sequence[int], most: int) -> tuple[Infos | None, list[str]]:
+    """The panel of the infos that the given episodes have, and what of them is not shown."""
+    kinds: dict[str, str] = {}
+    for position in positions:
+        for info in recording.infos(position) or ():
+            for key, value in (info or {}).items():
+                kind = "text" if isinstance(value, str) else "number" if _is_number(value) else "other"
+                kinds[key] = kind if kinds.get(key, kind) == kind else "other"
+    numbers = [key for key, kind in kinds.items() if kind == "number"]
+    texts = [key for key, kind in kinds.items() if kind == "text"]
+    left = numbers[most:] + texts[most:] + [key for key, kind in kinds.items() if kind == "other"]
+    unseen = [f"info {key!r:.60}" for key in left]
+    if not numbers and not texts:
+        return None, unseen
+    entities = {key: f"/info/{escaped(key)}" for key in (*numbers[:most], *texts[:most])}
+    return Infos({k: entities[k] for k in numbers[:most]}, {k: entities[k] for k in texts[:most]}), unseen
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, bool | int | float | np.bool_ | np.number):
+        return not isinstance(value, int) or abs(value) < 2**1000
+    return isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "biuf"
