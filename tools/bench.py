@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from benchmarks import catalog, reading, recording
+from benchmarks import catalog, reading, recording, watching
 from benchmarks.measure import Line, Run
 from rich.console import Console
 from rich.markup import escape
@@ -24,6 +24,7 @@ CASES: dict[str, Callable[[Run], Iterator[Line]]] = {
     "record-cartpole": recording.record_cartpole,
     "record-floats": recording.record_floats,
     "record-vector": recording.record_vector,
+    "live": watching.live,
     "size": recording.file_size,
     "read": reading.read_cartpole,
     "window": reading.window,

@@ -146,7 +146,8 @@ class TableEnv(gym.Env[Any, Any]):
 
     def __init__(self, table: Callable[[], NDArray[Any]], action_space: gym.Space[Any], length: int) -> None:
         states = table()
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, states.shape[1:], states.dtype.type)
+        low, high = (0, 255) if states.dtype == np.uint8 else (-np.inf, np.inf)
+        self.observation_space = gym.spaces.Box(low, high, states.shape[1:], states.dtype.type)
         self.action_space = action_space
         self._table = table
         self._rows = itertools.cycle(list(states)).__next__
@@ -236,6 +237,23 @@ def floats(length: int = 1000) -> Workload:
     actions = list(np.random.default_rng(SEED).uniform(-1, 1, (TABLE_ROWS, 6)).astype(np.float32))
     space = gym.spaces.Box(-1, 1, (6,), np.float32)
     return Workload("floats", lambda: TableEnv(walk17, space, length), actions)
+
+
+@functools.cache
+def screen_frames() -> NDArray[np.uint8]:
+    """Screens of 210 x 160 x 3: blocks that move before a still background, about as compressible as an arcade game."""
+    rng = np.random.default_rng(SEED)
+    frames = np.repeat(rng.integers(0, 256, (1, 21, 16, 3), np.uint8), 64, axis=0).repeat(10, 1).repeat(10, 2)
+    for i, frame in enumerate(frames):
+        for top, left in ((i, 2 * i), (150 - i, i), (100, 3 * i % 140)):
+            frame[top : top + 12, left : left + 12] = 255
+    return frames
+
+
+def screens(length: int = 1000) -> Workload:
+    """An image of 210 x 160 x 3 as observation, from a table."""
+    actions = list(np.random.default_rng(SEED).integers(0, 6, TABLE_ROWS))
+    return Workload("screens", lambda: TableEnv(screen_frames, gym.spaces.Discrete(6), length), actions)
 
 
 def small(length: int) -> Workload:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.contents import RECORDING_METADATA
@@ -23,9 +24,20 @@ from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.rows import even_rows
 from tupli_mcap.recording.signed import SIGNATURE_NAME, stays_signed
 
-__all__ = ["rewrite_recording"]
+__all__ = ["Follower", "rewrite_recording"]
 
 _CHUNK = 256 * 1024
+_FOLLOWS = "follows"  # in the metadata of a companion channel: the topic it was made from
+
+
+class Follower(NamedTuple):
+    """A companion channel: `make` gives it a message for each step of the channel `follows`, in the same row."""
+
+    topic: str
+    schema: str
+    text: str
+    follows: str
+    make: Callable[[int, Rows], Rows]
 
 
 def rewrite_recording(
@@ -36,6 +48,7 @@ def rewrite_recording(
     attachments: Mapping[str, tuple[str, bytes]] | None = None,
     benchmark_id: str | None = None,
     compression: str = "zstd",
+    followers: Sequence[Follower] = (),
 ) -> None:
     """Writes `target` (replaced in one rename) from `source`.
 
@@ -43,6 +56,7 @@ def rewrite_recording(
         episodes: numbers of the episodes to keep (all by default).
         attachments: name -> (media type, bytes), added to the source's or replacing them.
         benchmark_id: replaces the source's.
+        followers: companion channels to make. Those of the source are left out: they can be made again.
 
     A signature stays if nothing it covers is changed, and is left out otherwise.
 
@@ -53,7 +67,7 @@ def rewrite_recording(
     target = Path(target)
     with replacing(target) as (fd, _):
         _Rewriter(source, Container(fd, str(target), compression)).run(
-            episodes, attachments or {}, benchmark_id
+            episodes, attachments or {}, benchmark_id, followers
         )
 
 
@@ -65,12 +79,14 @@ class _Rewriter:
         self._store = source._store
         self._topics = source._topics
         self._index = IndexBuilder()
+        self._followers: dict[int, list[tuple[int, Follower]]] = {}  # by step channel
 
     def run(
         self,
         numbers: Sequence[int] | None,
         attachments: Mapping[str, tuple[str, bytes]],
         benchmark_id: str | None,
+        followers: Sequence[Follower] = (),
     ) -> None:
         container, source = self._container, self._source
         metadata = {key: value for key, value in source.metadata.items() if key != "journal"}
@@ -89,9 +105,7 @@ class _Rewriter:
             container.add_attachment(name, info.media_type, source.read_attachment(name), now)
         for name, (media_type, data) in attachments.items():
             container.add_attachment(name, media_type, data, now)
-        container.schemas = dict(self._contents.schemas)
-        container.channels = dict(self._contents.channels)
-        container.counts = dict.fromkeys(container.channels, 0)
+        self._define(followers)
         rows = source.index
         if numbers is not None:
             rows = rows[np.isin(rows["episode"], np.asarray(list(numbers), dtype=np.int64))]
@@ -100,6 +114,36 @@ class _Rewriter:
             self._steps(rows)
         container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, self._index.encode(container.chunk_rows), now)
         container.finish()
+
+    def _define(self, followers: Sequence[Follower]) -> None:
+        """The source's channels, and those of the followers after them."""
+        container, contents = self._container, self._contents
+        own = {i: c for i, c in contents.channels.items() if _FOLLOWS not in c.metadata}
+        if sorted(own) != list(range(1, len(own) + 1)):  # somebody else's channels are in between
+            own = dict(contents.channels)
+        used = {channel.schema_id for channel in own.values()}
+        schemas = {i: schema for i, schema in contents.schemas.items() if i in used}
+        whole = sorted(schemas) == list(range(1, len(schemas) + 1))
+        container.schemas = schemas if whole else dict(contents.schemas)
+        container.channels = own
+        taken = {channel.topic for channel in own.values()} & {follower.topic for follower in followers}
+        if taken:
+            raise RecordingError(
+                f"{self._source.name} has channels of its own named {', '.join(sorted(taken))}"
+            )
+        container.counts = dict.fromkeys(own, 0)
+        known: dict[str, int] = {}
+        for follower in followers:
+            if follower.schema not in known:
+                known[follower.schema] = container.add_schema(follower.schema, follower.text)
+            about = {_FOLLOWS: follower.follows}
+            number = container.add_channel(follower.topic, known[follower.schema], about)
+            self._followers.setdefault(self._topics[follower.follows], []).append((number, follower))
+
+    def _add_chunk(self, rows: Rows) -> None:
+        self._container.add_chunk(rows)
+        for number, follower in self._followers.get(rows.channel, []):
+            self._container.add_chunk(follower.make(number, rows))
 
     def _steps(self, rows: Any) -> None:
         layout = self._source.layout
@@ -147,7 +191,7 @@ class _Rewriter:
         )  # concatenating arrays would drop their padding
         rows = np.frombuffer(data, batch[0].dtype)
         rows["#sequence"] = first + np.arange(len(rows))
-        self._container.add_chunk(even_rows(channel, first, data, rows))
+        self._add_chunk(even_rows(channel, first, data, rows))
         return len(rows)
 
     def _messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
@@ -168,12 +212,15 @@ class _Rewriter:
 
     def _emit(self, groups: list[Rows]) -> None:
         for rows in groups:
-            self._container.add_chunk(rows)
+            self._add_chunk(rows)
 
     def _events(self, rows: Any, firsts: Any) -> None:
         starts: list[tuple[int, bytes]] = []
         ends: list[tuple[int, bytes]] = []
         finals: list[tuple[int, bytes]] = []
+        # ends keep their order, which is not that of the episodes in a vector environment
+        end_places = _places(rows["end_row"])
+        final_places = _places(rows["final_row"][rows["final_row"] >= 0])
         positions = {int(number): i for i, number in enumerate(self._source.index["episode"])}
         for row, first in zip(rows, firsts, strict=True):
             last = int(row["start_row"])
@@ -185,7 +232,7 @@ class _Rewriter:
             end = EpisodeEnd.decode(memoryview(body))._replace(first_row=int(first))
             final = -1
             if row["final_row"] >= 0:
-                final = len(finals)
+                final = final_places[len(finals)]
                 finals += self._messages(self._topics["/final_state"], int(row["final_row"]), 1)
             seed = int(row["seed"]) if row["has_seed"] else None
             self._index.add(
@@ -197,7 +244,7 @@ class _Rewriter:
                     int(row["end_time"]),
                     seed,
                     len(starts) - 1,
-                    len(ends),
+                    end_places[len(ends)],
                     final,
                     end.episode,
                     end.env,
@@ -206,6 +253,8 @@ class _Rewriter:
                 end.metadata,
             )
             ends.append((end_time, end.encode()))
+        ends = _in_order(ends, end_places)
+        finals = _in_order(finals, final_places)
         for topic, messages in (("/episode_start", starts), ("/episode_end", ends), ("/final_state", finals)):
             self._write(self._topics[topic], iter(_in_time(messages)))
 
@@ -229,6 +278,18 @@ class _Rewriter:
         channel = self._topics["/info"]
         everything = self._messages(channel, 0, self._store.count(channel))
         self._write(channel, (m for m in everything if int.from_bytes(m[1][:4], "little") in numbers))
+
+
+def _places(rows: Any) -> list[int]:
+    """Where each of some rows comes once the others are gone."""
+    places = np.empty(len(rows), np.int64)
+    places[np.argsort(rows, kind="stable")] = np.arange(len(rows))
+    found: list[int] = places.tolist()
+    return found
+
+
+def _in_order(messages: list[tuple[int, bytes]], places: Sequence[int]) -> list[tuple[int, bytes]]:
+    return [messages[i] for i in np.argsort(places, kind="stable").tolist()]
 
 
 def _in_time(messages: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:

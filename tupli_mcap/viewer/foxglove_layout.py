@@ -1,0 +1,113 @@
+"""A layout for Foxglove: plots, images and state transitions on the topics of a recording."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.messages.labels import Labels
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.recording import Recording
+from tupli_mcap.viewer.companions import WIDEST, companion_topics
+from tupli_mcap.viewer.names import dimension_names
+
+__all__ = ["foxglove_layout", "write_layout"]
+
+_MOST_LINES = 12  # in a plot
+_PLOT = {
+    "isSynced": True,
+    "legendDisplay": "floating",
+    "showLegend": True,
+    "showPlotValuesInLegend": False,
+    "showXAxisLabels": True,
+    "showYAxisLabels": True,
+    "sidebarDimension": 240,
+    "xAxisVal": "timestamp",
+}
+
+
+def write_layout(recording: Recording, target: str | os.PathLike[str]) -> Path:
+    """Writes the layout of a recording as JSON, which Foxglove imports ("Import from file" in its layouts)."""
+    path = Path(target)
+    path.write_text(
+        json.dumps(foxglove_layout(recording), indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
+    return path
+
+
+def foxglove_layout(recording: Recording) -> dict[str, Any]:
+    """States and actions on the left, pictures, reward and ends on the right; of the first sub-environment."""
+    top = "/env_0" if recording.is_vector else ""
+    layout, labels = recording.layout, recording.labels
+    panels: dict[str, dict[str, Any]] = {}
+    left: list[str] = []
+    right: list[str] = []
+
+    def add(side: list[str], kind: str, name: str, config: Mapping[str, Any]) -> None:
+        number = f"{kind}!{name}"
+        panels[number] = {**config, "foxglovePanelTitle": name}
+        side.append(number)
+
+    topics = companion_topics(layout, top)
+    for leaf in [*layout.state, *layout.action]:
+        paths = _paths(leaf, top, labels, layout.dtypes.get(leaf.name), topics)
+        if leaf.kind == "image":
+            add(right, "Image", leaf.path, {"imageMode": {"imageTopic": f"{top}/image/{leaf.name}"}})
+        elif type(leaf.space) is spaces.Discrete:
+            add(left, "StateTransitions", leaf.path, {"isSynced": True, "paths": paths})
+        elif type(leaf.space) is spaces.Text:
+            add(right, "RawMessages", leaf.path, {"topicPath": f"{topics[leaf.name]}.data"})
+        elif paths:
+            add(left, "Plot", leaf.path, {**_PLOT, "paths": paths})
+    for camera in recording.cameras:
+        add(right, "Image", f"camera {camera}", {"imageMode": {"imageTopic": f"{top}/camera/{camera}"}})
+    rewards = [
+        p for leaf in layout.reward for p in _paths(leaf, top, labels, layout.dtypes.get(leaf.name), topics)
+    ]
+    add(right, "Plot", "return", {**_PLOT, "paths": [_path(f"{top}/plot/return.data[0]", "return")]})
+    add(right, "Plot", "reward", {**_PLOT, "paths": rewards})
+    add(right, "RawMessages", "last end of an episode", {"topicPath": "/episode_end"})
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": _split("row", _stack(left), _stack(right), 60),
+    }
+
+
+def _paths(
+    leaf: Leaf, top: str, labels: Labels, dtype: np.dtype[Any] | None, topics: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """A message path for each dimension; none of a leaf that is no number, or too wide to be plotted."""
+    if dtype is None or leaf.kind == "image" or not 0 < leaf.size <= WIDEST:
+        return []
+    names = dimension_names(leaf, labels.dimensions.get(leaf.path))
+    # a float16 is stored as its bits, which are no number to plot
+    place = f"{topics[leaf.name]}.data" if dtype == np.float16 else f"{top}/step.{leaf.name}"
+    if leaf.shape == () and dtype != np.float16:
+        return [_path(place, names[0])]
+    return [_path(f"{place}[{i}]", name) for i, name in enumerate(names[:_MOST_LINES])]
+
+
+def _path(value: str, label: str) -> dict[str, Any]:
+    return {"value": value, "label": label, "enabled": True, "timestampMethod": "receiveTime"}
+
+
+def _stack(panels: Sequence[str]) -> Any:
+    """Panels below each other, of equal heights."""
+    if len(panels) <= 1:
+        return panels[0] if panels else None
+    return _split("column", panels[0], _stack(panels[1:]), 100 / len(panels))
+
+
+def _split(direction: str, first: Any, second: Any, percentage: float) -> Any:
+    if first is None or second is None:
+        return first or second
+    return {"direction": direction, "first": first, "second": second, "splitPercentage": percentage}
