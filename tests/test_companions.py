@@ -18,8 +18,10 @@ from gymnasium import spaces
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from test_golden import NAMES, as_read, assert_same, expected, place
+from typer.testing import CliRunner
 
 from tupli_mcap import RecordEpisodes, Recording, RecordingError
+from tupli_mcap.cli.app import app
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.verify import verify_recording
@@ -238,3 +240,36 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
             write_companions(recording, tmp_path / "out.mcap")
         write_companions(recording, tmp_path / "out.mcap", force=True)
     assert clean(tmp_path / "out.mcap")
+
+
+def test_the_command_writes_a_copy_and_a_layout(tmp_path: Path) -> None:
+    source = record(tmp_path / "r.mcap", SPACE)
+    runner = CliRunner()
+    done = runner.invoke(app, ["replay", str(source), "-e", "best", "--to-mcap", str(tmp_path / "out.mcap")])
+    assert done.exit_code == 0, done.output
+    assert "open it with: rerun" in done.output
+    with Recording(tmp_path / "out.mcap") as copy, Recording(source) as recording:
+        best = max(recording.episodes, key=lambda e: e.return_)
+        assert [e.number for e in copy.episodes] == [best.number]
+    layout = json.loads((tmp_path / "out.foxglove-layout.json").read_text(encoding="utf-8"))
+    assert layout["layout"]["direction"] == "row"
+    again = ["replay", str(source), "--to-mcap", str(tmp_path / "new.mcap"), "--layout"]
+    done = runner.invoke(app, [*again, str(tmp_path / "out.foxglove-layout.json")])
+    assert done.exit_code == 1 and not (tmp_path / "new.mcap").exists()
+    done = runner.invoke(app, [*again, str(tmp_path / "other.json")])
+    assert done.exit_code == 0 and (tmp_path / "other.json").exists()
+    done = runner.invoke(app, ["replay", str(source), "--layout", "x.json"])
+    assert done.exit_code == 2
+    both = [str(source), str(tmp_path / "new.mcap")]
+    done = runner.invoke(app, ["replay", *both, "--to-mcap", str(tmp_path / "no.mcap")])
+    assert done.exit_code == 1 and not (tmp_path / "no.mcap").exists()
+
+
+@pytest.mark.filterwarnings("ignore:.*is declared float32:UserWarning")
+def test_rewriting_a_vector_recording_keeps_the_order_of_ends(tmp_path: Path) -> None:
+    """Episodes of sub-environments end in another order than they begin in."""
+    for name in NAMES:
+        if name.startswith("vector"):
+            with Recording(place(name, tmp_path)) as recording:
+                rewrite_recording(recording, tmp_path / f"{name}-new.mcap")
+            assert clean(tmp_path / f"{name}-new.mcap")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -52,6 +52,22 @@ def _replay(
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
+    to_mcap: Annotated[
+        Path | None,
+        typer.Option(
+            "--to-mcap",
+            metavar="FILE.mcap",
+            help="Write a copy that Rerun and Foxglove plot as it is instead.",
+        ),
+    ] = None,
+    layout: Annotated[
+        Path | None,
+        typer.Option(
+            "--layout",
+            metavar="FILE.json",
+            help="Where --to-mcap puts the layout for Foxglove; beside the copy.",
+        ),
+    ] = None,
 ) -> None:
     """Look at recordings in the Rerun viewer.
 
@@ -60,6 +76,15 @@ def _replay(
     """
     from tupli_mcap import viewer
 
+    if to_mcap is not None:
+        if compare or split or web or save is not None or connect is not None:
+            raise typer.BadParameter(
+                "--to-mcap writes a recording, and goes with --episode, --filter and --layout"
+            )
+        _copy(sources, to_mcap, episode, filter_of(filter_text), layout, force=force)
+        return
+    if layout is not None:
+        raise typer.BadParameter("--layout goes with --to-mcap")
     if compare and split:
         raise typer.BadParameter("--compare overlays episodes, --split shows them apart; give one of them")
     form: viewer.Form = "compare" if compare else "split" if split else "joined"
@@ -81,3 +106,14 @@ def _replay(
 
 def _tell(url: str) -> None:
     print(f"{url}\nopen it in a browser; Ctrl-C ends it", flush=True)
+
+
+def _copy(
+    sources: list[str], target: Path, episode: str | None, wanted: Any, layout: Path | None, *, force: bool
+) -> None:
+    from tupli_mcap.viewer.copies import to_mcap
+
+    made = to_mcap(sources, target, episode, filter=wanted, layout=layout, force=force)
+    size = bytes_of(made.recording.stat().st_size)
+    print(f"{made.recording}: {size}; open it with: rerun {shlex.quote(str(made.recording))}")
+    print(f"{made.layout}: for Foxglove: open the copy, then import this as a layout")
