@@ -34,6 +34,8 @@ from tupli_mcap import (
     TupliDataset,
     TupliEnvWrapper,
     TupliError,
+    plots,
+    viewer,
 )
 from tupli_mcap.cli import app
 from tupli_mcap.doctor import examine
@@ -173,6 +175,8 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
         lambda: _with(path, lambda r: tupli_mcap.rewrite_recording(r, work / f"rewritten_{name}")),
     )
     yield "import", lambda: _import(path, work / "lab")
+    yield "view", lambda: viewer.save(path, work / f"{name}.rrd", force=True)
+    yield "plot", lambda: plots.report(path)
     for command in ("info", "ls", "episodes", "verify", "doctor"):
         yield f"tupli-mcap {command}", _cli(command, str(path))
     yield "tupli-mcap info --json", _cli("info", str(path), "--json")
