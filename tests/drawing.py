@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -42,3 +43,22 @@ class Drawing(gym.Env[Any, Any]):
 
     def render(self) -> Any:
         return drawn(self.state)
+
+
+class Drifting(Drawing):
+    """A walk that goes another way from step `DRIFT` (of the process's environment) on."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        state, reward, terminal, timeout, info = super().step(action)
+        if "DRIFT" in os.environ and self.steps > int(os.environ["DRIFT"]):
+            self.state = state = self.state + 1e-12
+        return state.copy(), reward, terminal, timeout, info
+
+
+class Blank(Drawing):
+    """Takes no `render_mode`, as it draws nothing."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    def __init__(self) -> None:
+        super().__init__(render_mode=None)

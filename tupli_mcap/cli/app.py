@@ -16,7 +16,17 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from tupli_mcap.cli import doctor, plotting, recordings, repair, sharing, storages, trusting, viewing
+from tupli_mcap.cli import (
+    doctor,
+    plotting,
+    recordings,
+    rendering,
+    repair,
+    sharing,
+    storages,
+    trusting,
+    viewing,
+)
 from tupli_mcap.cli.output import warnings_in_one_line
 from tupli_mcap.errors import FilterError, TupliError
 
@@ -132,6 +142,7 @@ sharing.register(app)
 trusting.register(app)
 repair.register(app)
 viewing.register(app)
+rendering.register(app)
 
 
 def main() -> None:

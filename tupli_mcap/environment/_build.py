@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import platform
 import re
@@ -23,14 +24,17 @@ __all__ = ["build", "foreign_arguments", "foreign_code", "make_from_spec", "reas
 _PLAIN_WORD = re.compile(r"[A-Za-z0-9_ +=,;()\[\]<>#-]{0,256}\Z")
 
 
-def build(record: EnvironmentRecord, *, trust: bool = False) -> gym.Env[Any, Any]:
+def build(
+    record: EnvironmentRecord, *, trust: bool = False, render_mode: str | None = None
+) -> gym.Env[Any, Any]:
     """Rebuild an environment.
 
     A spec is built when its id is registered on this machine (with the entry points the file names) and its
     wrappers are gymnasium's own or come from the environment's own package, already imported. Everything
     else, the pickled environment above all, is code from a file: it runs only if this user made or trusted
     it (`tupli_mcap.trust`) or `trust=True` is given. Arguments in a spec are data for code installed here, unless
-    one of them may name a file or more code (`foreign_arguments`).
+    one of them may name a file or more code (`foreign_arguments`). `render_mode` replaces the record's; a pickled
+    environment that has no such mode keeps its own.
 
     Raises:
         UntrustedError: Code would run that nobody here has trusted; nothing has been executed.
@@ -44,7 +48,7 @@ def build(record: EnvironmentRecord, *, trust: bool = False) -> gym.Env[Any, Any
             f"{record.digest}); reading its episodes needs no trust"
         )
     try:
-        env = _unpickle(record) if record.spec is None else make_from_spec(record.spec)
+        env = _unpickle(record) if record.spec is None else make_from_spec(record.spec, render_mode)
     except Exception as err:
         made_with = ", ".join(f"{name} {version}" for name, version in list(record.versions.items())[:20])
         raise TupliError(
@@ -56,17 +60,26 @@ def build(record: EnvironmentRecord, *, trust: bool = False) -> gym.Env[Any, Any
         raise TupliError(
             f"expected a gymnasium.Env in the record {record.name[:200]!r}, found {type(env).__name__}"
         )
+    if render_mode is not None and record.spec is None and render_mode in _render_modes(env):
+        with contextlib.suppress(AttributeError):  # where it cannot be set
+            env.unwrapped.render_mode = render_mode
     return env
 
 
-def make_from_spec(spec: Mapping[str, Any]) -> gym.Env[Any, Any]:
+def _render_modes(env: gym.Env[Any, Any]) -> list[Any]:
+    told = (env.metadata or {}).get("render_modes")
+    return list(told) if isinstance(told, list | tuple | set) else []
+
+
+def make_from_spec(spec: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
     """`gymnasium.make` of a spec given as JSON-able object; runs its entry points."""
     told = copy.deepcopy(dict(spec))
     known = gym.registry.get(told["id"])
     # Of no account to a single environment: this machine's own.
     told["vector_entry_point"] = None if known is None else known.vector_entry_point
     wrappers = tuple(WrapperSpec(**wrapper) for wrapper in told.pop("additional_wrappers", ()))
-    return gym.make(EnvSpec(**told, additional_wrappers=wrappers))
+    made = EnvSpec(**told, additional_wrappers=wrappers)
+    return gym.make(made) if render_mode is None else gym.make(made, render_mode=render_mode)
 
 
 def foreign_code(spec: Mapping[str, Any]) -> list[str]:

@@ -52,13 +52,14 @@ class RecordedBenchmark(NamedTuple):
     record: EnvironmentRecord
     signature: bytes | None = None
 
-    def make_env(self, *, trust: bool = False) -> gym.Env[Any, Any]:
-        """Rebuilds the environment.
+    def make_env(self, *, trust: bool = False, render_mode: str | None = None) -> gym.Env[Any, Any]:
+        """Rebuilds the environment, with another `render_mode` if one is given and it has that.
 
         Raises:
             UntrustedError: code from the file would run, and neither is it trusted here, nor the key that signed it.
         """
-        return build(self.record, trust=trust or (self.needs_trust and self.voucher is not None))
+        trust = trust or (self.needs_trust and self.voucher is not None)
+        return build(self.record, trust=trust, render_mode=render_mode)
 
     @property
     def needs_trust(self) -> bool:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.layout import BODY
+from tupli_mcap.recording.cameras import EncodedFrame, encode_frame, encode_pair
+from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
@@ -24,7 +27,7 @@ from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.rows import even_rows
 from tupli_mcap.recording.signed import SIGNATURE_NAME, stays_signed
 
-__all__ = ["Follower", "rewrite_recording"]
+__all__ = ["Follower", "NewFrames", "rewrite_recording"]
 
 _CHUNK = 256 * 1024
 _FOLLOWS = "follows"  # in the metadata of a companion channel: the topic it was made from
@@ -40,6 +43,16 @@ class Follower(NamedTuple):
     make: Callable[[int, Rows], Rows]
 
 
+class NewFrames(Protocol):
+    """Frames of some episodes, which take the place of those that a camera has of them."""
+
+    camera: str
+
+    def of(self, episode: int) -> Iterable[tuple[int, EncodedFrame]] | None:
+        """(step, frame) of an episode, in order; None: what the recording has of it stays."""
+        ...
+
+
 def rewrite_recording(
     source: Recording,
     target: str | os.PathLike[str],
@@ -49,6 +62,7 @@ def rewrite_recording(
     benchmark_id: str | None = None,
     compression: str = "zstd",
     followers: Sequence[Follower] = (),
+    frames: NewFrames | None = None,
 ) -> None:
     """Writes `target` (replaced in one rename) from `source`.
 
@@ -57,6 +71,7 @@ def rewrite_recording(
         attachments: name -> (media type, bytes), added to the source's or replacing them.
         benchmark_id: replaces the source's.
         followers: companion channels to make. Those of the source are left out: they can be made again.
+        frames: of a camera that may be a new one.
 
     A signature stays if nothing it covers is changed, and is left out otherwise.
 
@@ -66,13 +81,17 @@ def rewrite_recording(
     """
     target = Path(target)
     with replacing(target) as (fd, _):
-        _Rewriter(source, Container(fd, str(target), compression)).run(
+        _Rewriter(source, Container(fd, str(target), compression), frames).run(
             episodes, attachments or {}, benchmark_id, followers
         )
 
 
 class _Rewriter:
-    def __init__(self, source: Recording, container: Container) -> None:
+    def __init__(self, source: Recording, container: Container, frames: NewFrames | None) -> None:
+        self._new_frames = frames
+        self._held: dict[
+            int, int
+        ] = {}  # times must not decrease, whatever the clock did between two episodes
         self._source = source
         self._container = container
         self._contents = source._contents
@@ -98,7 +117,7 @@ class _Rewriter:
         container.add_metadata(RECORDING_METADATA, metadata)
         now = time.time_ns()
         kept = {name: info for name, info in source.attachments.items() if name not in attachments}
-        same = numbers is None and benchmark_id in (None, source.benchmark_id)
+        same = numbers is None and benchmark_id in (None, source.benchmark_id) and self._new_frames is None
         if not (same and stays_signed(source.attachments, attachments)):
             kept.pop(SIGNATURE_NAME, None)
         for name, info in kept.items():
@@ -109,6 +128,7 @@ class _Rewriter:
         rows = source.index
         if numbers is not None:
             rows = rows[np.isin(rows["episode"], np.asarray(list(numbers), dtype=np.int64))]
+        self._cameras = self._camera_channels() if source.num_envs else {}
         container.define_channels()
         if source.num_envs:
             self._steps(rows)
@@ -258,21 +278,44 @@ class _Rewriter:
         for topic, messages in (("/episode_start", starts), ("/episode_end", ends), ("/final_state", finals)):
             self._write(self._topics[topic], iter(_in_time(messages)))
 
+    def _camera_channels(self) -> dict[str, list[tuple[int, int]]]:
+        """By camera, then by sub-environment, the ids of its channels; those of a new camera are added."""
+        source, cameras = self._source, self._source._cameras
+        envs = range(source.num_envs)
+        found = {name: [cameras.channels(name, env) for env in envs] for name in cameras.names}
+        new = self._new_frames
+        if new is not None and new.camera not in found:
+            vector = source.num_envs if source.is_vector else None
+            where = (self._container, source.name, source.layout, vector, None, (new.camera,))
+            found[new.camera] = register_channels(*where).cameras
+        return found
+
     def _frames(self, rows: Any) -> None:
-        """The frames of episodes that stay, picture and what it shows row by row."""
-        cameras = self._source._cameras
-        for camera in cameras.names:
-            for env in range(self._source.num_envs):
-                pictures, pairs = cameras.channels(camera, env)
+        """The frames of episodes that stay: pictures, and what they show row by row."""
+        for camera, channels in self._cameras.items():
+            for env, (pictures, pairs) in enumerate(channels):
                 mine = rows[rows["env"] == env]
                 mine = mine[np.argsort(mine["first_row"], kind="stable")]
-                kept = [
-                    int(row)
-                    for episode in mine
-                    for row in cameras.rows(camera, env, int(episode["episode"]), int(episode["length"]))[0]
-                ]
                 for channel in (pictures, pairs):
-                    self._write(channel, (m for row in kept for m in self._messages(channel, row, 1)))
+                    found = (
+                        self._frames_of(camera, episode, channel, channel == pictures) for episode in mine
+                    )
+                    self._write(channel, itertools.chain.from_iterable(found))
+
+    def _frames_of(self, camera: str, row: Any, channel: int, pictures: bool) -> Iterator[tuple[int, bytes]]:
+        """(log_time, body) of the messages of an episode's frames."""
+        number = int(row["episode"])
+        new = self._new_frames
+        drawn = new.of(number) if new is not None and new.camera == camera else None
+        if drawn is not None:
+            for step, frame in drawn:
+                time_ns = self._held[channel] = max(frame.time_ns, self._held.get(channel, 0))
+                held = frame._replace(time_ns=time_ns)
+                yield time_ns, encode_frame(camera, held) if pictures else encode_pair(number, step)
+        elif camera in self._source.cameras:
+            places = self._source._cameras.rows(camera, int(row["env"]), number, int(row["length"]))[0]
+            for place in places.tolist():
+                yield from self._messages(channel, place, 1)
 
     def _infos(self, numbers: set[int]) -> None:
         channel = self._topics["/info"]

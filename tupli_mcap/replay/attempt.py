@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -16,7 +16,10 @@ from tupli_mcap.replay.plan import EpisodePlan
 from tupli_mcap.replay.reapply import EnvironmentFailedError, Moment, Replayer, recorded_actions
 from tupli_mcap.replay.values import Block, RecordedValues
 
-__all__ = ["Attempt", "attempt", "repeats_itself"]
+__all__ = ["Attempt", "Watch", "attempt", "repeats_itself"]
+
+Watch = Callable[[int], None]
+"""Called when the environment is in the state of a step, and that agrees; the last one is the final state."""
 
 _SAMPLE = 2000  # steps that are taken twice to see whether an environment repeats itself
 
@@ -53,9 +56,15 @@ class _Actions:
 
 
 def attempt(
-    recording: Recording, replayer: Replayer, plan: EpisodePlan, values: RecordedValues, checker: Checker
+    recording: Recording,
+    replayer: Replayer,
+    plan: EpisodePlan,
+    values: RecordedValues,
+    checker: Checker,
+    watch: Watch | None = None,
 ) -> Attempt:
-    """Takes an episode again and compares it, up to its end or the environment's."""
+    """Takes an episode again and compares it, up to its end or the environment's; with `watch`, up to the first
+    difference."""
     tally = Tally()
     actions = _Actions(recording, plain=replayer.plain)
     moments = replayer.moments(plan, actions)
@@ -66,6 +75,10 @@ def attempt(
             actions.bind(block)
             for step in range(block.start, block.stop):
                 checker.state(step, moment.state, tally)
+                if watch is not None:
+                    if tally.first is not None:
+                        return Attempt(tally)
+                    watch(step)
                 moment = next(moments)
                 if not checker.result(step, moment, tally) and step + 1 < values.length:
                     tally.ended = step  # stepping on would tell nothing
@@ -73,6 +86,8 @@ def attempt(
         final = values.final_state
         if final is not None:
             checker.final_state(values.length, final, moment.state, tally)
+            if watch is not None and tally.first is None:
+                watch(values.length)
     except EnvironmentFailedError as err:
         return Attempt(tally, err)
     return Attempt(tally)

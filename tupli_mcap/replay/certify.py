@@ -12,7 +12,7 @@ import gymnasium as gym
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.replay.attempt import Attempt, attempt, repeats_itself
+from tupli_mcap.replay.attempt import Attempt, Watch, attempt, repeats_itself
 from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, SkipKind, Skipped
 from tupli_mcap.replay.compare import Checker, Difference
 from tupli_mcap.replay.facts import content_digest, platform_facts, versions_of
@@ -20,7 +20,7 @@ from tupli_mcap.replay.plan import EpisodePlan, plan_episodes
 from tupli_mcap.replay.reapply import Replayer, brief
 from tupli_mcap.replay.values import RecordedValues, recorded_values
 
-__all__ = ["certify"]
+__all__ = ["Certifier", "certify"]
 
 _MAX_DIVERGENCES = 100
 _REASONS: dict[SkipKind, str] = {
@@ -59,11 +59,16 @@ def certify(
     if not isinstance(recording, Recording):
         with Recording(recording) as opened:
             return certify(opened, trust=trust, episodes=episodes, env=env, progress=progress)
-    certifier = _Certifier(recording, trust, _chosen(recording, episodes), env, progress)
+    certifier = Certifier(recording, trust, _chosen(recording, episodes), env, progress)
     return certifier.run()
 
 
-class _Certifier:
+class Certifier:
+    """Replays the chosen episodes, and what they depend on; `run` does it once.
+
+    What is to be done beside comparing is for a subclass: `_build`, `_watch` and `_stops` are its to replace.
+    """
+
     def __init__(
         self,
         recording: Recording,
@@ -84,25 +89,37 @@ class _Certifier:
         self._plain = False  # Python's numbers in actions
         self._settled = False  # which of the two it is
         self._deterministic: bool | None = None
+        self._stopped = False
 
     def run(self) -> Certificate:
+        """Replays and compares; the result."""
         captured = self._record is not None and self._record.pickle is not None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what the environment has to say, it said when it was recorded
             if self._chosen:
                 self._checker = Checker(self._recording.layout, casts=self._recording.is_vector)
                 for plans in plan_episodes(self._recording, captured=captured):
-                    self._sub_environment(plans)
+                    if not self._stopped:
+                        self._sub_environment(plans)
         return self._certificate()
 
     def _make(self) -> gym.Env[Any, Any]:
-        env = (
-            self._given if self._given is not None else self._recording.benchmark.make_env(trust=self._trust)
-        )
+        env = self._given if self._given is not None else self._build()
         if self._versions is None:
             _check_spaces(self._recording, env)
             self._versions = versions_of(env)
         return env
+
+    def _build(self) -> gym.Env[Any, Any]:
+        return self._recording.benchmark.make_env(trust=self._trust)
+
+    def _watch(self, plan: EpisodePlan, replayer: Replayer) -> Watch | None:
+        """Who watches the next attempt at an episode; it may not be the last one."""
+        return None
+
+    def _stops(self, plan: EpisodePlan, outcome: Divergence | SkipKind | None) -> bool:
+        """Whether nothing more is to be replayed after this outcome."""
+        return False
 
     def _replayer(self, *, plain: bool = False) -> Replayer:
         return Replayer(self._make, owned=self._given is None, plain=plain)
@@ -114,8 +131,9 @@ class _Certifier:
         needed = _needed(everything, self._chosen)
         self._replay(needed)
         if len(needed) < len(everything) and self._given is None:
-            outcomes = [self._outcomes[plan.position] for plan in needed if plan.number in self._chosen]
+            outcomes = [self._outcomes.get(plan.position) for plan in needed if plan.number in self._chosen]
             if any(isinstance(outcome, Divergence) for outcome in outcomes):
+                self._stopped = False
                 self._replay(everything)
 
     def _replay(self, plans: list[EpisodePlan]) -> None:
@@ -137,6 +155,9 @@ class _Certifier:
                 self._done += recorded.length
                 if self._progress is not None:
                     self._progress(self._done)
+                self._stopped = self._stops(plan, outcome)
+                if self._stopped:
+                    return
         finally:
             replayer.close()
 
@@ -154,7 +175,7 @@ class _Certifier:
         """The episode on the environment that took those before it, or else on a new one: a recording may have
         been continued in another process, and its policy may have given Python's numbers."""
         used = replayer.used
-        found = attempt(self._recording, replayer, plan, values, self._checker)
+        found = self._attempted(plan, values, replayer)
         if found.agrees:
             self._settled = True
         if found.agrees or not plan.starts_chain or self._given is not None:
@@ -163,13 +184,17 @@ class _Certifier:
         if not self._settled and any(leaf.is_scalar for leaf in self._recording.layout.action):
             others.append(self._replayer(plain=True))
         for other in others:
-            again = attempt(self._recording, other, plan, values, self._checker)
+            again = self._attempted(plan, values, other)
             if again.agrees:
                 replayer.close()
                 self._settled, self._plain = True, other.plain
                 return again, other
             other.close()
         return found, replayer
+
+    def _attempted(self, plan: EpisodePlan, values: RecordedValues, replayer: Replayer) -> Attempt:
+        watch = self._watch(plan, replayer)
+        return attempt(self._recording, replayer, plan, values, self._checker, watch)
 
     # ---- what is said of a difference
 

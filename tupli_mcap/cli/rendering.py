@@ -1,0 +1,125 @@
+"""The command that makes pictures of a recording that has none."""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tupli_mcap.cli.options import FilterText, Json, filter_of
+from tupli_mcap.cli.output import bytes_of, counted, number, print_json, step_progress
+
+if TYPE_CHECKING:
+    from tupli_mcap.replay import RenderReport
+
+__all__ = ["register"]
+
+
+class _Format(StrEnum):
+    png = "png"
+    jpeg = "jpeg"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the application."""
+    app.command("render")(_render)
+
+
+def _render(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or an URL.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")
+    ],
+    episodes: Annotated[
+        str, typer.Option(metavar="WHICH", help="Numbers such as 3,7, or best, worst, first, last, all.")
+    ] = "best",
+    filter_text: FilterText = None,
+    every: Annotated[int, typer.Option(min=1, help="A frame of every so many steps, and the last.")] = 1,
+    width: Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Of the frames (pixels).")] = None,
+    frame_format: Annotated[
+        _Format, typer.Option("--format", help="Of the frames in a .mcap: png is exact.")
+    ] = _Format.png,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Rebuild the environment even if that runs code from the file.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Render episodes that were recorded without pictures.
+
+    Rebuilds the environment, takes the episodes again, and compares every step with the recording, bit for
+    bit. The frames go into a copy of the recording (as /camera/render), into an MP4, or into a GIF.
+
+    Where the replay differs from the recording, rendering ends: the frames before that are written, the
+    difference is named, and the exit code is 1. So is it for an episode that cannot be replayed.
+    """
+    from tupli_mcap.dataset.choose import choose_episodes
+    from tupli_mcap.recording import Recording
+    from tupli_mcap.replay import render
+
+    os.environ.setdefault(
+        "SDL_VIDEODRIVER", "dummy"
+    )  # no window is opened, and pygame need not look for a screen
+    with Recording(file) as recording:
+        chosen = choose_episodes(recording, episodes, filter_of(filter_text))
+        with step_progress(sum(map(len, chosen)), "rendering") as progress:
+            report = render(
+                recording,
+                output,
+                episodes=chosen,
+                every=every,
+                width=width,
+                frame_format=frame_format.value,
+                trust=trust,
+                overwrite=force,
+                progress=progress,
+            )
+    if as_json:
+        print_json(_plain(report))
+    else:
+        _print(report)
+    if not report.ok:
+        raise typer.Exit(1)
+
+
+def _plain(report: RenderReport) -> dict[str, object]:
+    divergence = report.divergence
+    return {
+        **report._asdict(),
+        "path": None if report.path is None else str(report.path),
+        "episodes": [episode._asdict() for episode in report.episodes],
+        "divergence": None if divergence is None else divergence.model_dump(),
+        "skipped": [skipped.model_dump() for skipped in report.skipped],
+        "frames": report.frames,
+        "ok": report.ok,
+    }
+
+
+def _print(report: RenderReport) -> None:
+    if report.path is not None:
+        rendered = sum(1 for episode in report.episodes if episode.frames)
+        print(
+            f"{report.path}: {counted(report.frames, 'frame')} of {counted(rendered, 'episode')}, "
+            f"{report.width} x {report.height}, {report.fps:.4g} a second, "
+            f"{bytes_of(report.path.stat().st_size)} in {report.seconds:.1f} s"
+        )
+    if report.signature_left_out:
+        print("its signature is left out: it is of the recording without these frames")
+    for skipped in report.skipped:
+        print(
+            f"error: {counted(skipped.episodes, 'episode')} cannot be replayed, the first is {skipped.first}: "
+            f"{skipped.reason}",
+            file=sys.stderr,
+        )
+    if report.divergence is not None:
+        kept = (
+            "nothing was written"
+            if report.path is None
+            else f"the {number(report.frames)} before it are kept"
+        )
+        hint = f". {report.divergence.hint}" if report.divergence.hint else ""
+        print(f"error: {report.divergence}; no frames from there on, {kept}{hint}", file=sys.stderr)

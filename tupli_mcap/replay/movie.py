@@ -1,0 +1,95 @@
+"""Pictures as a film that everybody can play: MP4 by PyAV (extra `video`), GIF by Pillow (extra `frames`)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from fractions import Fraction
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import MissingExtraError, RecordingError
+from tupli_mcap.recording.pictures import Picture, resized
+
+__all__ = ["check_movie", "write_movie"]
+
+_GIF_FPS = 50  # browsers show faster ones at 10 frames a second
+_CODECS = ("libx264", "h264", "mpeg4")
+
+
+def check_movie(suffix: str) -> None:
+    """Raises MissingExtraError unless films of that kind can be written here."""
+    if suffix == ".mp4":
+        _av()
+
+
+def _av() -> Any:
+    try:
+        import av
+    except ImportError as err:
+        raise MissingExtraError("MP4 needs PyAV; install the extra: pip install 'tupli-mcap[video]'") from err
+    return av
+
+
+def write_movie(path: Path, kind: str, pictures: Iterator[Picture], count: int, fps: float) -> None:
+    """Writes `count` pictures as ".mp4" or ".gif"; all get the size of the first one.
+
+    Raises:
+        RecordingError: the file cannot be written.
+    """
+    first = next(pictures)
+    size = first.shape[1], first.shape[0]
+    rest = (resized(picture, *size) for picture in pictures)
+    if kind == ".mp4":
+        _write_mp4(path, first, rest, fps)
+    else:
+        _write_gif(path, first, rest, count, fps)
+
+
+def _write_mp4(path: Path, first: Picture, rest: Iterator[Picture], fps: float) -> None:
+    av = _av()
+    rate = Fraction(fps).limit_denominator(1000)
+    codec = next((name for name in _CODECS if name in av.codecs_available), "")
+    if not codec:
+        raise RecordingError(f"this PyAV has none of the codecs {', '.join(_CODECS)}; write a .gif instead")
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream(codec, rate=rate)
+        even = _even(first)
+        stream.height, stream.width = even.shape[:2]
+        stream.pix_fmt = "yuv420p"  # what every player and browser knows
+        if codec == "libx264":
+            stream.options = {"crf": "18", "movflags": "+faststart"}
+        for picture in _with(first, rest):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(_even(picture)), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def _even(picture: Picture) -> Picture:
+    """The picture with its last row and column once more where they are odd in number: colours are stored by 2 x 2."""
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def _with(first: Picture, rest: Iterator[Picture]) -> Iterator[Picture]:
+    yield first
+    yield from rest
+
+
+def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, fps: float) -> None:
+    from PIL import Image
+
+    stride = max(1, math.ceil(fps / _GIF_FPS))
+    shown = math.ceil(count / stride)
+    ends = np.round(
+        np.arange(1, shown + 1) * stride * 100 / fps
+    )  # in hundredths of a second, as GIF has them
+    durations = (np.diff(ends, prepend=0) * 10).astype(int).tolist()
+    durations[-1] += 1000  # a moment to see the end
+    images = (Image.fromarray(picture) for picture in islice(rest, stride - 1, None, stride))
+    Image.fromarray(first).save(
+        path, format="GIF", save_all=True, append_images=images, duration=durations, loop=0, disposal=1
+    )

@@ -1,0 +1,312 @@
+"""`render`: frames of a recording that has none, from its environment, replayed and compared step by step."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import gymnasium as gym
+
+from tupli_mcap.errors import RecordingError, TupliError, UntrustedError
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.episode import Episode
+from tupli_mcap.recording.framing import CAMERA, RENDER_MODE
+from tupli_mcap.recording.pictures import FrameFormat, check_format, check_picture, resized
+from tupli_mcap.recording.replacing import replacing
+from tupli_mcap.recording.rewrite import rewrite_recording
+from tupli_mcap.recording.signed import SIGNATURE_NAME
+from tupli_mcap.replay.attempt import Watch
+from tupli_mcap.replay.certificate import Divergence, SkipKind, Skipped
+from tupli_mcap.replay.certify import Certifier
+from tupli_mcap.replay.film import Film
+from tupli_mcap.replay.movie import check_movie, write_movie
+from tupli_mcap.replay.plan import EpisodePlan
+from tupli_mcap.replay.reapply import Replayer, brief
+from tupli_mcap.storage.sidecar import Sidecar
+
+__all__ = ["RenderReport", "RenderedEpisode", "render"]
+
+_KINDS: Final = (".mcap", ".mp4", ".gif")
+_FPS: Final = 30.0  # where neither recording nor environment says how long a step takes
+
+
+class RenderedEpisode(NamedTuple):
+    """`frames` of an episode of `steps` steps; `whole`: it was replayed to its end, and agreed at every step."""
+
+    episode: int
+    steps: int
+    frames: int
+    whole: bool
+
+
+class RenderReport(NamedTuple):
+    """What was rendered.
+
+    path: the new file; None if there is no frame, and so no file.
+    episodes: those that were asked for and begun, in their order.
+    divergence: where the replay differed from the recording; nothing was rendered from there on. None if it did not.
+    skipped: episodes that cannot be replayed, whatever the environment does.
+    fps: frames a second of environment time, as a film shows them.
+    width, height: of the frames (pixels); 0 if there is none.
+    signature_left_out: the recording was signed, and the new file is another one.
+    """
+
+    path: Path | None
+    episodes: tuple[RenderedEpisode, ...]
+    divergence: Divergence | None
+    skipped: tuple[Skipped, ...]
+    fps: float
+    width: int
+    height: int
+    signature_left_out: bool
+    seconds: float
+
+    @property
+    def frames(self) -> int:
+        """All frames."""
+        return sum(episode.frames for episode in self.episodes)
+
+    @property
+    def ok(self) -> bool:
+        """Whether all that was asked for was rendered."""
+        return self.divergence is None and not self.skipped
+
+
+def render(
+    recording: Recording | str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    episodes: Sequence[int | Episode] | None = None,
+    every: int = 1,
+    width: int | None = None,
+    frame_format: FrameFormat = "png",
+    trust: bool = False,
+    env: gym.Env[Any, Any] | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> RenderReport:
+    """Rebuilds the environment with render_mode="rgb_array", replays episodes, and writes what it renders.
+
+    States, rewards and flags are compared with the recording at every step, bit for bit. At the first difference
+    rendering ends; the frames before it are written. The episodes of another environment than the recorded one are
+    therefore never shown as the recorded ones.
+
+    Args:
+        recording: an open recording, or what `Recording` opens.
+        target: a new file. ".mcap": the recording with the frames as `/camera/render` (those it already has of the
+            rendered episodes are replaced; a signature is left out); ".mp4" or ".gif": the frames one after another.
+        episodes: numbers, or episodes of `recording`; all by default.
+        every: a frame of every so many steps, and of the last one.
+        width: of the frames (pixels); as the environment renders them by default.
+        frame_format: of the frames in a ".mcap".
+        trust: rebuild the environment even if that runs code from the file.
+        env: used instead of the environment in the file, made with render_mode="rgb_array"; it is not closed.
+        overwrite: whether an existing target is replaced.
+        progress: called with the number of steps done.
+
+    Raises:
+        UntrustedError: rebuilding the environment would run code that nobody here has trusted; nothing was run.
+        RecordingError: no environment in the recording, or one that cannot render; no such episode; the target
+            exists or cannot be written. It is written in one rename.
+        MissingExtraError: Pillow (`frames`), or PyAV for ".mp4" (`video`).
+    """
+    if not isinstance(recording, Recording):
+        with Recording(recording) as opened:
+            return render(
+                opened, target, episodes=episodes, every=every, width=width, frame_format=frame_format, trust=trust,
+                env=env, overwrite=overwrite, progress=progress,
+            )  # fmt: skip
+    began = time.perf_counter()
+    goal = Path(target)
+    kind = _check_target(recording, goal, overwrite=overwrite)
+    if every < 1 or (width is not None and not 1 <= width <= 1 << 14):
+        raise RecordingError(f"expected every >= 1 and a width of 1 to 16384, found {every} and {width}")
+    form = check_format(frame_format if kind == ".mcap" else "png")
+    check_movie(kind)
+    chosen = _numbers(recording, episodes)
+    with Film(CAMERA, form) as film:
+        renderer = _Renderer(recording, trust, chosen, env, progress, film, every, width)
+        certificate = renderer.run()
+        counts = film.counts
+        if counts:
+            _write(recording, goal, kind, film, [n for n in chosen if n in counts], renderer.fps)
+    lengths = dict(zip(recording.index["episode"].tolist(), recording.index["length"].tolist(), strict=True))
+    done = tuple(
+        RenderedEpisode(n, lengths[n], counts.get(n, 0), n in renderer.agreed)
+        for n in chosen
+        if n in counts or n in renderer.agreed
+    )
+    height, wide = renderer.size
+    return RenderReport(
+        path=goal if counts else None,
+        episodes=done,
+        divergence=renderer.divergence,
+        skipped=tuple(certificate.skipped),
+        fps=renderer.fps,
+        width=wide,
+        height=height,
+        signature_left_out=kind == ".mcap" and bool(counts) and SIGNATURE_NAME in recording.attachments,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _check_target(recording: Recording, goal: Path, *, overwrite: bool) -> str:
+    kind = goal.suffix.lower()
+    if kind not in _KINDS:
+        raise RecordingError(f"{goal}: expected a name that ends in {', '.join(_KINDS[:-1])} or {_KINDS[-1]}")
+    if goal.exists() and recording.path is not None and goal.samefile(recording.path):
+        raise RecordingError(f"{goal} is the recording, which is never written over; give another name")
+    if goal.exists() and not overwrite:
+        raise RecordingError(
+            f"{goal} exists and is not replaced; give another name, or allow it with --force"
+        )
+    if not goal.absolute().parent.is_dir():
+        raise RecordingError(f"{goal}: there is no directory {goal.parent}; make it")
+    return kind
+
+
+def _numbers(recording: Recording, episodes: Sequence[int | Episode] | None) -> list[int]:
+    deleted = _deleted(recording)
+    known = [number for number in recording.index["episode"].tolist() if number not in deleted]
+    if not known:
+        raise RecordingError(f"{recording.name} has no episode to render")
+    if episodes is None:
+        return known
+    numbers = [item.number if isinstance(item, Episode) else int(item) for item in episodes]
+    for number in numbers:
+        if number not in known:
+            raise RecordingError(
+                f"{recording.name} has no episode {number}; choose from {known[0]} to {known[-1]}"
+            )
+    return list(dict.fromkeys(numbers))
+
+
+def _deleted(recording: Recording) -> set[int]:
+    return set() if recording.path is None else Sidecar.read(recording.path).deleted
+
+
+def _write(recording: Recording, goal: Path, kind: str, film: Film, order: list[int], fps: float) -> None:
+    if kind == ".mcap":
+        deleted = _deleted(recording)
+        kept = [n for n in recording.index["episode"].tolist() if n not in deleted] if deleted else None
+        rewrite_recording(recording, goal, episodes=kept, frames=film)
+        return
+    with replacing(goal) as (_, temporary):
+        count = sum(film.counts[number] for number in order)
+        write_movie(temporary, kind, film.pictures(order), count, fps)
+
+
+class _Renderer(Certifier):
+    """A replay that renders the chosen episodes, and ends at the first difference."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        trust: bool,
+        chosen: list[int],
+        env: gym.Env[Any, Any] | None,
+        progress: Callable[[int], None] | None,
+        film: Film,
+        every: int,
+        width: int | None,
+    ) -> None:
+        super().__init__(recording, trust, frozenset(chosen), env, progress)
+        self._film = film
+        self._every = every
+        self._width = width
+        self._fps: float | None = None
+        self.size = (0, 0)
+        self.divergence: Divergence | None = None
+        self._earlier: Divergence | None = None  # of an episode that is only replayed for those after it
+
+    @property
+    def fps(self) -> float:
+        """Frames a second of environment time."""
+        return (self._fps or _FPS) / self._every
+
+    @property
+    def agreed(self) -> set[int]:
+        """Numbers of the chosen episodes that were replayed to their end."""
+        numbers = self._recording.index["episode"]
+        found = {int(numbers[p]) for p, outcome in self._outcomes.items() if outcome is None}
+        return found & self._chosen
+
+    def _make(self) -> gym.Env[Any, Any]:
+        env = super()._make()
+        if env.render_mode != RENDER_MODE:
+            raise self._cannot_render(f"its render_mode is {env.render_mode!r:.40}")
+        if self._fps is None:
+            self._fps = self._steps_a_second(env)
+        return env
+
+    def _build(self) -> gym.Env[Any, Any]:
+        benchmark = self._recording.benchmark
+        try:
+            return benchmark.make_env(trust=self._trust, render_mode=RENDER_MODE)
+        except UntrustedError:
+            raise
+        except TupliError as err:
+            try:
+                benchmark.make_env(trust=self._trust).close()
+            except TupliError:
+                raise err from None  # it cannot be built at all, and says why
+            raise self._cannot_render(brief(err.__cause__ or err)) from err
+
+    def _cannot_render(self, why: str) -> RecordingError:
+        name = self._record.name if self._record is not None else str(self._given)
+        return RecordingError(
+            f"{self._recording.name}: the environment {name[:200]!r} cannot be rendered with "
+            f"render_mode={RENDER_MODE!r}: {why}"
+        )
+
+    def _steps_a_second(self, env: gym.Env[Any, Any]) -> float:
+        told = self._recording.labels.step_seconds
+        if told:
+            return 1 / told
+        fps = (env.metadata or {}).get("render_fps")
+        return float(fps) if isinstance(fps, int | float) and 0 < fps < 1e6 else _FPS
+
+    def _watch(self, plan: EpisodePlan, replayer: Replayer) -> Watch | None:
+        if plan.number not in self._chosen:
+            return lambda step: None
+        number, length = plan.number, int(self._recording.index["length"][plan.position])
+        times = self._recording.read([plan.position], fields=["times"]).times.tolist()
+        self._film.begin(number, [int(self._recording.index["start_time"][plan.position]), *times])
+
+        def watch(step: int) -> None:
+            if step % self._every == 0 or step == length:
+                self._film.add(number, step, self._picture(replayer.env, number, step))
+
+        return watch
+
+    def _picture(self, env: gym.Env[Any, Any], number: int, step: int) -> Any:
+        where = f"{self._recording.name}: episode {number}, step {step}"
+        try:
+            rendered: Any = env.render()
+        except Exception as err:  # an environment's own code
+            raise self._cannot_render(
+                f"at step {step} of episode {number} it fails with {brief(err)}"
+            ) from err
+        picture = check_picture(rendered, where)
+        if self._width is not None:
+            picture = resized(picture, self._width)
+        self.size = (picture.shape[0], picture.shape[1])
+        return picture
+
+    def _replay(self, plans: list[EpisodePlan]) -> None:
+        self.divergence = self._earlier = None  # a second try may agree
+        super()._replay(plans)
+
+    def _stops(self, plan: EpisodePlan, outcome: Divergence | SkipKind | None) -> bool:
+        if plan.number not in self._chosen:
+            if isinstance(outcome, Divergence) and self._earlier is None:
+                self._earlier = outcome
+            return False
+        if isinstance(outcome, Divergence):
+            self.divergence = outcome
+        elif outcome == "after_divergence":  # of an episode it goes on from
+            self.divergence = self._earlier
+        return self.divergence is not None
