@@ -9,7 +9,6 @@ import contextlib
 import importlib.util
 import json
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -194,31 +193,6 @@ def test_other_readers_decode_every_message(name: str, tmp_path: Path) -> None:
     assert seen["step"] == steps
     assert seen["/episode_start"] == seen["/episode_end"] == episodes
     assert places == {(number, step) for number, length in lengths.items() for step in range(length)}
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_rerun_converts_without_a_warning(name: str, tmp_path: Path) -> None:
-    target = tmp_path / "golden.rrd"
-    command = [
-        Path(sys.executable).parent / "rerun",
-        "mcap",
-        "convert",
-        finished(name, tmp_path),
-        "-o",
-        target,
-    ]
-    done = subprocess.run(
-        [*map(str, command), "--application-id", "golden"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    said = done.stdout + done.stderr
-    assert done.returncode == 0, said
-    assert "WARN" not in said, said
-    assert "ERROR" not in said, said
-    assert target.stat().st_size > 1000
 
 
 def parts(path: Path) -> list[bytes]:
