@@ -16,6 +16,7 @@ from tupli_mcap.plots.gather import Measured
 from tupli_mcap.plots.page import Cell, Page
 from tupli_mcap.plots.style import GREY, INK, colours, cut, drawable
 from tupli_mcap.plots.trace import Trace
+from tupli_mcap.plots.values import LeafValues
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,15 +45,20 @@ def compose(
         add_episodes(page, shown)
     valued = [one for one in shown if one.layout is not None and one.read_steps]
     if valued:
-        add_values(page, "States", [*zip(*(one.states for one in valued), strict=True)])
+        add_values(page, "States", _together([one.states for one in valued]))
         add_coverage(page, valued)
-        acted = [[*one.actions, *one.rewards] for one in valued]
-        add_values(page, "Actions and rewards", [*zip(*acted, strict=True)])
+        acted, rewarded = ([one.actions for one in valued], [one.rewards for one in valued])
+        add_values(page, "Actions and rewards", _together(acted), _together(rewarded))
     for one, trace in traces:
         add_trace(page, one, trace, _heading(one, trace, several=len(measured) > 1))
     if head:
         _add_notes(page, notes)
     return page.draw()
+
+
+def _together(leaves: Sequence[Sequence[LeafValues]]) -> list[Sequence[LeafValues]]:
+    """The same leaf of all recordings, for each leaf."""
+    return list(zip(*leaves, strict=True))
 
 
 def _heading(measured: Measured, trace: Trace, *, several: bool) -> str:

@@ -90,4 +90,7 @@ def _draw_map(
     axes.set_xlabel(cut(names[0], 40))
     axes.set_ylabel(cut(names[1], 26))
     axes.set_title(cut(title, 60))
+    for axis, at in ((axes.xaxis, edges[0]), (axes.yaxis, edges[1])):
+        if at[1] - at[0] == 1:  # whole numbers
+            axis.get_major_locator().set_params(integer=True)
     colour_bar(axes, mesh, "% of steps")

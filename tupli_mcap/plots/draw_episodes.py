@@ -98,26 +98,23 @@ def _draw_one_of_several(axes: Any, measured: Measured, column: str, colour: str
 
 
 def _draw_distribution(axes: Any, measured: Sequence[Measured], column: str, name: str) -> None:
-    axes.set_xlabel(name)
     pooled = np.concatenate([one.rows[column].astype(np.float64) for one in measured])
-    finite = pooled[np.isfinite(pooled)]
     edges, beyond = bin_edges(pooled, bin_count(len(pooled), _BINS))
-    axes.set_title("episodes" if len(measured) == 1 else "% of episodes")
     show_alone(axes, edges)
     if len(measured) == 1:
+        axes.set_ylabel("episodes", color=GREY)
         _draw_ends(axes, measured[0].rows, column, edges)
+        if len(pooled) > MOST_DOTS:  # else the dots at the left have told
+            legend_above(axes)
     else:
+        axes.set_ylabel("% of episodes", color=GREY)
         for one, colour in zip(measured, colours(len(measured)), strict=True):
             values = one.rows[column].astype(np.float64)
             counts, _ = np.histogram(values[np.isfinite(values)], edges)
             axes.stairs(100 * counts / max(1, len(values)), edges, color=colour, linewidth=1.2)
-    left_out = [
-        f"{count:,} {word}"
-        for count, word in ((beyond, "beyond"), (len(pooled) - len(finite), "not finite"))
-        if count
-    ]
-    if left_out:
-        axes.set_title(", ".join(left_out), loc="right", fontsize=7.5, color=GREY)
+    odd = int((~np.isfinite(pooled)).sum())
+    left_out = [f"{count:,} {word}" for count, word in ((beyond, "beyond"), (odd, "not finite")) if count]
+    axes.set_xlabel("; ".join([name, *left_out]))
 
 
 def _draw_ends(axes: Any, rows: Array, column: str, edges: Array) -> None:
@@ -127,6 +124,13 @@ def _draw_ends(axes: Any, rows: Array, column: str, edges: Array) -> None:
         values = rows[column][rows["end"] == i].astype(np.float64)
         counts, _ = np.histogram(values[np.isfinite(values)], edges)
         if counts.any():
-            axes.stairs(below + counts, edges, baseline=below, fill=True, color=ENDS[END_NAMES[i]][0])
+            axes.stairs(
+                below + counts,
+                edges,
+                baseline=below,
+                fill=True,
+                color=ENDS[END_NAMES[i]][0],
+                label=END_NAMES[i],
+            )
         below += counts
     axes.set_ylim(0, max(1.0, float(below.max())) * 1.05)

@@ -48,8 +48,10 @@ def add_trace(page: Page, measured: Measured, trace: Trace, heading: str) -> Non
 
 def _on_steps(axes: Any, trace: Trace, draw: Any, measured: Measured, last: bool) -> None:
     draw(axes)
-    axes.set_xlim(-0.5, max(trace.length, 1) - 0.5 if trace.length > 1 else 0.5)
+    axes.set_xlim(-0.5, max(trace.length, 1) - 0.5)
     axes.xaxis.get_major_locator().set_params(integer=True)
+    if trace.length <= 1:
+        axes.set_xticks([0])
     if last:
         seconds = measured.step_seconds
         unit = "" if seconds is None else f" (each {number_text(seconds)} s)"

@@ -40,29 +40,30 @@ class Dimension(NamedTuple):
         return self.leaves[0].names[self.i]
 
 
-def add_values(page: Page, heading: str, leaves: Sequence[Sequence[LeafValues]]) -> None:
-    """Panels of some leaves; each is given as the same leaf of every recording."""
-    shown = [leaf for leaf in leaves if leaf[0].kind in ("numbers", "choices")]
-    if not shown:
+Leaves = Sequence[Sequence[LeafValues]]
+"""Some leaves, each as the same leaf of every recording."""
+
+
+def add_values(page: Page, heading: str, *groups: Leaves) -> None:
+    """Panels of some leaves; the dimensions of a group that has too many become one heat map."""
+    groups = tuple([leaf for leaf in group if leaf[0].kind in ("numbers", "choices")] for group in groups)
+    if not any(groups):
         return
     page.heading(heading)
-    numbers = [
-        Dimension(leaf, i)
-        for leaf in shown
-        if leaf[0].kind == "numbers"
-        for i in range(len(leaf[0].elements))
-    ]
-    if len(numbers) > MOST_PANELS:
-        page.row(1.7, [Cell(partial(_draw_quantiles, dimensions=numbers), right=0.9)])
     cells: list[tuple[float, Cell]] = []
-    for leaf in shown:
-        if leaf[0].kind == "choices":
-            cells += _cells_of_choices(leaf)
-        elif len(numbers) <= MOST_PANELS:
-            cells += [
-                (_HEIGHT, Cell(partial(_draw_histogram, dimension=Dimension(leaf, i))))
-                for i in range(len(leaf[0].elements))
-            ]
+    for group in groups:
+        numbers = [leaf for leaf in group if leaf[0].kind == "numbers"]
+        dimensions = [Dimension(leaf, i) for leaf in numbers for i in range(len(leaf[0].elements))]
+        if len(dimensions) > MOST_PANELS:
+            page.row(1.7, [Cell(partial(_draw_quantiles, dimensions=dimensions), right=0.9)])
+        for leaf in group:
+            if leaf[0].kind == "choices":
+                cells += _cells_of_choices(leaf)
+            elif len(dimensions) <= MOST_PANELS:
+                cells += [
+                    (_HEIGHT, Cell(partial(_draw_histogram, dimension=Dimension(leaf, i))))
+                    for i in range(len(leaf[0].elements))
+                ]
     page.pack(cells, _COLUMNS)
 
 
@@ -254,7 +255,10 @@ def _draw_bits(axes: Any, leaf: Sequence[LeafValues]) -> None:
     edges = np.arange(len(leaf[0].counts) + 1) - 0.5
     for one, colour in zip(leaf, colours(len(leaf)), strict=True):
         ones = np.array([_shares(one, i)[1] for i in range(len(one.counts))])
-        axes.stairs(ones, edges, fill=len(leaf) == 1, color=colour, linewidth=1.2)
+        if len(leaf) == 1 and len(ones) <= _BARS:
+            axes.bar(edges[:-1] + 0.5, ones, 0.8, color=colour)
+        else:
+            axes.stairs(ones, edges, fill=len(leaf) == 1, color=colour, linewidth=1.2)
     axes.set_ylim(0, 100)
     axes.set_xlim(edges[0], edges[-1])
     axes.set_ylabel("% of steps", color=GREY, fontsize=7.5)

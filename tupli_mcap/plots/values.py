@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, Literal
 
 import numpy as np
@@ -123,7 +124,7 @@ def short_path(leaf: Leaf) -> str:
     """`arm.x[0]` for `state['arm']['x'][0]`; a leaf that is the whole value keeps its root's name."""
     if not leaf.keys:
         return leaf.path
-    text = ""
+    text = "" if isinstance(leaf.keys[0], str) else re.split(r"\W", leaf.path, maxsplit=1)[0]
     for key in leaf.keys:
         text += f".{key}" if isinstance(key, str) else f"[{key}]"
     return text.removeprefix(".")

@@ -493,6 +493,17 @@ class Recording:
             return viewer.save(self, save, episodes, **options)
         return viewer.show(self, episodes, **options)
 
+    def plot(self, **options: Any) -> Any:
+        """A `tupli_mcap.plots.Report`: returns, lengths, states, actions and one episode, as one picture.
+
+        `options` are those of `tupli_mcap.plots.report`. A notebook shows it; `.save(path)` writes a .png, .svg or .html.
+
+        Raises:
+            MissingExtraError: matplotlib (the extra `plot`) is not installed.
+        """
+        # that package lies above this one, and is needed here only
+        return importlib.import_module("tupli_mcap.plots").report(self, **options)
+
     def close(self) -> None:
         """Closes the file; what was read stays valid."""
         self._source.close()
