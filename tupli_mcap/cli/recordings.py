@@ -26,6 +26,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.replaying import carried_certificate
+from tupli_mcap.cli.sparklines import print_sketch
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -180,7 +181,8 @@ def _info(
 ) -> None:
     """Show what is in a recording.
 
-    Spaces, benchmark, statistics, channels and attachments; no step is read.
+    Spaces, benchmark, statistics, returns and lengths of episodes, how rewards, actions and states are
+    distributed, channels and attachments. Of long recordings, only some steps are read; of URLs, none.
     """
     from dataclasses import asdict
 
@@ -190,12 +192,16 @@ def _info(
     with Recording(file) as recording:
         description = describe(recording)
         replayed = carried_certificate(recording)
+        if not as_json:
+            print_facts(
+                [*_facts(description), *([] if replayed is None else [("certificate", str(replayed))])]
+            )
+            print_sketch(recording)
     if as_json:
         channels = [channel._asdict() for channel in description.channels]
         certificate = {} if replayed is None else {"certificate": replayed._asdict()}
         print_json({**asdict(description), "channels": channels, **_spreads(description), **certificate})
         return
-    print_facts([*_facts(description), *([] if replayed is None else [("certificate", str(replayed))])])
     if description.channels:
         print()
         _print_channels(description)

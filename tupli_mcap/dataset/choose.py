@@ -14,7 +14,7 @@ from tupli_mcap.recording.reader import Recording
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate
 from tupli_mcap.storage.sidecar import Sidecar
 
-__all__ = ["WORDS", "choose_among", "choose_episodes"]
+__all__ = ["WORDS", "candidates", "choose_among", "choose_episodes"]
 
 WORDS: Final = ("best", "worst", "first", "last", "all")
 """What may stand in place of an episode's number; best and worst are by return, the first of equals."""
@@ -38,7 +38,7 @@ def choose_episodes(
         FilterError: the text is none of this, or the filter has an unknown key.
         RecordingError: there is no such episode, or none at all.
     """
-    among = _candidates(recording, filter)
+    among = candidates(recording, filter)
     return [recording.episodes[position] for position in choose_among(recording, among, text, filter)]
 
 
@@ -62,7 +62,8 @@ def choose_among(
     return list(chosen)
 
 
-def _candidates(recording: Recording, filter: BaseFilter | None) -> Positions:
+def candidates(recording: Recording, filter: BaseFilter | None) -> Positions:
+    """The positions of the episodes that a filter is true of, without those that the storage has deleted."""
     path = recording.path
     deleted = set() if path is None else Sidecar.read(Path(path)).deleted
     numbers = recording.index["episode"].astype(np.int64)

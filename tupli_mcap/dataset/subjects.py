@@ -7,12 +7,14 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
 from tupli_mcap.dataset import TupliDataset
+from tupli_mcap.dataset.choose import candidates
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Array
@@ -52,11 +54,8 @@ def subjects_of(
     if isinstance(source, str | os.PathLike):
         yield from _of_path(source, episode_filter)
     elif isinstance(source, Recording):
-        if episode_filter is not None:
-            raise RecordingError(
-                "a filter goes with paths, datasets and storages, not with an open Recording"
-            )
-        yield Subject(source.name, lambda: nullcontext(source), _all)
+        choose = _all if episode_filter is None else partial(candidates, filter=episode_filter)
+        yield Subject(source.name, lambda: nullcontext(source), choose)
     elif isinstance(source, TupliDataset):
         yield from _of_dataset(source if episode_filter is None else _narrowed(source, episode_filter))
     elif isinstance(source, TupliStorage):

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from tupli_mcap.messages.names import short_path
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.plots.trace import Trace
-from tupli_mcap.plots.values import LeafValues, short_path
+from tupli_mcap.plots.values import LeafValues
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Array, blocks, step_bytes
 from tupli_mcap.recording.describe import RecordingDescription, describe

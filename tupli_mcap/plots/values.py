@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any, Literal
 
 import numpy as np
@@ -10,9 +9,10 @@ from gymnasium import spaces
 
 from tupli_mcap.messages.labels import Labels
 from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.names import element_names
 from tupli_mcap.recording.blocks import Array
 
-__all__ = ["LeafValues", "short_path"]
+__all__ = ["LeafValues"]
 
 MAX_ELEMENTS = 256
 """Elements of a leaf that are looked at one by one; of larger leaves, so many evenly chosen ones."""
@@ -37,7 +37,7 @@ class LeafValues:
         self.kind: Kind = _kind(leaf)
         size = leaf.size if self.kind in ("numbers", "choices") else 0
         self.elements = _evenly(size, MAX_ELEMENTS)
-        self.names = _names(leaf, self.elements, labels)
+        self.names = element_names(leaf, labels, self.elements.tolist())
         self.value_names = labels.values.get(leaf.path, ())
         n = len(self.elements)
         self.count = 0
@@ -120,16 +120,6 @@ class LeafValues:
         return values[np.isfinite(values)]
 
 
-def short_path(leaf: Leaf) -> str:
-    """`arm.x[0]` for `state['arm']['x'][0]`; a leaf that is the whole value keeps its root's name."""
-    if not leaf.keys:
-        return leaf.path
-    text = "" if isinstance(leaf.keys[0], str) else re.split(r"\W", leaf.path, maxsplit=1)[0]
-    for key in leaf.keys:
-        text += f".{key}" if isinstance(key, str) else f"[{key}]"
-    return text.removeprefix(".")
-
-
 def _kind(leaf: Leaf) -> Kind:
     if leaf.kind == "variable":
         return "variable"
@@ -157,18 +147,6 @@ def _is_picture(leaf: Leaf) -> bool:
 def _evenly(size: int, most: int) -> Array:
     """At most so many of the indexes below `size`, at even distances."""
     return np.arange(size) if size <= most else np.linspace(0, size - 1, most).round().astype(np.int64)
-
-
-def _names(leaf: Leaf, elements: Array, labels: Labels) -> tuple[str, ...]:
-    prefix = short_path(leaf)
-    known = labels.dimensions.get(leaf.path)
-    if known is not None and len(known) == leaf.size:
-        own = f"{prefix}: " if leaf.keys else ""
-        return tuple(own + known[i] for i in elements)
-    if leaf.shape == ():
-        return (prefix,) * len(elements)
-    places = np.stack(np.unravel_index(elements, leaf.shape), axis=1).tolist()
-    return tuple(f"{prefix}[{','.join(map(str, place))}]" for place in places)
 
 
 def _choices(leaf: Leaf, elements: Array) -> tuple[list[int], list[int]]:

@@ -496,7 +496,7 @@ class Recording:
     def plot(self, **options: Any) -> Any:
         """A `tupli_mcap.plots.Report`: returns, lengths, states, actions and one episode, as one picture.
 
-        `options` are those of `tupli_mcap.plots.report`. A notebook shows it; `.save(path)` writes a .png, .svg or .html.
+        `options` are those of `tupli_mcap.plots.report`. A notebook shows it; `.save(path)` writes it.
 
         Raises:
             MissingExtraError: matplotlib (the extra `plot`) is not installed.

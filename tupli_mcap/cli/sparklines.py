@@ -1,0 +1,87 @@
+"""Series of numbers as lines of blocks, for `info`."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from tupli_mcap.cli.output import Column, number, print_table, terminal_width, visible
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording import Recording
+    from tupli_mcap.recording.sketch import Series
+
+__all__ = ["print_sketch", "sparkline"]
+
+BLOCKS = "▁▂▃▄▅▆▇█"
+PLAIN = ".:-=+*#@"  # where blocks cannot be printed
+_WIDEST, _NARROWEST = 40, 8
+_OTHERS = 44  # columns of a line beside its blocks
+_LONGEST_NAME = 24
+
+
+def sparkline(values: Sequence[float], *, zero_based: bool = False, blocks: str = BLOCKS) -> str:
+    """One character a number: a higher one for a larger number, a space for NaN.
+
+    zero_based: the lowest level is that of 0, which is a space; else that of the smallest number.
+    """
+    finite = [value for value in values if math.isfinite(value)]
+    if not finite:
+        return ""
+    low, high = (0.0 if zero_based else min(finite)), max(finite)
+    line = ""
+    for value in values:
+        if not math.isfinite(value) or (zero_based and value <= 0):
+            line += " "
+        elif high > low:
+            part = value / (high - low) - low / (high - low)  # a difference of huge numbers may overflow
+            line += blocks[min(int(part * len(blocks)), len(blocks) - 1)]
+        else:
+            line += blocks[len(blocks) // 2]
+    return line
+
+
+def print_sketch(recording: Recording) -> None:
+    """Returns and lengths over episodes, and how rewards, actions and states are distributed."""
+    from tupli_mcap.recording.sketch import sketch
+
+    room = (terminal_width() or _WIDEST + _OTHERS) - _OTHERS
+    found = sketch(recording, max(_NARROWEST, min(_WIDEST, room)))
+    if not found.courses:
+        return
+    print()
+    _print("EPISODES", "FIRST TO LAST", found.courses, zero_based=False)
+    if found.distributions:
+        print()
+        _print("STEPS", "LEAST TO MOST", found.distributions, zero_based=True)
+        told = "" if found.sampled == recording.num_steps else f"{number(found.sampled)} steps sampled"
+        hidden = f"{number(found.hidden)} more dimensions" if found.hidden else ""
+        if told or hidden:
+            print(", ".join(filter(None, (hidden, told))))
+    if found.error:
+        print(f"no step is shown: {visible(found.error)}")
+
+
+def _print(title: str, spark: str, series: Sequence[Series], *, zero_based: bool) -> None:
+    blocks = BLOCKS if _is_printable(BLOCKS) else PLAIN
+    columns = (Column(title, shrink="end"), Column(spark), Column("LEAST", "right"), Column("MOST", "right"))
+    rows = [
+        (
+            one.name if len(one.name) <= _LONGEST_NAME else f"{one.name[:8]}...{one.name[-13:]}",
+            sparkline(one.values, zero_based=zero_based, blocks=blocks),
+            number(one.least, 3),
+            number(one.most, 3),
+        )
+        for one in series
+    ]
+    print_table(columns, rows, empty="")
+
+
+def _is_printable(text: str) -> bool:
+    try:
+        text.encode(sys.stdout.encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True

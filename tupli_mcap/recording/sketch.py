@@ -1,0 +1,145 @@
+"""A recording in a few small series of numbers: cheap enough for every look at it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.errors import TupliError
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.names import element_names
+from tupli_mcap.recording.blocks import step_bytes
+from tupli_mcap.recording.columns import Columns
+from tupli_mcap.recording.reader import Recording
+
+__all__ = ["Series", "Sketch", "sketch"]
+
+Array = np.ndarray[Any, Any]
+
+READ_BYTES = 4 << 20
+"""Steps of so many bytes are read at most; of longer recordings, some at a few places."""
+_PLACES, _AT_EACH = 16, 256
+_VARIABLE_PLACES, _VARIABLE_AT_EACH = 8, 32  # steps of variable size are decoded one by one
+_MOST_REWARDS, _MOST_STATES, _MOST_ACTIONS = 2, 12, 6
+
+
+class Series(NamedTuple):
+    """Some numbers in their order (NaN: there is none), and the range of the values they stand for."""
+
+    name: str
+    values: tuple[float, ...]
+    least: float
+    most: float
+
+
+class Sketch(NamedTuple):
+    """courses: means of consecutive episodes. distributions: counts of steps, from the least value to the most.
+
+    sampled: how many steps the distributions are of. hidden: dimensions that are left out. error: why the steps could
+    not be read; empty if they could, or need not be.
+    """
+
+    courses: tuple[Series, ...]
+    distributions: tuple[Series, ...]
+    sampled: int
+    hidden: int
+    error: str = ""
+
+
+def sketch(recording: Recording, points: int) -> Sketch:
+    """Series of at most `points` numbers. A few steps are read, if the recording is a local file; no image."""
+    rows = recording.index
+    courses = tuple(
+        found
+        for name, column in (("return", "return"), ("length", "length"))
+        if (found := _course(name, rows[column].astype(np.float64), points)) is not None
+    )
+    if not recording.num_envs or recording.path is None or not recording.num_steps:
+        return Sketch(courses, (), 0, 0)
+    try:
+        pieces = list(_pieces(recording))
+    except TupliError as err:  # a damaged chunk hides nothing else
+        return Sketch(courses, (), 0, 0, str(err))
+    layout = recording.layout
+    shown = tuple(
+        series
+        for leaves, field, most in (
+            (layout.reward, "rewards", _MOST_REWARDS),
+            (layout.state, "states", _MOST_STATES),
+            (layout.action, "actions", _MOST_ACTIONS),
+        )
+        for series in itertools.islice(_distributions(recording, leaves, field, pieces, points), most)
+    )
+    dimensions = sum(leaf.size for leaf in layout.leaves if leaf.kind not in ("image", "variable"))
+    return Sketch(courses, shown, sum(len(piece) for piece in pieces), dimensions - len(shown))
+
+
+def _course(name: str, values: Array, points: int) -> Series | None:
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return None
+    edges = np.linspace(0, len(values), min(points, len(values)) + 1).round().astype(np.int64)
+    known = np.isfinite(values)
+    counts = np.add.reduceat(known.astype(np.float64), edges[:-1])
+    with np.errstate(invalid="ignore", over="ignore"):
+        means = np.add.reduceat(np.where(known, values, 0.0), edges[:-1]) / np.where(counts, counts, np.nan)
+    return Series(name, tuple(means.tolist()), float(finite.min()), float(finite.max()))
+
+
+def _pieces(recording: Recording) -> Iterator[Columns]:
+    """Steps of the whole recording, or some at even distances."""
+    fields = ("states", "actions", "rewards")
+    lengths = recording.index["length"].astype(np.int64)
+    ends = np.cumsum(lengths)
+    total = int(ends[-1])
+    constant = recording.layout.constant
+    most = READ_BYTES // step_bytes(recording.layout, images=False)
+    if total <= most and constant:
+        yield recording.read(fields=fields, images=False)
+        return
+    places, each = (_PLACES, _AT_EACH) if constant else (_VARIABLE_PLACES, _VARIABLE_AT_EACH)
+    each = max(1, min(each, most // places))
+    if total <= places * each:
+        places, each = 1, total
+    for step in np.linspace(0, total - each, places).astype(np.int64).tolist():
+        first = int(np.searchsorted(ends, step, side="right"))
+        start = step - int(ends[first] - lengths[first])
+        if lengths[first] - start >= each:
+            yield recording.read_steps(first, start, start + each, fields, images=False)
+        else:
+            last = int(np.searchsorted(ends, step + each, side="left"))
+            yield recording.read(np.arange(first, last + 1), fields=fields, images=False)
+
+
+def _distributions(
+    recording: Recording, leaves: list[Leaf], field: str, pieces: list[Columns], points: int
+) -> Iterator[Series]:
+    for leaf in leaves:
+        if leaf.kind in ("image", "variable") or not leaf.size:
+            continue
+        columns = [leaf.get(getattr(piece, field)) for piece in pieces]
+        flat = np.concatenate([column.reshape(len(column), -1) for column in columns])
+        for i, name in enumerate(element_names(leaf, recording.labels)):
+            yield _distribution(leaf, name, flat[:, i].astype(np.float64), points)
+
+
+def _distribution(leaf: Leaf, name: str, values: Array, points: int) -> Series:
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return Series(name, (), np.nan, np.nan)
+    least, most = float(values.min()), float(values.max())
+    if isinstance(leaf.space, spaces.Discrete):  # values that never occur are seen, too
+        least, most = float(leaf.space.start), float(leaf.space.start + leaf.space.n - 1)
+    bins = points
+    if np.array_equal(values, np.round(values)):
+        bins = int(min(points, most - least + 1))
+    if not most > least or not np.isfinite(most - least):
+        return Series(name, (float(len(values)),), least, most)
+    with np.errstate(over="ignore"):
+        at = np.minimum((values - least) / (most - least) * bins, bins - 1).astype(np.int64)
+    counts = np.bincount(np.maximum(at, 0), minlength=bins)
+    return Series(name, tuple(counts.astype(np.float64).tolist()), least, most)
