@@ -166,7 +166,13 @@ def courier(path: Path, episodes: int = 3) -> Path:
         gripper = (2 if state["carrying"] else 1) if close else 0
         return {"thrust": np.clip(thrust, -1, 1).astype(np.float32), "gripper": gripper}
 
-    with RecordEpisodes(gym.wrappers.TimeLimit(Courier(), 200), path) as env:
+    labels = {
+        **{f"state[{name!r}]": ("x", "y") for name in ("position", "velocity", "goal")},
+        "state['carrying']": ("empty", "loaded"),
+        "action['thrust']": ("x", "y"),
+        "action['gripper']": ("rest", "grasp", "release"),
+    }
+    with RecordEpisodes(gym.wrappers.TimeLimit(Courier(), 200), path, labels=labels) as env:
         rollout(env, head_for_goal, episodes)
     return path
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from tupli_mcap.viewer.panels import Panel
+from tupli_mcap.viewer.panels import Panel, Series
 from tupli_mcap.viewer.pictures import Camera, Grid, HeatMap, Picture
 from tupli_mcap.viewer.scene import Scene
 from tupli_mcap.viewer.words import Infos, Lanes, Words
@@ -16,7 +16,7 @@ _STACKED, _A_PAGE = 4, 12
 _MOST_LINKED = 1000  # rows
 _SHARE = 3.0  # of a column's height, a panel like any other
 _SHARES: dict[type, float] = {
-    Lanes: 1.6,
+    Lanes: 2.0,
     Words: 2.0,
     Infos: 2.0,
     Picture: 4.0,
@@ -62,26 +62,48 @@ def blueprint_of(scene: Scene, roots: Sequence[str] = ("",)) -> Any:
 
 
 def _stack(panels: Sequence[Panel], roots: Sequence[str], axis: Any, name: str) -> Any:
-    """Views below each other; many of them side by side, and on several pages. A heat map has a page of its own."""
+    """Views below each other; many of them side by side, and on several pages. What a heat map shows comes last."""
     import rerun.blueprint as rrb
 
-    maps = [panel.view(roots, axis) for panel in panels if isinstance(panel, HeatMap)]
-    others = [panel for panel in panels if not isinstance(panel, HeatMap)]
-    views = [panel.view(roots, axis) for panel in others]
-    if not maps and len(views) <= _STACKED:
-        shares = [_SHARES.get(type(panel), _SHARE) for panel in others]
-        return views[0] if len(views) == 1 else rrb.Vertical(*views, name=name, row_shares=shares)
-    pages = list(maps)
-    for start in range(0, len(views), _A_PAGE):
-        page = views[start : start + _A_PAGE]
-        told = name if len(views) <= _A_PAGE else f"{name} {start + 1} to {start + len(page)}"
-        pages.append(rrb.Grid(*page, name=told) if len(page) > 1 else page[0])
-    return pages[0] if len(pages) == 1 else rrb.Tabs(*pages, name=name)
+    maps = [panel for panel in panels if isinstance(panel, HeatMap)]
+    wide = {panel.leaf.path for panel in maps}
+    lines = [panel for panel in panels if isinstance(panel, Series) and panel.leaf.path in wide]
+    others = [panel for panel in panels if not any(panel is taken for taken in (*maps, *lines))]
+    pages = []
+    for group, told in ((others, name), (lines, f"{name}: lines")):
+        for start in range(0, len(group), _A_PAGE):
+            page = group[start : start + _A_PAGE]
+            where = "" if len(group) <= _A_PAGE else f" {start + 1} to {start + len(page)}"
+            pages.append((_below(page, roots, axis), told + where))
+    if maps:
+        shown, told = pages.pop(0) if others else ([], name)
+        pages.insert(0, (shown + _below(maps, roots, axis), told))
+    columns = [
+        rrb.Vertical(*views, row_shares=shares, name=told) for views, shares, told in map(_unzipped, pages)
+    ]
+    return columns[0] if len(columns) == 1 else rrb.Tabs(*columns, name=name)
+
+
+def _below(panels: Sequence[Panel], roots: Sequence[str], axis: Any) -> list[tuple[Any, float]]:
+    """Views and their shares of the height; in two columns where they would be flat below each other."""
+    import rerun.blueprint as rrb
+
+    views = [panel.view(roots, axis) for panel in panels]
+    if len(views) <= _STACKED:
+        return [(view, _SHARES.get(type(panel), _SHARE)) for view, panel in zip(views, panels, strict=True)]
+    return [(rrb.Grid(*views, grid_columns=2), _SHARE * ((len(views) + 1) // 2))]
+
+
+def _unzipped(page: tuple[list[tuple[Any, float]], str]) -> tuple[list[Any], list[float], str]:
+    return [view for view, _ in page[0]], [share for _, share in page[0]], page[1]
 
 
 def _share(panels: Sequence[Panel], main: bool) -> float:
-    """How much of a column's height some panels need; what matters most takes what there is."""
-    return min(8.0, max(6.0 if main else 0.0, sum(_SHARES.get(type(panel), _SHARE) for panel in panels)))
+    """How much of a column's height some panels need; what was seen takes what there is."""
+    return min(
+        12.0 if main else 8.0,
+        max(6.0 if main else 0.0, sum(_SHARES.get(type(panel), _SHARE) for panel in panels)),
+    )
 
 
 def _time_axis(rows: int) -> Any:
