@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import shutil
+import signal
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import psutil
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
@@ -34,6 +40,34 @@ class Seen(NamedTuple):
     def ink(self) -> float:
         """The part of the pixels below the viewer's bar that are coloured."""
         return _ink(self.picture)
+
+
+@contextlib.contextmanager
+def served(recording: Path, *options: str) -> Iterator[tuple[str, set[str]]]:
+    """`tupli-mcap replay --web` while it runs: the URL it tells, and the addresses on which anybody can reach it."""
+    command = [
+        sys.executable,
+        "-c",
+        "from tupli_mcap.cli import main; main()",
+        "replay",
+        str(recording),
+        *options,
+        "--web",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stderr is not None
+    try:
+        url = process.stdout.readline().strip()
+        if not url.startswith("http://127.0.0.1:"):
+            raise RuntimeError(f"expected a URL, found {url!r}: {process.stderr.read()[-2000:]}")
+        told = psutil.Process(process.pid)
+        sockets = [
+            sock for one in (told, *told.children(recursive=True)) for sock in one.net_connections("tcp")
+        ]
+        yield url, {sock.laddr.ip for sock in sockets if sock.status == psutil.CONN_LISTEN}
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
 
 
 def browse(url: str, seconds: float = 90.0, size: tuple[int, int] = (1000, 700)) -> Seen:
