@@ -14,15 +14,23 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from drawing import Drawing, drawn
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
+from typer.testing import CliRunner
 
 from tupli_mcap import RecordEpisodes, Recording, recover_recording, verify_recording
+from tupli_mcap.benchmark import TupliEnvWrapper
+from tupli_mcap.cli import app
+from tupli_mcap.doctor import examine
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
 from tupli_mcap.recording import rewrite_recording
 from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.recording.pictures import decode_picture, encode_picture
+from tupli_mcap.schema import FilterEQ
+from tupli_mcap.storage import FileStorage
+from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 
 def record(path: Path, lengths: list[int], env: Any = None, **options: Any) -> None:
@@ -146,6 +154,58 @@ class TestRecording:
             np.testing.assert_array_equal(env.reset(seed=3)[0], plain.reset(seed=3)[0])
             for _ in range(8):
                 np.testing.assert_array_equal(env.step(1)[0], plain.step(1)[0])
+
+
+class TestVector:
+    """Sub-environments: each has a channel of its own."""
+
+    @pytest.mark.parametrize("every", [1, 3])
+    @pytest.mark.parametrize("mode", list(AutoresetMode))
+    def test_every_frame_shows_its_state(self, tmp_path: Path, mode: AutoresetMode, every: int) -> None:
+        envs = SyncVectorEnv([lambda n=n: Drawing(4 + n) for n in range(3)], autoreset_mode=mode)  # type: ignore[misc]
+        with RecordVector(envs, tmp_path / "r.mcap", attachments={}, frames=every) as recorder:
+            recorder.reset(seed=5)
+            for _ in range(20):
+                *_, terminals, timeouts, _ = recorder.step(recorder.action_space.sample())
+                if mode == AutoresetMode.DISABLED and (terminals | timeouts).any():
+                    recorder.reset(options={"reset_mask": terminals | timeouts})
+        with Recording(tmp_path / "r.mcap") as recording:
+            assert recording.cameras == ("render",)
+            assert {episode.env for episode in recording.episodes} == {0, 1, 2}
+            for episode in recording.episodes:
+                ended = episode.end != "interrupted"
+                steps = [
+                    s for s in range(len(episode) + 1) if s % every == 0 or (ended and s == len(episode))
+                ]
+                if mode == AutoresetMode.SAME_STEP and ended:
+                    steps = [s for s in steps if s < len(episode)]  # it is gone when it can be drawn
+                assert episode.frames.steps.tolist() == steps
+                for step, frame in zip(steps, episode.frames, strict=True):
+                    np.testing.assert_array_equal(frame, drawn(states_of(episode)[step]))
+        assert problems(tmp_path / "r.mcap") == []
+
+    def test_of_other_processes(self, tmp_path: Path) -> None:
+        envs = AsyncVectorEnv([Drawing, Drawing])
+        with RecordVector(envs, tmp_path / "r.mcap", frames=True) as recorder:
+            recorder.reset(seed=5)
+            for _ in range(9):
+                recorder.step(np.array([0, 2]))
+        assert check(tmp_path / "r.mcap") == 2 * (7 + 3)
+        report = recover_recording(tmp_path / "r.mcap", tmp_path / "new.mcap")
+        assert report.intact
+        assert check(tmp_path / "new.mcap") == 20
+        assert problems(tmp_path / "new.mcap") == []
+
+    def test_no_pictures(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        with pytest.raises(RecordingError, match="render_mode='rgb_array', found None"):
+            RecordVector(SyncVectorEnv([lambda: Drawing(render_mode=None)]), tmp_path / "r.mcap", frames=True)
+        recorder = RecordVector(
+            SyncVectorEnv([Drawing] * 2), tmp_path / "r.mcap", attachments={}, frames=True
+        )
+        monkeypatch.setattr(SyncVectorEnv, "render", lambda self: [drawn([1.0])])
+        with pytest.raises(RecordingError, match="for each of 2 sub-environments, found list of 1"):
+            recorder.reset(seed=1)
+        recorder.close()
 
 
 class TestBadInput:
@@ -386,6 +446,71 @@ class TestRewriting:
                     assert [a.frames.encoded(i) for i in range(len(a.frames))] == [
                         b.frames.encoded(i) for i in range(len(b.frames))
                     ]
+
+
+class TestStorages:
+    """What hands recordings on knows of frames."""
+
+    def roll(self, env: gym.Env[Any, Any], episodes: int) -> None:
+        for seed in range(episodes):
+            env.reset(seed=seed)
+            for t in range(6):
+                env.step(t % 3)
+
+    def test_bundles_and_compacted_storages(self, tmp_path: Path) -> None:
+        with FileStorage(tmp_path / "lab") as storage:
+            known = None
+            for _ in range(2):
+                env = TupliEnvWrapper(
+                    Drawing(), storage=storage, benchmark_id=known, frames=True, compression="none"
+                )
+                if known is None:
+                    env.store(name="walk")
+                    known = env.id
+                self.roll(env, 3)
+                env.close()
+            assert known is not None
+            storage.bundle(known, tmp_path / "bundle.mcap")
+            assert check(tmp_path / "bundle.mcap") == 6 * 7
+            assert problems(tmp_path / "bundle.mcap") == []
+            assert storage.delete_episodes(FilterEQ(key="seed", value=1)) == 2
+            assert storage.compact() > 0
+            for path in (tmp_path / "lab").rglob("*.mcap"):
+                assert check(path) == 2 * 7
+                assert problems(path) == []
+            storage.bundle(known, tmp_path / "less.mcap")
+        assert check(tmp_path / "less.mcap") == 4 * 7
+        with FileStorage(tmp_path / "other") as storage:
+            storage.import_bundle(tmp_path / "bundle.mcap", trust=True)
+            (path,) = (tmp_path / "other").rglob("*.mcap")
+            assert check(path) == 6 * 7
+
+    def test_the_doctor_finds_nothing(self, tmp_path: Path) -> None:
+        record(tmp_path / "r.mcap", [6] * 8)
+        record(tmp_path / "plain.mcap", [6] * 8, frames=False)
+        found, plain = (examine([str(tmp_path / name)]).to_dict() for name in ("r.mcap", "plain.mcap"))
+        assert found["episodes"] == plain["episodes"] == 8
+        assert [f["check"] for f in found["findings"]] == [f["check"] for f in plain["findings"]]
+
+    def test_copies_for_stock_viewers(self, tmp_path: Path) -> None:
+        record(tmp_path / "r.mcap", [6, 3])
+        result = CliRunner().invoke(
+            app, ["replay", str(tmp_path / "r.mcap"), "--to-mcap", str(tmp_path / "new.mcap")]
+        )
+        assert result.exit_code == 0, result.output
+        assert check(tmp_path / "new.mcap") == 7 + 4
+        assert [p for p in problems(tmp_path / "new.mcap") if p.severity == "error"] == []
+
+    def test_the_record_command(self, tmp_path: Path) -> None:
+        path = str(tmp_path / "r.mcap")
+        arguments = ["record", "CartPole-v1", "-o", path, "--steps", "30", "--frames"]
+        result = CliRunner().invoke(app, [*arguments, "--every", "4"])
+        assert result.exit_code == 0, result.output
+        with Recording(path) as recording:
+            for episode in recording.episodes:
+                assert set(range(0, len(episode) + 1, 4)) <= set(episode.frames.steps.tolist())
+        result = CliRunner().invoke(app, ["record", "CartPole-v1", "-o", path, "--every", "4"])
+        assert (result.exit_code, "give --frames too" in result.stderr) == (2, True)
 
 
 class TestDamage:

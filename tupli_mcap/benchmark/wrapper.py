@@ -34,6 +34,8 @@ _RECORDING_OPTIONS = (
     "chunk_size",
     "flush_seconds",
     "durability",
+    "frames",
+    "frame_format",
 )
 
 

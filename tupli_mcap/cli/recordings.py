@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -99,6 +100,10 @@ def _record(
         str | None,
         typer.Option(metavar="VIEWER", help="Show it meanwhile: rerun, foxglove, or the URL of a viewer."),
     ] = None,
+    frames: Annotated[
+        bool, typer.Option("--frames", help="Record what the environment renders (rgb_array) too.")
+    ] = False,
+    every: Annotated[int, typer.Option(min=1, help="With --frames: of every so many steps.")] = 1,
     as_json: Json = False,
 ) -> None:
     """Record rollouts of an environment.
@@ -106,6 +111,12 @@ def _record(
     Modules (of a policy, or an ENV_ID such as my_envs:Maze-v0) are looked for in the current directory too.
     Ctrl-C ends the recording early; what was recorded stays.
     """
+    if every > 1 and not frames:
+        raise typer.BadParameter("--every says of how many steps frames are recorded; give --frames too")
+    if frames:
+        os.environ.setdefault(
+            "SDL_VIDEODRIVER", "dummy"
+        )  # no window is opened: pygame need not look for a screen
     from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
     sys.path.insert(0, "")  # as `python -m` has it
@@ -123,6 +134,7 @@ def _record(
             record_info=record_info,
             durability=durability.value,
             live=live,
+            frames=every if frames else False,
             progress=progress,
         )
     if as_json:

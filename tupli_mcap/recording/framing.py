@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from typing import Any, Final
+
+import numpy as np
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording.cameras import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.recording.pictures import FrameFormat, check_picture, encode_picture
+from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.writer import RecordingWriter
 
-__all__ = ["CAMERA", "FrameRecorder", "check_every", "check_render_mode"]
+__all__ = [
+    "CAMERA",
+    "RENDER_MODE",
+    "FrameRecorder",
+    "VectorFrames",
+    "check_every",
+    "check_render_mode",
+    "put_frame",
+]
 
+Array = np.ndarray[Any, Any]
 CAMERA: Final = "render"
 """The camera that `env.render()` is."""
 
@@ -59,19 +72,20 @@ class FrameRecorder:
         """After a reset that failed: nothing is known of the state."""
         self._first[env] = None
 
-    def step(self, env: int, episode: int, step: int, ended: bool, render: Callable[[], Any]) -> None:
-        """After `step` steps of an episode; `render` is called if their frame is wanted.
+    def step(self, env: int, episode: int, step: int, ended: bool, render: Callable[[], Any] | None) -> None:
+        """After `step` steps of an episode; `render` is called if their frame is wanted; None where the environment
+        has been reset since.
 
         Raises:
             RecordingError: what is rendered is no picture.
         """
         first, self._first[env] = self._first[env], None
         if first is not None:
-            self._put(env, episode, 0, first)
-        if not ended and step % self._every:
+            put_frame(self._writer, env, episode, 0, first)
+        if render is None or (not ended and step % self._every):
             return
         frame = self._encoded(render())
-        self._put(env, episode, step, frame)
+        put_frame(self._writer, env, episode, step, frame)
         if ended:  # where no reset follows, the next episode starts here
             self._first[env] = frame
 
@@ -79,12 +93,63 @@ class FrameRecorder:
         now = time.time_ns()
         return EncodedFrame(now, self._form, encode_picture(check_picture(picture, "frames"), self._form))
 
-    def _put(self, env: int, episode: int, step: int, frame: EncodedFrame) -> None:
-        writer = self._writer
-        camera, pairs = writer.channels.cameras[env]
-        log = writer.frames[env]
-        frame = frame._replace(time_ns=max(frame.time_ns, log.latest_ns))
-        with writer.whole:
-            log.append(
-                frame.time_ns, (pairs, encode_pair(episode, step)), (camera, encode_frame(CAMERA, frame))
+
+def put_frame(writer: RecordingWriter, env: int, episode: int, step: int, frame: EncodedFrame) -> None:
+    """Puts the frame of a step that is recorded into a recording; its time is not before the last one's."""
+    camera, pairs = writer.channels.cameras[env]
+    log = writer.frames[env]
+    frame = frame._replace(time_ns=max(frame.time_ns, log.latest_ns))
+    with writer.whole:
+        pair = (pairs, encode_pair(episode, step))
+        log.append(frame.time_ns, pair, (camera, encode_frame(CAMERA, frame)))
+
+
+class VectorFrames:
+    """The frames of a vector environment's cameras, of which `render()` gives one a sub-environment."""
+
+    def __init__(self, writer: RecordingWriter, num_envs: int, every: int, form: FrameFormat) -> None:
+        self._frames = FrameRecorder(writer, num_envs, every, form)
+        self._n = num_envs
+
+    def start(self, chosen: Array, render: Callable[[], Any]) -> None:
+        """After a reset of the `chosen` sub-environments (bool)."""
+        pictures = self._rendered(render)
+        for i in np.flatnonzero(chosen).tolist():
+            self._frames.start(i, pictures[i])
+
+    def step(
+        self,
+        recorder: VectorRecorder,
+        stepped: Array,
+        ended: Array,
+        render: Callable[[], Any],
+        *,
+        same_step: bool,
+    ) -> None:
+        """After a batch, before its ends are recorded. A sub-environment that took no step was reset; with `same_step`,
+        one that ended was too, so that its final state has no frame.
+
+        Raises:
+            RecordingError: what is rendered are no pictures.
+        """
+        once = cache(lambda: self._rendered(render))
+
+        def picture(i: int) -> Any:
+            return once()[i]
+
+        for i in range(self._n):
+            reset = not stepped[i] or (same_step and bool(ended[i]))
+            if stepped[i]:
+                number, step = recorder.running(i)
+                self._frames.step(i, number, step, bool(ended[i]), None if reset else partial(picture, i))
+            if reset:
+                self._frames.start(i, picture(i))
+
+    def _rendered(self, render: Callable[[], Any]) -> Sequence[Any]:
+        found = render()
+        if not isinstance(found, list | tuple | np.ndarray) or len(found) != self._n:
+            raise RecordingError(
+                f"frames: expected render() to return a picture for each of {self._n} sub-environments, "
+                f"found {type(found).__name__}{f' of {len(found)}' if hasattr(found, '__len__') else ''}"
             )
+        return list(found)

@@ -13,7 +13,9 @@ import gymnasium as gym
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.cameras import EncodedFrame
 from tupli_mcap.recording.events import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
+from tupli_mcap.recording.framing import CAMERA, put_frame
 from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.single import SingleRecorder
@@ -27,7 +29,7 @@ class EpisodeData:
     """An episode as sequences of one value a step.
 
     `final_state` None: not known, and then the last step has no next state. `end` None: from the last step's flags,
-    "interrupted" if neither is set.
+    "interrupted" if neither is set. `frames` are (step, frame), in order; they get the times of the new recording.
     """
 
     states: Sequence[Any]
@@ -41,6 +43,7 @@ class EpisodeData:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     infos: Sequence[Mapping[str, Any]] | None = None
     end: str | None = None
+    frames: Sequence[tuple[int, EncodedFrame]] = ()
 
 
 def write_recording(
@@ -54,26 +57,31 @@ def write_recording(
     attachments: Mapping[str, tuple[str, bytes]] | None = None,
     mode: Mode = "x",
     compression: str = "zstd",
+    frames: bool = False,
 ) -> None:
     """Records episodes that exist as values; exactness and errors are those of `RecordEpisodes`.
+
+    `frames` says that some of them have frames.
 
     Raises:
         StepError: an episode without steps, of unequal columns, or with values that cannot be stored exactly.
     """
     spaces = StepLayout(observation_space, action_space, reward_space)
-    options = WriterOptions(compression, mode, benchmark_id, attachments, keep_empty=True)
+    cameras = (CAMERA,) if frames else ()
+    options = WriterOptions(compression, mode, benchmark_id, attachments, keep_empty=True, cameras=cameras)
     writer = RecordingWriter(path, options)
     recorder = SingleRecorder(writer, spaces, InfoRecorder(True))
     try:
         writer.check_spaces(spaces, 1, vector=False)
         for episode in episodes:
-            _write(recorder, episode)
+            _write(writer, recorder, episode)
     finally:
         recorder.close()
 
 
-def _write(recorder: SingleRecorder, episode: EpisodeData) -> None:
+def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeData) -> None:
     n = len(episode.states)
+    frames = dict(episode.frames)
     columns = (episode.actions, episode.rewards, episode.terminals, episode.timeouts)
     if n == 0 or any(len(column) != n for column in columns):
         found = [n, *(len(column) for column in columns)]
@@ -90,6 +98,10 @@ def _write(recorder: SingleRecorder, episode: EpisodeData) -> None:
         recorder.put(episode.actions[i], after, episode.rewards[i], episode.terminals[i], episode.timeouts[i])
         if episode.infos is not None and episode.infos[i]:
             recorder.put_info(episode.infos[i])
+        for step in (0, 1) if i == 0 else (i + 1,):
+            if step in frames:
+                frame = frames[step]._replace(time_ns=time.time_ns())
+                put_frame(writer, 0, recorder.running[0], step, frame)
     flags = TERMINAL if episode.terminals[n - 1] else TIMEOUT if episode.timeouts[n - 1] else INTERRUPTED
     end = flags if episode.end is None else END_NAMES.index(episode.end)
     metadata = jsonvalue.dumps_plain(dict(episode.metadata)) if episode.metadata else "{}"

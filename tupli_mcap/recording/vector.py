@@ -195,6 +195,11 @@ class VectorRecorder:
                 raise StepError(f"{name}: expected shape {(self._n,)}, found shape {flag.shape}")
         return np.asarray(rewards), *flags
 
+    def running(self, i: int) -> tuple[int, int]:
+        """The number of the running episode of a sub-environment and its steps so far; (-1, 0) if there is none."""
+        episode = self._episodes[i]
+        return (-1, 0) if episode is None else (episode.number, int(self._lengths[i]))
+
     def note_metadata(self, texts: Sequence[str]) -> None:
         """The metadata (JSON texts) of the running episodes, by sub-environment."""
         self._texts = list(texts)

@@ -15,6 +15,8 @@ from tupli_mcap import trust as _trust
 from tupli_mcap.environment import EnvironmentRecord, sha256
 from tupli_mcap.errors import FormatError, NotFoundError, SignatureError, StepError, StorageError
 from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
+from tupli_mcap.recording.cameras import EncodedFrame
+from tupli_mcap.recording.framing import CAMERA
 from tupli_mcap.recording.signature import SIGNATURE_NAME, Signature, sign_recording, verify_signature
 from tupli_mcap.schema import (
     ArtifactMetadata,
@@ -289,6 +291,10 @@ def _write_episodes(
             )
         return
     reward_space = None
+    drawn = False
+    for name in names:
+        with storage.open_recording(name) as recording:
+            drawn = drawn or CAMERA in recording.cameras
     if names:
         with storage.open_recording(names[0]) as recording:
             spaces = [recording.observation_space, recording.action_space]
@@ -307,6 +313,7 @@ def _write_episodes(
             reward_space=reward_space,
             benchmark_id=benchmark_id,
             attachments=attachments,
+            frames=drawn,
         )
     except StepError as err:
         raise StorageError(
@@ -344,7 +351,15 @@ def _episodes(storage: FileStorage, headers: Sequence[EpisodeHeader]) -> Iterato
                     metadata=episode.metadata,
                     infos=None if episode.infos is None else [info or {} for info in episode.infos],
                     end=episode.end,
+                    frames=_frames(recording, positions[header.episode]),
                 )
+
+
+def _frames(recording: Recording, position: int) -> list[tuple[int, EncodedFrame]]:
+    if CAMERA not in recording.cameras:
+        return []
+    frames = recording.frames(position, CAMERA)
+    return [(step, frames.encoded(i)) for i, step in enumerate(frames.steps.tolist())]
 
 
 def _environment(recording: Recording, path: Path) -> EnvironmentRecord:

@@ -16,6 +16,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording.durability import Durability
+from tupli_mcap.recording.framing import RENDER_MODE
 from tupli_mcap.recording.infos import RecordInfo
 from tupli_mcap.recording.options import Mode
 from tupli_mcap.recording.reader import Recording
@@ -55,6 +56,7 @@ def record_rollouts(
     record_info: RecordInfo = False,
     durability: Durability = "os",
     live: str | None = None,
+    frames: bool | int = False,
     progress: Callable[[int], None] | None = None,
 ) -> RolloutSummary:
     """Records `steps` steps of a registered environment into the MCAP file `path`.
@@ -67,6 +69,7 @@ def record_rollouts(
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
         mode, compression, record_info, durability, live: as `RecordEpisodes` has them.
+        frames: as `RecordEpisodes` has it; the environment is made with render_mode="rgb_array".
         progress: called with the number of steps so far, a few hundred times.
 
     Raises:
@@ -79,7 +82,7 @@ def record_rollouts(
     began = time.perf_counter()
     known = _episodes_in(Path(path)) if mode == "a" else 0
     report = _every(max(1, steps // _REPORTS), progress)
-    with contextlib.closing(_make(env_id, num_envs)) as made:
+    with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if frames else None)) as made:
         if isinstance(made, gym.vector.VectorEnv):
             attachments = benchmark_attachments(made.envs[0]) if hasattr(made, "envs") else {}
             vector = RecordVectorEpisodes(
@@ -90,6 +93,7 @@ def record_rollouts(
                 record_info=record_info,
                 durability=durability,
                 live=live,
+                frames=frames,
                 attachments=attachments,
             )
             with _closing(vector, mode):
@@ -103,6 +107,7 @@ def record_rollouts(
                 record_info=record_info,
                 durability=durability,
                 live=live,
+                frames=frames,
             )
             with _closing(single, mode):
                 done = _run(single, steps, seed, policy, report)
@@ -135,11 +140,14 @@ def load_policy(name: str) -> Policy:
     return policy
 
 
-def _make(env_id: str, num_envs: int) -> gym.Env[Any, Any] | gym.vector.SyncVectorEnv:
+def _make(
+    env_id: str, num_envs: int, render_mode: str | None
+) -> gym.Env[Any, Any] | gym.vector.SyncVectorEnv:
+    def make() -> gym.Env[Any, Any]:
+        return gym.make(env_id) if render_mode is None else gym.make(env_id, render_mode=render_mode)
+
     try:
-        if num_envs == 1:
-            return gym.make(env_id)
-        return gym.vector.SyncVectorEnv([lambda: gym.make(env_id)] * num_envs)
+        return make() if num_envs == 1 else gym.vector.SyncVectorEnv([make] * num_envs)
     except Exception as err:  # an environment's constructor may raise anything
         raise RecordingError(f"the environment {env_id!r} cannot be made: {_reason(err)}") from err
 

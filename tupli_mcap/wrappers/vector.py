@@ -19,8 +19,10 @@ from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
+from tupli_mcap.recording.framing import CAMERA, VectorFrames, check_every, check_render_mode
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
 from tupli_mcap.recording.options import Mode, WriterOptions
+from tupli_mcap.recording.pictures import FrameFormat, check_format
 from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.vector_infos import final_info_of, info_of
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
@@ -66,9 +68,15 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         durability: Durability = "os",
         autoreset_mode: str | None = None,
         live: str | None = None,
+        frames: bool | int = False,
+        frame_format: FrameFormat = "png",
     ) -> None:
         super().__init__(env)
         self.path = Path(path)
+        every = check_every(frames)
+        if every:
+            check_render_mode(getattr(env, "render_mode", None))
+            frame_format = check_format(frame_format)
         self._autoreset = _autoreset(env, autoreset_mode)
         n = env.num_envs
         self._callbacks = (
@@ -94,6 +102,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             chunk_size,
             flush_seconds,
             durability=durability,
+            cameras=(CAMERA,) if every else (),
         )
         self._writer = RecordingWriter(path, options)
         try:
@@ -102,6 +111,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             self._writer.close()
             raise
         self._recorder = VectorRecorder(self._writer, spaces, n, self._autoreset, self._infos)
+        self._frames = VectorFrames(self._writer, n, every, frame_format) if every else None
         self._texts = ["{}"] * n
         self._states: list[Any] = []
         self._watches = wanted or metadata_callback is not None
@@ -123,6 +133,11 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         try:
             if self._watches:
                 self._watch(stepped, actions, result)
+            if self._frames is not None:
+                ended = np.logical_or(terminals, timeouts)
+                self._frames.step(
+                    self._recorder, stepped, ended, self.env.render, same_step=self._autoreset == "SameStep"
+                )
         finally:  # a callback that raises changes nothing about what the environments did
             self._recorder.finish(terminals, infos)
         self._writer.flush_if_due()
@@ -143,6 +158,10 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             if self._watches:
                 self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
             self._recorder.reset(states, facts, mask)
+            if self._frames is not None:
+                self._frames.start(
+                    np.ones(self.num_envs, np.bool_) if mask is None else mask, self.env.render
+                )
         except BaseException:  # wherever the environments are now: the running episodes are over
             self._recorder.refuse()
             raise
