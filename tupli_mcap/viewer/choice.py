@@ -7,20 +7,30 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
-from tupli_mcap.dataset.choose import choose_episodes
+import numpy as np
+
 from tupli_mcap.errors import FilterError, RecordingError, TupliError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.episode import Episode
-from tupli_mcap.schema import BaseFilter, parse_filter
-from tupli_mcap.storage.listing import find_recordings
+from tupli_mcap.recording.choice import named_positions
 from tupli_mcap.viewer.plan import Chosen
+
+if TYPE_CHECKING:
+    from tupli_mcap.schema import BaseFilter
 
 __all__ = ["Source", "chosen_from"]
 
 Source = Recording | str | os.PathLike[str]
 _CACHE_BYTES = 64 << 20  # each chunk is read once or twice
 _MOST_OPEN = 200
+
+
+class _Found(NamedTuple):
+    """What an item names in one file."""
+
+    positions: list[int]
+    first_return: float
 
 
 @contextlib.contextmanager
@@ -40,17 +50,17 @@ def chosen_from(
     text = (
         "all" if episodes is None else episodes if isinstance(episodes, str) else ",".join(map(str, episodes))
     )
-    wanted = parse_filter(filter) if isinstance(filter, str) else filter
+    wanted = _parsed(filter) if isinstance(filter, str) else filter
     with contextlib.ExitStack() as stack:
         chosen: list[Chosen] = []
         for source in given:
             if isinstance(source, Recording):
-                chosen.append(_chosen(source, choose_episodes(source, text, wanted)))
+                chosen.append(Chosen(source, _positions(source, text, wanted)))
             elif _is_directory(source):
                 chosen += _of_directory(Path(source), text, wanted, stack)
             else:
                 recording = stack.enter_context(Recording(source, cache_bytes=_CACHE_BYTES))
-                chosen.append(_chosen(recording, choose_episodes(recording, text, wanted)))
+                chosen.append(Chosen(recording, _positions(recording, text, wanted)))
         if not chosen:
             raise RecordingError("expected a recording to show, found none; give its path")
         yield chosen
@@ -60,14 +70,29 @@ def _is_directory(source: str | os.PathLike[str]) -> bool:
     return "://" not in os.fspath(source) and Path(source).is_dir()
 
 
-def _chosen(recording: Recording, episodes: Sequence[Episode]) -> Chosen:
-    return Chosen(recording, [episode.position for episode in episodes])
+def _parsed(text: str) -> BaseFilter:
+    from tupli_mcap.schema import parse_filter
+
+    return parse_filter(text)
+
+
+def _positions(recording: Recording, text: str, filter: BaseFilter | None) -> list[int]:
+    # The storage, and with it its notes of what was deleted, takes half a second to import: a file that was never in
+    # one has no such note beside it.
+    noted = recording.path is not None and recording.path.with_name(f"{recording.path.name}.json").exists()
+    if filter is None and not noted:
+        return named_positions(recording, np.arange(len(recording.index)), text)
+    from tupli_mcap.dataset.choose import candidates, choose_among
+
+    return choose_among(recording, candidates(recording, filter), text, filter)
 
 
 def _of_directory(
     folder: Path, text: str, filter: BaseFilter | None, stack: contextlib.ExitStack
 ) -> list[Chosen]:
-    found: dict[str, dict[str, list[Episode]]] = {}  # item -> file -> episodes
+    from tupli_mcap.storage.listing import find_recordings
+
+    found: dict[str, dict[str, _Found]] = {}  # item -> file -> what it has
     items = list(dict.fromkeys(item.strip().lower() for item in text.split(",")))
     for path in find_recordings(folder):
         try:
@@ -79,8 +104,8 @@ def _of_directory(
             warnings.warn(f"{err}; it is left out", stacklevel=4)
     positions: dict[str, dict[int, None]] = {}
     for item in items:
-        for file, episodes in _one_of(item, found.get(item, {})).items():
-            positions.setdefault(file, {}).update((episode.position, None) for episode in episodes)
+        for file, of_file in _one_of(item, found.get(item, {})).items():
+            positions.setdefault(file, {}).update(dict.fromkeys(of_file.positions))
     if not positions:
         among = "" if filter is None else f" that {filter} is true of"
         raise RecordingError(
@@ -101,14 +126,16 @@ def _collect(
     file: str,
     items: Sequence[str],
     filter: BaseFilter | None,
-    found: dict[str, dict[str, list[Episode]]],
+    found: dict[str, dict[str, _Found]],
 ) -> None:
     for item in items:
         with contextlib.suppress(RecordingError):  # another one of the directory may have it
-            found.setdefault(item, {})[file] = choose_episodes(recording, item, filter)
+            positions = _positions(recording, item, filter)
+            first = float(recording.index["return"][positions[0]])
+            found.setdefault(item, {})[file] = _Found(positions, first)
 
 
-def _one_of(item: str, found: dict[str, list[Episode]]) -> dict[str, list[Episode]]:
+def _one_of(item: str, found: dict[str, _Found]) -> dict[str, _Found]:
     """Of what each file has, what is meant of all."""
     if not found or item not in ("best", "worst", "first", "last"):
         return found
@@ -119,5 +146,5 @@ def _one_of(item: str, found: dict[str, list[Episode]]) -> dict[str, list[Episod
         file = files[-1]
     else:
         pick = max if item == "best" else min
-        file = pick(files, key=lambda name: found[name][0].return_)
+        file = pick(files, key=lambda name: found[name].first_return)
     return {file: found[file]}
