@@ -71,6 +71,7 @@ def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
     try:
         wait_for(lambda: answers(port))
         yield process
+        time.sleep(0.5)  # for what is on its way
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)
@@ -226,9 +227,9 @@ def test_without_a_viewer_there_is_one_warning(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     with pytest.warns(UserWarning, match="no Rerun viewer answers at") as said:
         with RecordEpisodes(gym.make("CartPole-v1"), path, live=url(free_port())) as env:
-            roll(env, 300, 0.01)
+            roll(env, 200, 0.01)
     assert len(said) == 1
-    assert_exact(path, 300)
+    assert_exact(path, 200)
 
 
 def test_a_viewer_may_come_later_be_killed_and_come_back(tmp_path: Path) -> None:
@@ -238,17 +239,17 @@ def test_a_viewer_may_come_later_be_killed_and_come_back(tmp_path: Path) -> None
         with RecordEpisodes(gym.make("CartPole-v1"), path, live=url(port)) as env:
             roll(env, 20, 0.01)
             with receiver(port, tmp_path / "a.rrd") as process:
-                roll(env, 200, 0.01)
+                roll(env, 100, 0.01)
                 os.killpg(process.pid, signal.SIGKILL)
                 roll(env, 100, 0.01)
             with receiver(port, tmp_path / "b.rrd"):
                 roll(env, 250, 0.01)
     assert len([w for w in said if w.category is UserWarning]) == 1, [str(w.message) for w in said]
     rows, _ = shown(tmp_path / "b.rrd", "/state")
-    assert len(rows) > 100
-    assert rows.max() > 500
+    assert len(rows) > 50
+    assert rows.max() > 400
     with Recording(path) as recording:
-        assert (recording.complete, recording.num_steps) == (True, 570)
+        assert (recording.complete, recording.num_steps) == (True, 470)
 
 
 def test_a_viewer_that_stops_taking_data_holds_nothing_up(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import subprocess
 import sys
@@ -19,6 +18,7 @@ __all__ = ["Picture", "RerunView"]
 
 _TRY_AGAIN = 1.0  # seconds between two looks for a viewer that is not there
 _PATIENCE = 0.5  # seconds for a viewer to take what it was sent; then nothing more is sent until it has
+_FAREWELL = 1.5  # the same for the rest, when the rollout is over
 _STARTING = 20.0  # seconds for a viewer that we have started
 
 
@@ -41,7 +41,7 @@ class RerunView:
     """Connects to a Rerun viewer, or starts one and connects to it.
 
     Args:
-        draw: makes the picture, once the layout is known.
+        draw: makes the picture; None as long as too little is known for it.
         warn: told once, if there is no viewer or no longer one.
 
     Raises:
@@ -49,7 +49,11 @@ class RerunView:
     """
 
     def __init__(
-        self, target: Target, title: str, draw: Callable[[Watcher], Picture], warn: Callable[[str], None]
+        self,
+        target: Target,
+        title: str,
+        draw: Callable[[Watcher], Picture | None],
+        warn: Callable[[str], None],
     ) -> None:
         try:
             import rerun
@@ -96,12 +100,15 @@ class RerunView:
     def show(self, watcher: Watcher) -> None:
         if self._picture is None:
             self._picture = self._draw(watcher)
+        if self._picture is None:
+            return
         if self._stream is None and not self._connect(self._picture):
             return
-        if self._is_behind and not self._caught_up():
+        patience = _FAREWELL if watcher.is_over else _PATIENCE
+        if self._is_behind and not self._caught_up(patience):
             return
         self._picture.send(self._stream, watcher)
-        self._caught_up()
+        self._caught_up(patience)
 
     def _connect(self, picture: Picture) -> bool:
         now = time.monotonic()
@@ -119,19 +126,19 @@ class RerunView:
         self._is_behind = True
         return True
 
-    def _caught_up(self) -> bool:
+    def _caught_up(self, patience: float) -> bool:
         """True if the viewer has everything; what it cannot take yet is not added to."""
         try:
-            self._stream.flush(timeout_sec=_PATIENCE)
+            self._stream.flush(timeout_sec=patience)
         except RuntimeError as err:
             self._is_behind = True
             if "timed out" not in str(err) or not self._target.answers():
-                self._lose(str(err))
+                self._lose()
             return False
         self._is_behind = False
         return True
 
-    def _lose(self, reason: str) -> None:
+    def _lose(self) -> None:
         self._stream = None  # without a flush, which would wait for it
         self._say(f"the Rerun viewer at {self._url} is gone; the rollout is shown again once it is back")
 
@@ -141,7 +148,4 @@ class RerunView:
             warn(f"{text} (the recording goes on)")
 
     def close(self) -> None:
-        if self._stream is not None:
-            with contextlib.suppress(RuntimeError):
-                self._stream.flush(timeout_sec=_PATIENCE)
-            self._stream = None
+        self._stream = None

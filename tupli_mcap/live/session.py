@@ -7,6 +7,7 @@ time and rests 25 times as long. Whatever happens here, the rollout goes on; wha
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import threading
 import time
@@ -109,10 +110,11 @@ def open_session(writer: RecordingWriter, live: str, title: str) -> LiveSession 
     view: LiveView
     try:
         if target.kind == "rerun":
-            from tupli_mcap.live.picture import draw
             from tupli_mcap.live.rerun_view import RerunView
 
-            view = RerunView(target, title, draw, _warn)
+            # a layer above this one: it shows recordings in the same panels
+            sketch = importlib.import_module("tupli_mcap.viewer.live").Sketch
+            view = RerunView(target, title, sketch(title), _warn)
         else:
             from tupli_mcap.live.foxglove_view import FoxgloveView
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.labels import LABELS_NAME, Labels
 from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import EPISODE_ROWS
@@ -87,6 +88,19 @@ class Watcher:
     @property
     def is_vector(self) -> bool:
         return self._writer.is_vector
+
+    @property
+    def is_over(self) -> bool:
+        """True once the recording is closed: what is there now is the rest."""
+        return self._writer.closed
+
+    @property
+    def labels(self) -> Labels:
+        """What dimensions and values are called."""
+        layout, attachments = self.layout, self._writer.options.attachments or {}
+        if layout is None or LABELS_NAME not in attachments:
+            return Labels.none()
+        return Labels.from_json(attachments[LABELS_NAME][1], layout.leaves, str(self._writer.path))
 
     def look(self, envs: int) -> tuple[list[NewSteps], Array]:
         """The new steps of the first `envs` sub-environments, and the episodes that have ended (EPISODE_ROWS)."""

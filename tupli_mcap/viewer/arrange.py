@@ -14,6 +14,7 @@ __all__ = ["blueprint_of"]
 
 _STACKED, _A_PAGE = 4, 12
 _MOST_LINKED = 1000  # rows
+_WINDOW = 500  # rows that are shown of a rollout that goes on
 _SHARE = 3.0  # of a column's height, a panel like any other
 _SHARES: dict[type, float] = {
     Lanes: 2.0,
@@ -32,7 +33,7 @@ def blueprint_of(scene: Scene, roots: Sequence[str] = ("",)) -> Any:
 
     # where there is nothing to plot, what is looked at has the room
     main, beside = (scene.states, scene.beside) if scene.states else (scene.beside, [])
-    axis = _time_axis(scene.rows)
+    axis = _newest() if scene.grows else _time_axis(scene.rows)
     groups = ((main, "state"), (scene.actions, "action"))
     left = [
         (_stack(group, roots, axis, name), _share(group, group is main)) for group, name in groups if group
@@ -114,3 +115,14 @@ def _time_axis(rows: int) -> Any:
         return rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
     forever = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
     return rrb.archetypes.TimeAxis(view_range=forever)
+
+
+def _newest() -> Any:
+    """The time axis of plots that grow: the last rows before the cursor, which follows them."""
+    import rerun.blueprint as rrb
+
+    window = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.cursor_relative(seq=-_WINDOW),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    return rrb.archetypes.TimeAxis(view_range=window)

@@ -143,6 +143,10 @@ class Rewards:
             if len(at):
                 send_scalars(place.stream, f"{place.root}/end/{name}", times.at(at), returns[at][:, None])
 
+    def miss(self) -> None:
+        """Steps are left out before the next block: a return that goes on is not known until its episode ends."""
+        self._running = np.nan
+
     def _totals(self, block: Block) -> Array:
         total = np.zeros(len(block))
         for leaf in self.leaves:

@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from tupli_mcap.messages.labels import Labels
 from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.blocks import Array
 from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, escaped, magnitudes, title_of
@@ -18,7 +19,7 @@ from tupli_mcap.viewer.panels import Panel, Rewards, Series
 from tupli_mcap.viewer.pictures import Camera, Grid, HeatMap, Picture
 from tupli_mcap.viewer.words import Lanes, Words, infos_of
 
-__all__ = ["Scene", "scene_of"]
+__all__ = ["Scene", "live_scene", "scene_of"]
 
 MOST_LINES: Final = 12  # in one plot; more cannot be told apart
 _MOST_SMALL: Final = 48  # dimensions that get small plots beside their heat map
@@ -36,10 +37,11 @@ class Scene:
 
     states: list[Panel] = field(default_factory=list)
     actions: list[Panel] = field(default_factory=list)
-    rewards: list[Panel] = field(default_factory=list)
+    rewards: list[Rewards] = field(default_factory=list)
     beside: list[Panel] = field(default_factory=list)  # what is looked at next to the plots
     unseen: list[str] = field(default_factory=list)
     rows: int = 0
+    grows: bool = False  # rows are added while it is looked at
 
     @property
     def panels(self) -> list[Panel]:
@@ -79,6 +81,17 @@ def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = Fa
     if infos is not None:
         scene.beside.append(infos)
     scene.unseen += unseen
+    return scene
+
+
+def live_scene(layout: StepLayout, labels: Labels, sample: Sequence[Any]) -> Scene:
+    """The panels for a rollout that goes on; `sample` has columns of its first steps."""
+    scene = Scene(rewards=[Rewards(layout.reward)], grows=True)
+    material = _Material(labels, sample, _MOST_LANE_ROWS + 1, False)
+    for leaf in layout.state:
+        _add(scene, scene.states, leaf, "states", material)
+    for leaf in layout.action:
+        _add(scene, scene.actions, leaf, "actions", material)
     return scene
 
 

@@ -70,7 +70,9 @@ def send_scalars(stream: Any, entity: str, times: Times, values: Array) -> None:
     import pyarrow as pa
     import rerun as rr
 
-    flat = np.ascontiguousarray(values, np.float64).reshape(-1)
+    flat = np.require(values, np.float64, ("C", "ALIGNED")).reshape(
+        -1
+    )  # the SDK aborts the process at others
     column = column_of(rr.Scalars.descriptor_scalars(), pa.array(flat), values.shape[1])
     stream.send_columns(entity, times.columns, [column])
 
