@@ -24,7 +24,8 @@ SIZE = (1000, 700)
 _ADDRESS = re.compile(r"gRPC connections on 127\.0\.0\.1:(\d+)")
 _OPTIONS = ("--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen")
 _GRIDS = ("TimeSeries", "StateTimeline", "BarChart")
-_TITLE = 30  # rows of pixels
+_TITLE, _BAR = 30, 36  # rows of pixels
+_FADED = 6.0  # seconds after which the viewer's notes on loading are gone
 _ENVIRONMENT = {"RUST_LOG": "info", "NO_COLOR": "1", "RERUN_APP_ONLY": "true", "DISPLAY": ""}
 
 
@@ -148,6 +149,16 @@ class HeadlessViewer:
         if view.view_class in _GRIDS:
             return float((brightest - pixels.min(axis=2) > 60).mean())
         return float((brightest > 60).mean())
+
+    def portrait(self, replay: Path, goal: Path, step: int) -> None:
+        """A picture of a replay at a step, as a PNG, without the viewer's own bar and its notes on this machine."""
+        self.show(replay)
+        self.seek("step", step)
+        time.sleep(_FADED)
+        picture = Image.fromarray(self.screenshot()[_BAR:])
+        picture.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+            goal, optimize=True
+        )
 
     def close(self) -> None:
         """End the viewer and everything it started."""
