@@ -1,4 +1,4 @@
-"""The demo: record two real rollouts, look at the dataset, say which files to open.
+"""The demo: record two real rollouts, look at the dataset, replay the best episode.
 
 Run it with `tools/demo`, which installs what it needs first.
 """
@@ -6,7 +6,10 @@ Run it with `tools/demo`, which installs what it needs first.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import shutil
+import sys
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -16,7 +19,10 @@ from gymnasium.envs.classic_control import MountainCarEnv
 from rich.console import Console
 from rich.table import Table
 
-from tupli_mcap import F, FileStorage, TupliDataset, TupliEnvWrapper
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from viewing import HeadlessViewer, NoViewerError
+
+from tupli_mcap import F, FileStorage, TupliDataset, TupliEnvWrapper, viewer
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes
 
@@ -103,6 +109,33 @@ def show(title: str, dataset: TupliDataset) -> None:
     console.print(table)
 
 
+def replay(lab: Path, *, window: bool) -> None:
+    """The best episode in the viewer; without a display, a file for it and a picture of what it shows."""
+    command = f".venv/bin/tupli-mcap replay {lab.relative_to(ROOT.parent)} --episode best"
+    if window:
+        try:
+            viewer.show(lab, "best")
+            print(f"The viewer shows the best episode; again: {command}")
+            return
+        except viewer.ViewerError as err:
+            print(f"No window: {err}.")
+    replay = viewer.save(lab, ROOT / "best.rrd", "best")
+    print("A replay of the best episode is in demo/best.rrd; open it with: .venv/bin/rerun demo/best.rrd")
+    print(f"  in a window: {command}\n  in a browser: {command} --web")
+    if window and (picture := draw(replay)):
+        print(f"  what it looks like: {picture.relative_to(ROOT.parent)}")
+
+
+def draw(replay: Path) -> Path | None:
+    """A picture of a replay, where this machine can draw without a display."""
+    picture = replay.with_suffix(".png")
+    with contextlib.suppress(NoViewerError), tempfile.TemporaryDirectory() as folder:
+        window = HeadlessViewer(Path(folder), (1280, 860))
+        with window:
+            window.portrait(replay, picture, 60)
+    return picture if picture.exists() else None
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer steps")
@@ -126,7 +159,8 @@ def main() -> None:
     for path in (recording, cart_poles):
         print(f"  .venv/bin/tupli-mcap info {path.relative_to(ROOT.parent)}")
     print("  .venv/bin/tupli-mcap episodes demo/lab --filter 'metadata.highest > 0'")
-    print("They are ordinary MCAP files: Rerun, Foxglove and ROS tools open them too.")
+    print("They are ordinary MCAP files: Rerun, Foxglove and ROS tools open them too.\n")
+    replay(ROOT / "lab", window=not quick)
 
 
 if __name__ == "__main__":
