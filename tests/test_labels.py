@@ -109,6 +109,20 @@ def test_only_what_is_whole_is_taken(tmp_path: Path) -> None:
     assert record(Arm(), tmp_path / "r.mcap").labels == Labels({}, {"action": ("open", "close")}, None)
 
 
+class Joystick(Arm):
+    """## Action Space
+    - 0: something else
+    - 1: something else
+    """
+
+    def get_action_meanings(self) -> list[str]:
+        return ["NOOP", "FIRE"]
+
+
+def test_what_an_environment_says_of_its_actions_counts_more(tmp_path: Path) -> None:
+    assert record(Joystick(), tmp_path / "r.mcap").labels.values == {"action": ("NOOP", "FIRE")}
+
+
 def test_names_may_be_chosen(tmp_path: Path) -> None:
     given = {"state['joints']": ["shoulder", "elbow"], "state['held']": ["a", "b", "c"], "action": ["x", "y"]}
     labels = record(Arm(), tmp_path / "r.mcap", labels=given).labels

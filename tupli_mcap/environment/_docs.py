@@ -44,7 +44,7 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
             continue  # a wrapper has made something else of it
         section = _section(text, "observation space" if name == "state" else "action space")
         if isinstance(space, spaces.Discrete):
-            names = _names(section, int(space.n))
+            names = (name == "action" and _meanings(inner, int(space.n))) or _names(section, int(space.n))
             if names:
                 found.values[name] = names
         elif isinstance(space, spaces.Box) and len(space.shape) == 1:
@@ -77,6 +77,14 @@ def _names(section: str, count: int) -> tuple[str, ...]:
         found = [(int(number), _plain(name)) for number, name in pattern.findall(section)]
         if [number for number, _ in found] == list(range(count)) and all(name for _, name in found):
             return tuple(name for _, name in found)
+    return ()
+
+
+def _meanings(env: Any, count: int) -> tuple[str, ...]:
+    """What the Arcade Learning Environment says of its actions."""
+    with contextlib.suppress(Exception):  # whatever it does
+        names = tuple(_plain(str(name)) for name in env.get_action_meanings())
+        return names if len(names) == count and all(names) else ()
     return ()
 
 
