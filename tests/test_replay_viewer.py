@@ -14,7 +14,7 @@ from tupli_mcap.cli import app
 from tupli_mcap.recording import Recording
 
 rr = pytest.importorskip("rerun")
-from rerun.chunk import RrdReader  # noqa: E402
+from rrd import Rrd  # noqa: E402
 
 
 def record(path: Path, env: str, steps: int, seed: int = 3, **options: Any) -> Path:
@@ -34,47 +34,6 @@ def cartpole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 PUSHES = ("Push cart to the left", "Push cart to the right")
-
-
-class Rrd:
-    """What is in a `.rrd` file: of each of its recordings, the rows of an entity's component."""
-
-    def __init__(self, path: Path) -> None:
-        reader = RrdReader(str(path))
-        self.recordings = sorted(reader.recordings(), key=lambda entry: entry.recording_id)
-        self.blueprints = reader.blueprints()
-        self._batches: list[dict[str, list[Any]]] = []
-        for entry in self.recordings:
-            found: dict[str, list[Any]] = {}
-            for chunk in reader.stream(store=entry):
-                found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
-            self._batches.append(found)
-
-    def entities(self, recording: int = 0) -> set[str]:
-        return set(self._batches[recording])
-
-    def rows(self, entity: str, component: str, recording: int = 0) -> list[Any]:
-        """Of a component or a timeline, in the order they were sent."""
-        batches = [b for b in self._batches[recording][entity] if component in b.schema.names]
-        batches.sort(key=lambda batch: str(batch.column("rerun.controls.RowId")[0]))
-        return [row for batch in batches for row in batch.column(component).to_pylist()]
-
-    def scalars(self, entity: str, recording: int = 0) -> np.ndarray:
-        return np.array(self.rows(entity, "Scalars:scalars", recording))
-
-    def held(self, entity: str, rows: int, recording: int = 0) -> list[str]:
-        """The state of a lane at each step: what was sent last."""
-        sent = dict(
-            zip(
-                self.rows(entity, "step", recording),
-                self.rows(entity, "StateChange:state", recording),
-                strict=True,
-            )
-        )
-        states: list[str] = []
-        for step in range(rows):
-            states.append(sent[step][0] if step in sent else states[-1])
-        return states
 
 
 def test_every_step_is_sent(cartpole: Path, tmp_path: Path) -> None:

@@ -481,7 +481,9 @@ class Recording:
         save: str | os.PathLike[str] | None = None,
         **options: Any,
     ) -> Any:
-        """Shows episodes in the Rerun viewer, or writes them into a `.rrd` file; see `tupli_mcap.viewer`.
+        """Shows episodes in the Rerun viewer (in a notebook: below the cell), or writes them into a `.rrd` file.
+
+        `options` are those of `tupli_mcap.viewer.show`, `display` and `save`.
 
         Raises:
             MissingExtraError: rerun-sdk is not installed.
@@ -491,6 +493,8 @@ class Recording:
         )  # a layer above, which this one is not to depend on
         if save is not None:
             return viewer.save(self, save, episodes, **options)
+        if viewer.in_notebook():
+            return viewer.display(self, episodes, **options)
         return viewer.show(self, episodes, **options)
 
     def plot(self, **options: Any) -> Any:

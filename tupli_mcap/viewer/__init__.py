@@ -9,11 +9,12 @@ from typing import Any
 
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.choice import Source, chosen_from
+from tupli_mcap.viewer.notebook import Display, in_notebook
 from tupli_mcap.viewer.plan import Form, plans_of
 from tupli_mcap.viewer.sdk import ViewerError, rerun_sdk
 from tupli_mcap.viewer.targets import to_browser, to_file, to_viewer, to_window
 
-__all__ = ["Form", "ViewerError", "blueprint", "save", "send", "serve", "show"]
+__all__ = ["Form", "ViewerError", "blueprint", "display", "in_notebook", "save", "send", "serve", "show"]
 
 
 def save(
@@ -51,8 +52,8 @@ def show(
     filter: Any = None,
     form: Form = "joined",
     connect: str | None = None,
-) -> None:
-    """Opens the native viewer on episodes, chosen as for `save`; it stays open.
+) -> int | None:
+    """Opens the native viewer on episodes, chosen as for `save`; it stays open. Returns its process id.
 
     Args:
         connect: send to this viewer instead, `rerun+http://HOST:PORT/proxy`.
@@ -64,9 +65,33 @@ def show(
     rerun_sdk()
     with chosen_from(sources, episodes, filter) as chosen:
         if connect is None:
-            to_window(plans_of(chosen, form))
-        else:
-            to_viewer(plans_of(chosen, form), connect)
+            return to_window(plans_of(chosen, form))
+        to_viewer(plans_of(chosen, form), connect)
+        return None
+
+
+def display(
+    sources: Source | Sequence[Source],
+    episodes: str | Sequence[int] | None = None,
+    *,
+    filter: Any = None,
+    form: Form = "joined",
+    width: int | None = None,
+    height: int | None = None,
+) -> Display:
+    """Episodes, chosen as for `save`, as the result of a notebook's cell.
+
+    Without `rerun-notebook`, the cell shows what is known of them, and what to install.
+
+    Args:
+        width, height: of the viewer (pixels).
+
+    Raises:
+        MissingExtraError: rerun-sdk is not installed.
+    """
+    rerun_sdk()
+    with chosen_from(sources, episodes, filter) as chosen:
+        return Display(plans_of(chosen, form), width, height)
 
 
 def serve(

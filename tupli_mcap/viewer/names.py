@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import zlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,10 +16,12 @@ _LONGEST = 80  # characters of a part of an entity path
 
 
 def escaped(text: str) -> str:
-    """Any text as one part of an entity path."""
+    """Any text as one part of an entity path; texts that cannot be shown as they are get a number, to stay apart."""
     import rerun
 
     shown = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text[:_LONGEST])
+    if shown != text:
+        shown += f"~{zlib.crc32(text.encode('utf-8', 'surrogatepass')):08x}"
     return str(rerun.escape_entity_path_part(shown or "_"))
 
 

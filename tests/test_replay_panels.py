@@ -1,0 +1,227 @@
+"""What becomes of every kind of leaf in a replay, and of what is too much, not a number or strangely named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from tupli_mcap import RecordEpisodes, Recording, viewer
+from tupli_mcap.recording import EpisodeData, write_recording
+
+pytest.importorskip("rerun")
+from rrd import Rrd
+
+Box = spaces.Box
+
+
+class Sampled(gym.Env[Any, Any]):
+    """States from a function of the step, or samples of the space; an episode has 10 steps."""
+
+    def __init__(
+        self,
+        space: gym.Space[Any],
+        state: Callable[[int], Any] | None = None,
+        action: gym.Space[Any] | None = None,
+        info: Callable[[int], dict[str, Any]] | None = None,
+    ) -> None:
+        self.observation_space = space
+        self.action_space = action or spaces.Discrete(3)
+        self._state = state or (lambda _: space.sample())
+        self._info = info or (lambda _: {})
+        self._step = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        self._step = 0
+        return self._state(0), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._step += 1
+        return self._state(self._step), 1.0, self._step == 10, False, self._info(self._step)
+
+
+def replayed(tmp_path: Path, env: gym.Env[Any, Any], steps: int = 20, **options: Any) -> Rrd:
+    path = tmp_path / "sampled.mcap"
+    env.observation_space.seed(1)
+    with RecordEpisodes(env, path, **options) as recorder:
+        recorder.action_space.seed(1)
+        recorder.reset(seed=1)
+        for _ in range(steps):
+            *_, terminated, _, _ = recorder.step(recorder.action_space.sample())
+            if terminated:
+                recorder.reset()
+    return Rrd(viewer.save(path, tmp_path / "sampled.rrd"))
+
+
+def card(found: Rrd) -> str:
+    return str(found.rows("/card", "TextDocument:text")[0][0])
+
+
+def test_dimensions_of_other_scales_are_other_entities(tmp_path: Path) -> None:
+    scales = np.array([1.0, 500.0, 2.0, 0.001, 0.0])
+    found = replayed(tmp_path, Sampled(Box(-np.inf, np.inf, (5,), np.float64), lambda t: scales * (t + 1)))
+    groups = {entity: found.scalars(entity) for entity in found.entities() if entity.startswith("/state")}
+    assert set(groups) == {"/state/dims_0_2", "/state/dims_1", "/state/dims_3_4"}
+    steps = np.tile(np.arange(1.0, 11), 2)
+    assert np.array_equal(groups["/state/dims_1"][:, 0], 500 * steps)
+    assert np.array_equal(groups["/state/dims_0_2"], np.outer(steps, [1.0, 2.0]))
+
+
+def test_more_than_twelve_dimensions_are_a_heat_map_an_episode(tmp_path: Path) -> None:
+    found = replayed(
+        tmp_path, Sampled(Box(-1, 1, (13,), np.float64), lambda t: np.sin(t / 9 + np.arange(13)))
+    )
+    maps = found.rows("/state/heat_map", "Tensor:data")
+    assert found.rows("/state/heat_map", "step") == [0, 10]
+    assert [item[0]["shape"] for item in maps] == [[13, 10], [13, 10]]
+    values = np.array(maps[0][0]["buffer"]).reshape(13, 10)
+    assert values.min() == 0.0 and values.max() == 1.0
+    lines = {entity for entity in found.entities() if entity.startswith("/state/dims")}
+    assert sum(found.scalars(entity).shape[1] for entity in lines) == 13
+    assert all(found.scalars(entity).shape[1] <= 6 for entity in lines)
+
+
+def test_ten_thousand_dimensions_are_pooled(tmp_path: Path) -> None:
+    wide = np.arange(10_000, dtype=np.float32)
+    found = replayed(tmp_path, Sampled(Box(-np.inf, np.inf, (10_000,)), lambda t: wide * t))
+    assert {entity for entity in found.entities() if entity.startswith("/state")} == {"/state/heat_map"}
+    assert found.rows("/state/heat_map", "Tensor:data")[0][0]["shape"] == [512, 10]
+    assert "10,000 dimensions are in the heat map only" in card(found)
+
+
+def test_images_and_grids(tmp_path: Path) -> None:
+    space = spaces.Dict({"eye": Box(0, 255, (4, 6, 3), np.uint8), "map": Box(0, 1, (5, 4), np.float32)})
+    found = replayed(tmp_path, Sampled(space))
+    with Recording(tmp_path / "sampled.mcap") as recording:
+        states = recording.read(fields=["states"]).states
+    pictures = np.array(found.rows("/state/eye", "Image:buffer"), np.uint8)
+    assert np.array_equal(pictures.reshape(20, 4, 6, 3), states["eye"])
+    (form,) = found.rows("/state/eye", "Image:format")
+    assert (form[0]["width"], form[0]["height"]) == (6, 4)
+    grids = np.array([item[0]["buffer"] for item in found.rows("/state/map", "Tensor:data")], np.float32)
+    assert np.array_equal(grids.reshape(20, 5, 4), states["map"])
+
+
+def test_texts_and_values_of_variable_size(tmp_path: Path) -> None:
+    space = spaces.Dict(
+        {"says": spaces.Text(8), "list": spaces.Sequence(spaces.Discrete(4)), "none": Box(0, 1, (0, 3))}
+    )
+    found = replayed(tmp_path, Sampled(space))
+    with Recording(tmp_path / "sampled.mcap") as recording:
+        said = recording.read(fields=["states"]).states["says"]
+    assert [row[0] for row in found.rows("/state/says", "TextLog:text")] == said
+    assert [row[0] for row in found.rows("/state/says", "TextDocument:text")] == said
+    assert len(found.rows("/state/list", "TextDocument:text")) == 20
+    assert "none has no values" in card(found)
+
+
+def test_names_that_are_no_entity_paths(tmp_path: Path) -> None:
+    names = ["a/b", "ü ñ", "", "..", "x" * 300, "\N{ESCAPE}[2J", "[0]", "/"]
+    space = spaces.Dict([(name, Box(0, 1, (2,))) for name in names])
+    found = replayed(tmp_path, Sampled(space))
+    entities = [entity for entity in found.entities() if entity.startswith("/state")]
+    assert len(entities) == len(names)
+    assert all(found.scalars(entity).shape == (20, 2) for entity in entities)
+    assert "\N{ESCAPE}" not in "".join(entities)
+
+
+def test_keys_that_would_be_one_entity_stay_apart(tmp_path: Path) -> None:
+    long = "x" * 100
+    space = spaces.Dict([(long + "a", Box(0, 1, (2,))), (long + "b", Box(0, 1, (2,)))])
+    found = replayed(tmp_path, Sampled(space))
+    assert len([entity for entity in found.entities() if entity.startswith("/state")]) == 2
+
+
+def test_what_is_not_finite_stays_in_its_step(tmp_path: Path) -> None:
+    odd = [np.nan, np.inf, -np.inf, 1.0]
+    path = tmp_path / "odd.mcap"
+    episode = EpisodeData(
+        states=np.array([[value] for value in odd]),
+        actions=np.zeros(4, np.int64),
+        rewards=np.array([1.0, np.nan, 1.0, 1.0]),
+        terminals=np.array([False, False, False, True]),
+        timeouts=np.zeros(4, np.bool_),
+    )
+    space = Box(-np.inf, np.inf, (1,), np.float64)
+    write_recording(path, [episode, episode], observation_space=space, action_space=spaces.Discrete(2))
+    found = Rrd(viewer.save(path, tmp_path / "odd.rrd"))
+    assert np.array_equal(found.scalars("/state")[:, 0], odd * 2, equal_nan=True)
+    nan = np.nan
+    assert np.array_equal(found.scalars("/return")[:, 0], [1, nan, nan, nan] * 2, equal_nan=True)
+
+
+def test_actions_are_lanes_or_steps(tmp_path: Path) -> None:
+    action = spaces.Dict({"gear": spaces.Discrete(3, start=-1), "wheel": Box(-1, 1, (2,))})
+    found = replayed(
+        tmp_path,
+        Sampled(Box(0, 1, (1,)), action=action),
+        labels={"action['gear']": ["back", "neutral", "forth"]},
+    )
+    with Recording(tmp_path / "sampled.mcap") as recording:
+        actions = recording.read(fields=["actions"]).actions
+    gears = [("back", "neutral", "forth")[gear + 1] for gear in actions["gear"]]
+    assert found.held("/action/gear", 20) == gears
+    assert np.array_equal(found.scalars("/action/wheel"), actions["wheel"])
+    assert found.rows("/action/wheel", "SeriesLines:interpolation_mode") == [[2]]  # held until the next
+
+
+def test_infos_are_series_and_logs(tmp_path: Path) -> None:
+    def info(step: int) -> dict[str, Any]:
+        told = {"said": f"step {step}", "speed": step / 2, "won": step == 10, "array": np.zeros(3)}
+        return told if step % 2 == 0 else {"speed": step / 2}
+
+    found = replayed(tmp_path, Sampled(Box(0, 1, (1,)), info=info), record_info=True)
+    speeds = np.tile(np.arange(1, 11) / 2, 2)
+    assert np.array_equal(found.scalars("/info/speed")[:, 0], speeds)
+    assert found.rows("/info/won", "step") == [1, 3, 5, 7, 9, 11, 13, 15, 17, 19]
+    assert found.rows("/info/said", "TextLog:text")[:2] == [["step 2"], ["step 4"]]
+    assert "info 'array'" in card(found)
+
+
+def test_time_in_the_environment_is_a_timeline_where_it_is_known(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("Pendulum-v1"), tmp_path / "pendulum.mcap") as recorder:
+        recorder.reset(seed=1)
+        for _ in range(100):
+            recorder.step(np.zeros(1, np.float32))
+    found = Rrd(viewer.save(tmp_path / "pendulum.mcap", tmp_path / "pendulum.rrd"))
+    with Recording(tmp_path / "pendulum.mcap") as recording:
+        labels = recording.labels
+    assert labels.step_seconds is not None
+    seconds = [at.total_seconds() for at in found.rows("/state", "episode_time")]
+    assert np.allclose(seconds, np.arange(100) * labels.step_seconds, atol=1e-6)
+    assert found.rows("/state", "SeriesLines:names") == [list(labels.dimensions["state"])]
+    unknown = replayed(tmp_path, Sampled(Box(0, 1, (1,))))
+    assert unknown.rows("/state", "step") and unknown.rows("/state", "episode_time") == []
+
+
+def test_an_episode_longer_than_a_block_goes_on(tmp_path: Path) -> None:
+    n = 70_000
+    values = np.arange(n, dtype=np.float64)
+    ends = np.zeros(n, np.bool_)
+    episode = EpisodeData(values[:, None], np.zeros(n, np.int64), np.ones(n), ends, ends)
+    space = Box(-np.inf, np.inf, (1,), np.float64)
+    path = tmp_path / "long.mcap"
+    write_recording(path, [episode], observation_space=space, action_space=spaces.Discrete(2))
+    found = Rrd(viewer.save(path, tmp_path / "long.rrd"))
+    assert np.array_equal(found.scalars("/state")[:, 0], values)
+    assert np.array_equal(found.scalars("/return")[:, 0], values + 1)
+    assert found.rows("/state", "step") == list(range(n))
+
+
+def test_the_overview_is_of_all_episodes(tmp_path: Path) -> None:
+    n = 1500
+    with RecordEpisodes(Sampled(Box(0, 1, (1,))), tmp_path / "many.mcap") as recorder:
+        for _ in range(n):
+            recorder.reset()
+            recorder.step(0)
+    found = Rrd(viewer.save(tmp_path / "many.mcap", tmp_path / "many.rrd", "last"))
+    assert found.scalars("/overview/return").tolist() == [[1.0]] * n
+    assert found.rows("/overview/return", "episode") == list(range(n))
+    (bars,) = found.rows("/overview/length", "BarChart:values")
+    assert bars[0]["shape"] == [1000]  # no window shows more
+    assert len(found.scalars("/reward")) == 1

@@ -1,0 +1,82 @@
+"""Replays in a notebook: the viewer itself where `rerun-notebook` is installed, else what is known of the episodes."""
+
+from __future__ import annotations
+
+import html
+import importlib
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+from tupli_mcap.viewer.plan import Plan
+
+__all__ = ["Display", "in_notebook"]
+
+_SIZE = (1200, 700)  # pixels
+
+
+def in_notebook() -> bool:
+    """Whether this is the kernel of a notebook."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return shell is not None and hasattr(shell, "kernel")
+
+
+def _widget_installed() -> bool:
+    try:
+        importlib.import_module("rerun_notebook")
+    except ImportError:
+        return False
+    return True
+
+
+class Display:
+    """Episodes that show themselves as the result of a cell.
+
+    Args:
+        width, height: of the viewer (pixels).
+    """
+
+    def __init__(self, plans: Iterable[Plan], width: int | None = None, height: int | None = None) -> None:
+        self._width, self._height = width or _SIZE[0], height or _SIZE[1]
+        installed = _widget_installed()
+        self._facts: list[tuple[str, str]] = []
+        self._streams: list[tuple[Any, Any]] = []
+        for plan in plans:
+            self._facts.append((plan.name, plan.shown))
+            if installed:
+                stream = plan.new_stream()
+                plan.send(stream)  # kept until there is a viewer to take it
+                self._streams.append((stream, plan.blueprint))
+
+    def viewer(self) -> Any:
+        """The viewer, an ipywidget, with everything in it; None where `rerun-notebook` is not installed."""
+        if not self._streams:
+            return None
+        from rerun.notebook import Viewer
+
+        viewer = Viewer(width=self._width, height=self._height, use_global_recording=False)
+        for stream, blueprint in self._streams:
+            viewer.add_recording(stream, blueprint)
+        return viewer
+
+    def _ipython_display_(self) -> None:
+        from IPython.display import HTML, display
+
+        viewer = self.viewer()
+        if viewer is None:
+            display(HTML(self._repr_html_()))
+        else:
+            viewer.display()
+
+    def _repr_html_(self) -> str:
+        """What there is to say without a viewer."""
+        told = "".join(
+            f"<p><b>{html.escape(name)}</b></p><pre>{html.escape(shown)}</pre>" for name, shown in self._facts
+        )
+        return (
+            f"{told}<p>To see it here: <code>pip install rerun-notebook</code>, and restart the kernel.</p>"
+        )
+
+    def __repr__(self) -> str:
+        return "; ".join(f"{name}: {shown.splitlines()[0]}" for name, shown in self._facts)
