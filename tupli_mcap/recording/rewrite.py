@@ -87,7 +87,7 @@ def rewrite_recording(
 
 
 class _Rewriter:
-    def __init__(self, source: Recording, container: Container, frames: NewFrames | None) -> None:
+    def __init__(self, source: Recording, container: Container, frames: NewFrames | None = None) -> None:
         self._new_frames = frames
         self._held: dict[
             int, int
