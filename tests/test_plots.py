@@ -2,26 +2,59 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import roll
+from environments import Sampler, Scripted, roll
+from gymnasium import spaces
+from PIL import Image
+from typer.testing import CliRunner
 
 from tupli_mcap import (
+    EpisodeData,
+    F,
+    FileStorage,
+    FilterError,
     RecordEpisodes,
     Recording,
+    RecordingError,
+    TupliEnvWrapper,
+    vector,
+    write_recording,
 )
-from tupli_mcap.plots import gather, report
+from tupli_mcap.cli import app
+from tupli_mcap.cli.sparklines import PLAIN, sparkline
+from tupli_mcap.plots import Report, gather, report
+from tupli_mcap.plots.draw_coverage import most_varying
+from tupli_mcap.plots.draw_trace import by_scale
+from tupli_mcap.plots.draw_values import LEVELS, quantiles
 from tupli_mcap.plots.gather import measure
+from tupli_mcap.plots.series import bands, bin_count, bin_edges, running_mean
+from tupli_mcap.recording.sketch import sketch
+
+TOOL = Path(sys.executable).with_name("tupli-mcap")
+UNIT = spaces.Box(-1, 1, (3,), np.float32)
 
 
-def record(path: Path, env: gym.Env[Any, Any], steps: int, seed: int = 1) -> Path:
-    with RecordEpisodes(env, path) as recorded:
+def record(path: Path, env: gym.Env[Any, Any], steps: int, seed: int = 1, **options: Any) -> Path:
+    with RecordEpisodes(env, path, **options) as recorded:
         roll(recorded, steps, seed)
     return path
+
+
+def scripted(
+    path: Path, observe: Callable[[int], Any], space: gym.Space[Any], steps: int = 40, **options: Any
+) -> Path:
+    return record(path, Scripted(observe, space, **options), steps)
 
 
 @pytest.fixture
@@ -29,34 +62,648 @@ def cartpole(tmp_path: Path) -> Path:
     return record(tmp_path / "cartpole.mcap", gym.make("CartPole-v1"), 400)
 
 
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    """Few panels: quickly drawn."""
+    space = spaces.Box(-99, 99, (1,), np.float32)
+    return scripted(tmp_path / "tiny.mcap", lambda n: np.float32([n]), space, 55, length=10)
+
+
 def measured(path: Path) -> gather.Measured:
     with Recording(path) as recording:
         return measure(recording, np.arange(len(recording)))
 
 
+def texts(made: Report) -> list[str]:
+    """Every text in the picture."""
+    from matplotlib.text import Text
+
+    return [found.get_text() for found in made.figure.findobj(Text)]
+
+
 # --- numbers ---
 
 
-def test_moments_and_ranges_are_those_of_the_whole_data(
-    cartpole: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("block_bytes", [1000, 8 << 20])  # many blocks and parts of episodes, or one
+def test_values_are_those_of_the_whole_data(
+    cartpole: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
 ) -> None:
-    monkeypatch.setattr("tupli_mcap.recording.blocks.BLOCK_BYTES", 1000)  # many blocks, parts of episodes too
+    monkeypatch.setattr("tupli_mcap.recording.blocks.BLOCK_BYTES", block_bytes)
     found = measured(cartpole)
     with Recording(cartpole) as recording:
-        states = recording.read().states.astype(np.float64)
-        actions = recording.read().actions
-    (state,) = found.states
+        columns = recording.read()
+    states = columns.states.astype(np.float64)
+    (state,), (action,), (reward,) = found.states, found.actions, found.rewards
     np.testing.assert_allclose(state.mean, states.mean(axis=0), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(state.std, states.std(axis=0), rtol=1e-9)
     np.testing.assert_array_equal(state.least, states.min(axis=0))
     np.testing.assert_array_equal(state.most, states.max(axis=0))
     np.testing.assert_array_equal(state.sample, states)
-    (action,) = found.actions
-    np.testing.assert_array_equal(action.counts[0], np.bincount(actions, minlength=2))
-    assert found.read_steps == found.steps == 400 and found.notes() == []
+    np.testing.assert_array_equal(action.counts[0], np.bincount(columns.actions, minlength=2))
+    np.testing.assert_array_equal(quantiles([state], 2), np.percentile(states[:, 2], LEVELS))
+    assert (reward.mean[0], reward.std[0], reward.finite[0]) == (1.0, 0.0, 400)
+    assert found.read_steps == found.steps == 400
+    assert found.notes() == []
+    assert state.names == ("Cart Position", "Cart Velocity", "Pole Angle", "Pole Angular Velocity")
 
 
-def test_a_report_is_made_in_every_format(cartpole: Path, tmp_path: Path) -> None:
-    made = report(cartpole)
-    for suffix, head in ((".png", b"\x89PNG"), (".svg", b"<?xml"), (".html", b"<!DOCTYPE html>")):
-        assert made.save(tmp_path / f"report{suffix}").read_bytes().startswith(head)
+def test_nan_and_infinities_are_counted_and_left_out(tmp_path: Path) -> None:
+    odd = {3: np.nan, 7: np.inf, 11: -np.inf}
+    path = scripted(
+        tmp_path / "r.mcap", lambda n: np.array([odd.get(n, n), 2 * n, np.nan]), spaces.Box(-99, 99, (3,), np.float64),
+        length=20, reward=lambda n: odd.get(n, 1.0),
+    )  # fmt: skip
+    found = measured(path)
+    (state,) = found.states
+    with Recording(path) as recording:
+        column = recording.read().states[:, 0]
+    kept = column[np.isfinite(column)]
+    assert (state.nan.tolist(), state.infinite.tolist()) == ([2, 0, 40], [4, 0, 0])
+    assert (state.mean[0], state.std[0], state.least[0], state.most[0]) == pytest.approx(
+        (kept.mean(), kept.std(), kept.min(), kept.max())
+    )
+    assert np.isnan([state.mean[2], state.std[2], state.least[2], state.most[2]]).all()
+    assert "state: 42 NaN, 4 infinite values are left out." in found.notes()
+    assert report(path).png()
+
+
+def test_the_largest_numbers_are_drawn_or_said_not_to_be(tmp_path: Path) -> None:
+    for k, size in enumerate((3e38, 1.7e308)):
+        path = scripted(
+            tmp_path / f"{k}.mcap", lambda n, s=size: np.array([n % 7, (-1) ** n * s, s]),
+            spaces.Box(-np.inf, np.inf, (3,), np.float64), length=20, reward=lambda n, s=size: (-1) ** n * s,
+        )  # fmt: skip
+        made = report(path)
+        assert made.png()
+        assert any("values beyond 1e+150 are not drawn" in note for note in made.notes) == (k == 1)
+
+
+def test_long_recordings_are_sampled_and_say_so(cartpole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Recording(cartpole) as recording:
+        states = recording.read().states
+    monkeypatch.setattr(gather, "SAMPLE_STEPS", 50)
+    found = measured(cartpole)
+    sample = found.states[0].sample
+    assert sample.shape == (50, 4)
+    assert {row.tobytes() for row in sample} <= {row.tobytes() for row in states}
+    assert found.actions[0].counts[0].sum() == 400  # counts are exact all the same
+    assert found.notes() == [
+        "Histograms of numbers show 50 randomly chosen steps; counts of choices, means and ranges are exact."
+    ]
+    monkeypatch.setattr(gather, "READ_BYTES", 8000)
+    again = [measured(cartpole) for _ in range(2)]
+    assert 0 < again[0].read_steps < 200
+    assert again[0].actions[0].counts[0].sum() == again[0].read_steps
+    np.testing.assert_array_equal(again[0].states[0].sample, again[1].states[0].sample)
+    assert "randomly chosen episodes" in again[0].notes()[0]
+
+
+def test_images_are_not_read_for_histograms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = record(
+        tmp_path / "r.mcap", Sampler(spaces.Box(0, 255, (20, 30, 3), np.uint8), spaces.Discrete(2)), 60
+    )
+    with Recording(path) as recording:
+        images = set(recording._store.chunks(recording._topics["/image/state"]))
+        read: list[int] = []
+        load = recording._store.load
+        monkeypatch.setattr(recording._store, "load", lambda i, **kw: read.append(i) or load(i, **kw))
+        measure(recording, np.arange(len(recording)))
+        assert read and images and not images & set(read)
+
+
+def test_running_means_and_bands() -> None:
+    values = np.array([1.0, 3.0, np.nan, 5.0, np.inf, 7.0])
+    np.testing.assert_array_equal(running_mean(values, 2), [1, 2, 3, 5, 5, 7])
+    np.testing.assert_array_equal(running_mean(np.array([np.nan, 2.0]), 1), [np.nan, 2])
+    found = bands(np.arange(1000.0), 10)
+    np.testing.assert_allclose(found.mean, np.arange(10) * 100 + 49.5)
+    np.testing.assert_allclose(
+        found.tenth, [np.quantile(np.arange(k * 100, k * 100 + 100), 0.1) for k in range(10)]
+    )
+    assert (found.low.tolist()[3], found.high.tolist()[3]) == (300, 399)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [], [np.nan, np.inf], [3.5], [0.0, 0.0], [1e300, -1e300], [1e-310, 2e-310], [1.0, 1.0 + 2**-52], [5, 6, 9],
+        [-1e18, 1e18], [0.1] * 500 + [1e9], list(range(1000)), [1e308, 1.7e308], [-1.7e308, 1.7e308], [2.0**60] * 3,
+    ],
+)  # fmt: skip
+def test_bins_hold_the_values_or_say_how_many_they_do_not(values: list[float]) -> None:
+    array = np.array(values, np.float64)
+    edges, beyond = bin_edges(array, 30)
+    finite = array[np.isfinite(array)]
+    assert np.isfinite(edges).all()
+    assert (np.diff(edges) > 0).all()
+    assert len(edges) <= 32
+    assert np.histogram(finite, edges)[0].sum() + beyond == len(finite)
+
+
+def test_a_far_value_does_not_squeeze_the_others_into_one_bin() -> None:
+    values = np.append(np.linspace(0, 1, 5000), 1e9)
+    edges, beyond = bin_edges(values, 40)
+    assert beyond == 1
+    assert (np.histogram(values, edges)[0] > 0).sum() > 10
+    assert bin_edges(np.array([2, 3, 3, 5]), 40)[0].tolist() == [1.5, 2.5, 3.5, 4.5, 5.5]  # whole numbers
+    assert [bin_count(n, 40) for n in (1, 20, 10_000)] == [8, 10, 40]
+
+
+def test_the_two_dimensions_that_vary_most(tmp_path: Path) -> None:
+    path = scripted(
+        tmp_path / "r.mcap",
+        lambda n: np.array([n % 2, 9.0, 5 * n, 30 * np.sin(n)]),
+        spaces.Box(-99, 99, (4,), np.float64),
+    )
+    assert most_varying(measured(path), 2) == [(0, 3), (0, 2)]
+    assert most_varying(measured(path)) == [(0, 3), (0, 2), (0, 0)]  # the constant one is none
+
+
+def test_lines_of_one_axis_have_about_one_size() -> None:
+    table = np.array([[1.0, 1000, 2, 900, 0, np.nan]])
+    assert by_scale(table) == [[0, 2, 4, 5], [1, 3]]
+    assert [len(group) for group in by_scale(np.ones((2, 8)))] == [6, 2]
+
+
+def test_an_episode_step_by_step(cartpole: Path) -> None:
+    made = report(cartpole, episode="worst")
+    ((_, trace),) = made.traces
+    with Recording(cartpole) as recording:
+        episode = min(recording.episodes, key=lambda e: e.return_)
+        np.testing.assert_array_equal(trace.values["state"], episode.states)
+        np.testing.assert_array_equal(trace.values["action"][:, 0], episode.actions)
+        np.testing.assert_array_equal(trace.totals, np.cumsum(episode.rewards))
+        assert (trace.episode, trace.length, trace.end) == (episode.number, len(episode), episode.end)
+    assert any(f"Episode {episode.number}: " in text for text in texts(made))
+
+
+def test_a_long_episode_keeps_its_extremes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tupli_mcap.plots.trace.MAX_POINTS", 20)
+    monkeypatch.setattr("tupli_mcap.recording.blocks.BLOCK_BYTES", 2000)
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=400)
+    values[123] = 77
+    path = scripted(
+        tmp_path / "r.mcap",
+        lambda n: values[n : n + 1],
+        spaces.Box(-99, 99, (1,), np.float64),
+        317,
+        length=999,
+    )
+    ((_, trace),) = report(path).traces
+    states = values[:317]
+    assert trace.thinned == 32
+    assert len(trace.at) == len(trace.totals) == len(trace.values["state"]) == 20
+    parts = [states[k : k + 32] for k in range(0, 317, 32)]
+    np.testing.assert_array_equal(trace.values["state"][::2, 0], [part.min() for part in parts])
+    np.testing.assert_array_equal(trace.values["state"][1::2, 0], [part.max() for part in parts])
+    assert trace.totals[-1] == 317.0
+
+
+def test_pictures_of_an_episode(tmp_path: Path) -> None:
+    def frame(n: int) -> Any:
+        return np.full((4, 5, 3), 5 * n, np.uint8)
+
+    path = scripted(tmp_path / "r.mcap", frame, spaces.Box(0, 255, (4, 5, 3), np.uint8), 10, length=10)
+    ((_, trace),) = report(path).traces
+    (pictures,) = trace.pictures
+    assert pictures.steps == [0, 1, 3, 5, 7, 9]
+    assert [int(one[0, 0, 0]) for one in pictures.frames] == [0, 5, 15, 25, 35, 45]
+    assert pictures.mean.shape == (4, 5, 3) and int(pictures.mean[0, 0, 0]) == 22  # of 0, 5, ..., 45
+    assert pictures.averaged == 10
+
+
+# --- pictures of every kind of environment ---
+
+NESTED = spaces.Dict(
+    {
+        "arm": spaces.Dict({"x": spaces.Box(-1, 1, (3,)), "on": spaces.Discrete(2)}),
+        "pair": spaces.Tuple((spaces.MultiBinary(5), spaces.MultiDiscrete([3, 4]))),
+        "big": spaces.Box(-np.inf, np.inf, (40,), np.float64),
+        "note": spaces.Text(8),
+        "list": spaces.Sequence(spaces.Box(-1, 1, (2,))),
+        "none": spaces.Box(-1, 1, (0, 3)),
+        "half": spaces.Box(-1, 1, (), np.float16),
+        "eye": spaces.Box(0, 255, (16, 24, 1), np.uint8),
+        "stack": spaces.Box(0, 255, (4, 20, 20), np.uint8),
+    }
+)
+KINDS: dict[str, tuple[gym.Space[Any], gym.Space[Any]]] = {
+    "nested": (NESTED, spaces.Dict({"a": spaces.Discrete(3, start=-1), "b": spaces.Box(-2, 2, (2,))})),
+    "discrete": (spaces.Discrete(16), spaces.MultiBinary(3)),
+    "many values": (
+        spaces.Tuple((spaces.Discrete(3000), spaces.Discrete(10**9))),
+        spaces.Tuple((spaces.MultiDiscrete([2] * 30), spaces.MultiDiscrete([2, 10**6]))),
+    ),
+    "wide": (spaces.Box(-1, 1, (400,)), spaces.Box(-1, 1, (20,))),
+    "pixels": (spaces.Box(0, 255, (48, 64, 3), np.uint8), spaces.Box(0, 1, (2, 2), np.bool_)),
+    "grey": (spaces.Box(0, 255, (30, 20), np.uint8), spaces.Box(-5, 5, (), np.int32)),
+    "nothing": (spaces.Dict({}), spaces.Box(0, 1, (0,))),
+    "text": (spaces.Text(6), spaces.Graph(spaces.Discrete(3), None)),
+}
+
+
+def check_formats(made: Report, directory: Path) -> None:
+    """A picture that is not blank, and a page with the same picture as SVG."""
+    for suffix in (".png", ".html"):
+        made.save(directory / f"report{suffix}")
+    with Image.open(directory / "report.png") as image:
+        pixels = np.asarray(image.convert("L"))
+        assert image.width == 1100
+    assert 0.002 < (pixels < 128).mean() < 0.6
+    rows = np.flatnonzero((pixels < 200).any(axis=1))
+    assert np.diff(rows).max() < 120  # no gap of more than an inch
+    assert (directory / "report.html").read_text().count("<svg") == 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_space_is_drawn_without_a_warning(tmp_path: Path, kind: str) -> None:
+    observation, action = KINDS[kind]
+    path = record(tmp_path / "r.mcap", Sampler(observation, action), 40)
+    check_formats(report(path), tmp_path)
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "Blackjack-v1"])
+def test_real_environments_are_drawn(tmp_path: Path, env_id: str) -> None:
+    check_formats(report(record(tmp_path / "r.mcap", gym.make(env_id), 300)), tmp_path)
+
+
+def test_what_is_not_shown_is_noted(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", Sampler(NESTED, spaces.Discrete(2)), 40)
+    made = report(path)
+    assert "note is of variable size (Text) and not shown." in made.notes
+    assert "list is of variable size (Sequence) and not shown." in made.notes
+    assert "none has no elements (shape (0, 3))." in made.notes
+    assert set(made.notes) <= {text.replace("\n", " ") for text in texts(made)}
+
+
+def test_names_and_labels_are_in_the_picture(tmp_path: Path) -> None:
+    env = Sampler(UNIT, spaces.Discrete(3))
+    labels = {"state": ["height", "speed $^2$", "drag"], "action": ["left", "stay", "right"]}
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(env, path, labels=labels) as recorded:
+        recorded.reset(seed=1)
+        for _ in range(5):
+            recorded.step(2)
+    found = texts(report(path))
+    assert {"height", "speed $^2$", "drag", "left", "stay", "right"} <= set(found)
+    assert found.count(" never") == 2
+
+
+def test_short_unfinished_and_empty_recordings(tmp_path: Path) -> None:
+    one_step = record(tmp_path / "one.mcap", gym.make("CartPole-v1"), 1)
+    check_formats(report(one_step), tmp_path)
+    writing = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "live.mcap")
+    writing.reset(seed=1)
+    writing.step(0)
+    made = report(tmp_path / "live.mcap")
+    assert dict(made.facts)["recording"] == "live (recording)"
+    writing.close()
+    write_recording(tmp_path / "empty.mcap", [], observation_space=UNIT, action_space=spaces.Discrete(2))
+    empty = report(tmp_path / "empty.mcap")
+    assert empty.notes == ["There is no episode."]
+    assert empty.png() and empty.html()
+
+
+def test_vector_recordings(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with vector.RecordEpisodes(
+        gym.make_vec("CartPole-v1", num_envs=3, vectorization_mode="sync"), path
+    ) as envs:
+        envs.reset(seed=1)
+        envs.action_space.seed(1)
+        for _ in range(60):
+            envs.step(envs.action_space.sample())
+    found = measured(path)
+    with Recording(path) as recording:
+        columns = recording.read()
+    np.testing.assert_array_equal(np.sort(found.states[0].sample, axis=0), np.sort(columns.states, axis=0))
+    made = report(path)
+    assert "3 sub-environments" in dict(made.facts)["environment"]
+    assert made.png()
+
+
+def test_many_episodes_become_bands(tmp_path: Path) -> None:
+    episodes = [
+        EpisodeData([UNIT.low] * n, [0] * n, [float(i)] * n, [j == n - 1 for j in range(n)], [False] * n)
+        for i in range(3100)
+        for n in (1 + i % 3,)
+    ]
+    write_recording(tmp_path / "r.mcap", episodes, observation_space=UNIT, action_space=spaces.Discrete(2))
+    made = report(tmp_path / "r.mcap")
+    assert {"smallest to largest", "middle 80%", "mean of 12 episodes"} <= set(texts(made))
+    check_formats(made, tmp_path)
+
+
+def test_a_recording_that_is_open(cartpole: Path) -> None:
+    with Recording(cartpole) as recording:
+        made = recording.plot(episode=3, episode_filter=F("n_tuples") > 10)
+        assert recording.episodes[3].states is not None  # still open
+        assert len(made.measured[0].rows) == int((recording.index["length"] > 10).sum())
+    assert [trace.episode for _, trace in made.traces] == [3]
+    assert made._repr_png_().startswith(b"\x89PNG")
+    assert made._repr_html_().startswith('<div class="tupli-report">')
+
+
+# --- several recordings ---
+
+
+def test_recordings_are_compared(tmp_path: Path) -> None:
+    for name, seed in (("slow", 1), ("quick", 2)):
+        record(tmp_path / f"{name}.mcap", gym.make("CartPole-v1"), 200, seed)
+    made = report(tmp_path)
+    assert [one.name for one in made.measured] == ["quick", "slow"]
+    assert made.title == "CartPole-v1: 2 recordings"
+    best = max((one.rows["return"].max(), one.name) for one in made.measured)[1]
+    assert [one.name for one, _ in made.traces] == [best]
+    check_formats(made, tmp_path)
+    with pytest.raises(
+        RecordingError, match="expected best, worst, first or last of 2 recordings, found '3'"
+    ):
+        report(tmp_path, episode=3)
+
+
+def test_recordings_of_different_spaces_are_compared_by_their_returns(tmp_path: Path) -> None:
+    record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 100)
+    record(tmp_path / "b.mcap", gym.make("Pendulum-v1"), 300)
+    made = report([tmp_path / "a.mcap", tmp_path / "b.mcap"])
+    assert made.notes[0].startswith("The recordings have different spaces")
+    assert made.png()
+    many = tmp_path / "many"
+    many.mkdir()
+    for i in range(14):
+        record(many / f"{i:02}.mcap", gym.make("CartPole-v1"), 20, i)
+    assert "and 2 more" in texts(report(many))
+
+
+def test_a_storage_without_what_it_has_deleted(tmp_path: Path) -> None:
+    storage = FileStorage(tmp_path / "lab")
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), storage=storage)
+    env.store(name="cartpole", description="")
+    roll(env, 120)
+    env.close()
+    headers = storage.list_episodes()
+    storage.delete_episode(headers[0].id)
+    (one,) = report(tmp_path / "lab").measured
+    assert len(one.rows) == len(headers) - 1
+    storage.close()
+
+
+# --- files ---
+
+
+def test_the_same_recording_gives_the_same_bytes(tiny: Path) -> None:
+    first, second = report(tiny), report(tiny)
+    assert first.svg() == second.svg() == first.svg()
+    assert first.svg().startswith(b"<?xml")
+    assert first.html() == second.html()
+
+
+HOSTILE = "</svg><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$\\frac{--><!--\u202e"
+
+
+class _Tags(HTMLParser):
+    """Every element with its attributes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+
+def test_nothing_from_a_file_becomes_html(tmp_path: Path) -> None:
+    class Env(Sampler):
+        pass
+
+    Env.__name__ = Env.__qualname__ = HOSTILE
+    path = tmp_path / "<script>alert(3)<" / "r.mcap"  # a "/" would be a directory
+    path.parent.mkdir()
+    path = path.with_name("<img src=x onerror=alert(4)>.mcap")
+    space = spaces.Dict({HOSTILE: UNIT, "x": spaces.Discrete(2)})
+    with RecordEpisodes(
+        Env(space, spaces.Discrete(2)), path, labels={"action": ["<b onload=x>", "$x$"]}
+    ) as env:
+        roll(env, 20)
+    made = report(path)
+    assert HOSTILE[:20] in made.title
+    page = made.html().decode()
+    for document in (page, page[page.index('<div class="tupli-report">') :]):
+        tags = _Tags()
+        tags.feed(document)
+        names = {tag for tag, _ in tags.found}
+        assert not names & {"script", "img", "b", "iframe", "object", "foreignobject", "a", "link"}
+        for tag, attributes in tags.found:
+            assert not [key for key in attributes if key.startswith("on")], (tag, attributes)
+            for key in ("href", "xlink:href", "src"):
+                assert (attributes.get(key) or "#").startswith(("#", "data:image/png;"))
+        assert "alert(1)" in document  # shown, as text
+    assert 'http-equiv="Content-Security-Policy" content="default-src \'none\'' in page
+    assert made._repr_html_() in page
+
+
+def test_a_file_is_written_whole_or_not_at_all(tiny: Path, tmp_path: Path) -> None:
+    made = report(tiny)
+    goal = tmp_path / "report.png"
+    goal.write_bytes(b"old")
+    with pytest.raises(RecordingError, match=r"report.png exists; choose another name, or overwrite it"):
+        made.save(goal)
+    assert goal.read_bytes() == b"old"
+    assert made.save(goal, overwrite=True) == goal
+    with pytest.raises(
+        RecordingError, match=r"expected a file that ends in .png, .svg, .html, found 'report.pdf'"
+    ):
+        made.save(tmp_path / "report.pdf")
+    with pytest.raises(RecordingError, match="there is no directory .*; make it first"):
+        made.save(tmp_path / "nowhere" / "report.png")
+    with pytest.raises(RecordingError, match="is a directory; choose another name"):
+        (tmp_path / "d.svg").mkdir()
+        made.save(tmp_path / "d.svg", overwrite=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tiny.mcap", "d.svg", "report.png"]
+
+
+def test_the_users_matplotlib_stays_as_it_is(tiny: Path) -> None:
+    import matplotlib as mpl
+
+    with mpl.rc_context({"font.size": 33, "axes.facecolor": "red", "savefig.dpi": 20}):
+        before = dict(mpl.rcParams)
+        inside = report(tiny).png()
+        assert dict(mpl.rcParams) == before
+    assert inside == report(tiny).png()
+    code = "import sys; from tupli_mcap.plots import report; report(sys.argv[1]).png(); print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, tiny], capture_output=True, text=True, check=True, timeout=60
+    )
+    modules = done.stdout.split()
+    assert "matplotlib.figure" in modules and "matplotlib.pyplot" not in modules
+
+
+# --- the command ---
+
+
+def run(*args: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, [str(arg) for arg in args])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("plot", tiny)
+    assert (code, err) == (0, "")
+    assert out.startswith("tiny.png: ") and ", 55 steps, " in out
+    code, out, _ = run(
+        "plot", tiny, "-o", "two.html", "--episode", "3,worst", "--filter", "n_tuples > 9", "--json"
+    )
+    told = json.loads(out)
+    assert code == 0 and told["path"] == "two.html" and told["notes"] == []
+    with Recording(tiny) as recording:
+        assert told["episodes"] == int((recording.index["length"] > 9).sum())
+    assert run("plot", tiny)[::2] == (
+        1, "error: tiny.png exists; choose another name, or replace it with --force\n",
+    )  # fmt: skip
+    assert run("plot", tiny, "--force")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "message"),
+    [
+        (["missing.mcap"], 1, "missing.mcap does not exist"),
+        (["text.mcap"], 1, "text.mcap"),
+        (
+            ["cartpole.mcap", "-o", "x.jpeg"],
+            1,
+            "expected a file that ends in .png, .svg, .html, found 'x.jpeg'",
+        ),
+        (["cartpole.mcap", "-o", "no/x.png"], 1, "there is no directory 'no'; make it first"),
+        (["cartpole.mcap", "--episode", "999"], 1, "cartpole.mcap has no episode 999; choose from 0 to"),
+        (["cartpole.mcap", "--episode", "finest"], 2, "expected numbers of episodes such as '3,7,9'"),
+        (["cartpole.mcap", "--episode", "all"], 1, "expected at most 4 episodes to show in full, found"),
+        (
+            ["cartpole.mcap", "--filter", "n_tuples > 99999"],
+            1,
+            'there is no episode that F("n_tuples") > 99999 is true of',
+        ),
+        (["cartpole.mcap", "--filter", "n_tuples >"], 2, "error: "),
+        (["cartpole.mcap", "--filter", "color = 3"], 2, "color"),
+        ([], 2, "Missing argument"),
+    ],
+)
+def test_bad_input_is_one_line(
+    cartpole: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], code: int, message: str
+) -> None:
+    monkeypatch.chdir(cartpole.parent)
+    Path("text.mcap").write_text("no recording")
+    found, out, err = run("plot", *args)
+    assert (found, out, err.count("\n")) == (code, "", 1), err
+    assert message in err
+    assert not list(Path().glob("*.png"))
+
+
+def test_without_matplotlib_the_extra_is_named(cartpole: Path, tmp_path: Path) -> None:
+    (tmp_path / "hidden").mkdir()
+    (tmp_path / "hidden" / "matplotlib.py").write_text("raise ImportError('hidden')\n")
+    path = os.pathsep.join(filter(None, (str(tmp_path / "hidden"), os.environ.get("PYTHONPATH", ""))))
+
+    def tool(*args: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [TOOL, *map(str, args)], capture_output=True, text=True, check=False,
+            env={**os.environ, "PYTHONPATH": path}, cwd=tmp_path, timeout=60,
+        )  # fmt: skip
+
+    done = tool("plot", cartpole)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert (
+        done.stderr
+        == "error: reports need matplotlib: pip install 'tupli-mcap[plot]' (or pip install matplotlib)\n"
+    )
+    assert "Cart Position" in tool("info", cartpole).stdout  # needs none of it
+
+
+def test_a_word_that_is_none_is_refused(cartpole: Path) -> None:
+    with pytest.raises(FilterError, match="expected numbers of episodes"):
+        report(cartpole, episode="finest")
+
+
+# --- lines of blocks in info ---
+
+
+def test_blocks_follow_the_numbers() -> None:
+    assert sparkline([0, 1, 2, 3, 4, 5, 6, 7]) == "▁▂▃▄▅▆▇█"
+    assert sparkline([5, 5]) == "▅▅"
+    assert sparkline([0, 1, float("nan"), 100], zero_based=True) == " ▁ █"
+    assert sparkline([-1e308, 1e308]) == "▁█"
+    assert sparkline([0, 7], blocks=PLAIN) == ".@"
+    assert sparkline([float("nan")]) == ""
+
+
+def test_a_sketch_is_of_the_whole_data(cartpole: Path) -> None:
+    with Recording(cartpole) as recording:
+        found = sketch(recording, 10)
+        states, rows = recording.read().states.astype(np.float64), recording.index
+    returns, lengths = found.courses
+    parts = np.array_split(rows["length"], 10)
+    np.testing.assert_allclose(sorted(lengths.values), sorted(part.mean() for part in parts), rtol=0.2)
+    assert (lengths.least, lengths.most) == (rows["length"].min(), rows["length"].max())
+    assert returns.values == lengths.values  # a reward of 1 a step
+    by_name = {series.name: series for series in found.distributions}
+    assert list(by_name)[:2] == ["reward", "Cart Position"] and list(by_name)[-1] == "action"
+    for i, name in enumerate(("Cart Position", "Cart Velocity")):
+        np.testing.assert_array_equal(by_name[name].values, np.histogram(states[:, i], 10)[0])
+    assert (found.sampled, found.hidden, found.error) == (400, 0, "")
+
+
+def test_of_a_long_recording_a_sketch_reads_a_few_chunks(
+    cartpole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = record(cartpole.with_name("long.mcap"), gym.make("CartPole-v1"), 3000, chunk_size=2048)
+    monkeypatch.setattr(
+        "tupli_mcap.recording.sketch.READ_BYTES", 16 * 77 * 10
+    )  # ten steps at each of 16 places
+    with Recording(path) as recording:
+        loaded: set[int] = set()
+        load = recording._store.load
+        monkeypatch.setattr(recording._store, "load", lambda i, **kw: loaded.add(i) or load(i, **kw))
+        found = sketch(recording, 10)
+        assert 160 <= found.sampled < 1500
+        chunks = recording._store.chunks(recording._topics["/step"])
+        assert 0 < len(loaded) < len(chunks)
+    assert f"{found.sampled} steps sampled" in run("info", path)[1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_info_of_every_kind(tmp_path: Path, kind: str) -> None:
+    path = record(tmp_path / "r.mcap", Sampler(*KINDS[kind]), 20)
+    for width in ("40", "200"):
+        result = CliRunner().invoke(app, ["info", str(path)], env={"COLUMNS": width})
+        assert result.exit_code == 0 and result.stderr == ""
+        lines = result.stdout.splitlines()
+        assert any(line.startswith("return ") for line in lines)
+        start = next(i for i, line in enumerate(lines) if line.startswith("EPISODES"))
+        assert max(map(len, lines[start:])) <= int(width)
+
+
+def test_info_where_blocks_cannot_be_printed(cartpole: Path) -> None:
+    done = subprocess.run(
+        [TOOL, "info", str(cartpole)], capture_output=True, check=True, timeout=60,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )  # fmt: skip
+    (line,) = [line for line in done.stdout.decode("ascii").splitlines() if line.startswith("Pole Angle ")]
+    assert set(line) & set(PLAIN)
+
+
+def test_info_of_a_damaged_chunk_and_of_none(cartpole: Path, tmp_path: Path) -> None:
+    with Recording(cartpole) as recording:
+        table = recording._contents.table
+        chunk = table[table["channel"] == recording._topics["/step"]][0]
+    data = bytearray(cartpole.read_bytes())
+    data[int(chunk["offset"]) + int(chunk["length"]) // 2] ^= 255
+    cartpole.write_bytes(data)
+    code, out, err = run("info", cartpole)
+    assert (code, err) == (0, "") and "return " in out
+    assert "no step is shown: " in out
+    assert "sketch" not in run("info", cartpole, "--json")[1]
+    write_recording(tmp_path / "empty.mcap", [], observation_space=UNIT, action_space=spaces.Discrete(2))
+    assert "FIRST TO LAST" not in run("info", tmp_path / "empty.mcap")[1]

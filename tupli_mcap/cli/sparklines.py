@@ -36,7 +36,7 @@ def sparkline(values: Sequence[float], *, zero_based: bool = False, blocks: str 
         if not math.isfinite(value) or (zero_based and value <= 0):
             line += " "
         elif high > low:
-            part = value / (high - low) - low / (high - low)  # a difference of huge numbers may overflow
+            part = (value / 2 - low / 2) / (high / 2 - low / 2)  # a difference of huge numbers may overflow
             line += blocks[min(int(part * len(blocks)), len(blocks) - 1)]
         else:
             line += blocks[len(blocks) // 2]

@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.plots.draw_values import colour_bar
 from tupli_mcap.plots.gather import Measured
 from tupli_mcap.plots.page import Cell, Page
-from tupli_mcap.plots.series import bin_count, bin_edges
+from tupli_mcap.plots.series import LARGEST, bin_count, bin_edges, drawn
 from tupli_mcap.plots.style import cut
 from tupli_mcap.recording.blocks import Array
 
@@ -34,7 +34,7 @@ def most_varying(measured: Measured, most: int = 4) -> list[tuple[int, int]]:
         (-float(std), at, i)
         for at, leaf in enumerate(measured.states)
         for i, std in enumerate(leaf.std)
-        if std > 0 and np.isfinite(std)
+        if 0 < std < LARGEST
     ]
     return [(at, i) for _, at, i in sorted(found)[:most]]
 
@@ -66,7 +66,7 @@ def _pair(one: tuple[int, int], other: tuple[int, int]) -> _Pair:
 
 def _points(measured: Measured, pair: _Pair) -> Array:
     """The sampled steps that have both dimensions: (n, 2)."""
-    columns = [measured.states[leaf].sample[:, i].astype(np.float64) for leaf, i in pair]
+    columns = [drawn(measured.states[leaf].sample[:, i]) for leaf, i in pair]
     points = np.stack(columns, axis=1)
     finite: Array = points[np.isfinite(points).all(axis=1)]
     return finite

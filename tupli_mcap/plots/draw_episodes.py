@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.plots.gather import Measured
 from tupli_mcap.plots.page import Cell, Page
-from tupli_mcap.plots.series import bands, bin_count, bin_edges, running_mean, window_of
+from tupli_mcap.plots.series import bands, bin_count, bin_edges, drawn, running_mean, window_of
 from tupli_mcap.plots.style import BLUE, ENDS, GREY, INK, colours, drawable, legend_above, show_alone
 from tupli_mcap.recording.blocks import Array
 from tupli_mcap.recording.events import END_NAMES
@@ -39,7 +39,7 @@ def _draw_order(axes: Any, measured: Sequence[Measured], column: str, name: str)
     axes.set_xlabel("episode")
     if len(measured) == 1:
         rows = measured[0].rows
-        values = rows[column].astype(np.float64)
+        values = drawn(rows[column])
         if len(rows) <= MOST_DOTS:
             _draw_dots(axes, rows, values)
         else:
@@ -82,7 +82,7 @@ def _draw_bands(axes: Any, numbers: Array, values: Array, colour: str, name: str
 
 def _draw_one_of_several(axes: Any, measured: Measured, column: str, colour: str, *, few: bool) -> None:
     numbers = measured.rows["episode"].astype(np.float64)
-    values = measured.rows[column].astype(np.float64)
+    values = drawn(measured.rows[column])
     name = drawable(measured.name, 24)
     if len(values) > MOST_DOTS:
         _draw_bands(axes, numbers, values, colour, name)
@@ -98,7 +98,7 @@ def _draw_one_of_several(axes: Any, measured: Measured, column: str, colour: str
 
 
 def _draw_distribution(axes: Any, measured: Sequence[Measured], column: str, name: str) -> None:
-    pooled = np.concatenate([one.rows[column].astype(np.float64) for one in measured])
+    pooled = np.concatenate([drawn(one.rows[column]) for one in measured])
     edges, beyond = bin_edges(pooled, bin_count(len(pooled), _BINS))
     show_alone(axes, edges)
     if len(measured) == 1:
@@ -109,7 +109,7 @@ def _draw_distribution(axes: Any, measured: Sequence[Measured], column: str, nam
     else:
         axes.set_ylabel("% of episodes", color=GREY)
         for one, colour in zip(measured, colours(len(measured)), strict=True):
-            values = one.rows[column].astype(np.float64)
+            values = drawn(one.rows[column])
             counts, _ = np.histogram(values[np.isfinite(values)], edges)
             axes.stairs(100 * counts / max(1, len(values)), edges, color=colour, linewidth=1.2)
     odd = int((~np.isfinite(pooled)).sum())
@@ -121,7 +121,7 @@ def _draw_ends(axes: Any, rows: Array, column: str, edges: Array) -> None:
     """Stacked, the most frequent end at the bottom."""
     below = np.zeros(len(edges) - 1)
     for i in np.argsort(-np.bincount(rows["end"], minlength=len(END_NAMES)), kind="stable"):
-        values = rows[column][rows["end"] == i].astype(np.float64)
+        values = drawn(rows[column][rows["end"] == i])
         counts, _ = np.histogram(values[np.isfinite(values)], edges)
         if counts.any():
             axes.stairs(

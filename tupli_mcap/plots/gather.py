@@ -8,6 +8,7 @@ import numpy as np
 
 from tupli_mcap.messages.names import short_path
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.plots.series import LARGEST
 from tupli_mcap.plots.trace import Trace
 from tupli_mcap.plots.values import LeafValues
 from tupli_mcap.recording import Recording
@@ -148,6 +149,9 @@ def _notes_of(leaf: LeafValues) -> list[str]:
         )
         if counts.sum()
     ]
+    with np.errstate(invalid="ignore"):
+        if (np.maximum(np.abs(leaf.least), np.abs(leaf.most)) > LARGEST).any():
+            notes.append(f"{name}: values beyond {LARGEST:g} are not drawn.")
     if odd:
         notes.append(f"{name}: {', '.join(odd)} values are left out.")
     return notes

@@ -74,6 +74,7 @@ class Report:
     """A page of pictures.
 
     figure: matplotlib's, to be changed or saved in other ways. measured: the numbers behind it, a recording each.
+    traces: the episodes that are shown step by step, each with its recording.
     notes: what is not shown, and what is a sample.
     """
 
@@ -87,7 +88,7 @@ class Report:
         self.title = title_of(measured)
         self.facts = card(measured)
         self.notes = [*notes, *notes_of(measured)]
-        self._traces = list(traces)
+        self.traces = list(traces)
         with styled():
             self.figure: Figure = compose(measured, traces, notes=self.notes)
 
@@ -122,7 +123,7 @@ class Report:
 
     def _fragment(self) -> str:
         with styled():
-            figure = compose(self.measured, self._traces, head=False)
+            figure = compose(self.measured, self.traces, head=False)
         picture = self._drawn(figure, "svg", {"Date": None, "Creator": None})
         return fragment(self.title, self.facts, self.notes, picture.decode(), self.measured)
 

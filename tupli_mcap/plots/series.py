@@ -9,11 +9,20 @@ import numpy as np
 
 from tupli_mcap.recording.blocks import Array
 
-__all__ = ["Bands", "bands", "bin_count", "bin_edges", "running_mean", "window_of"]
+__all__ = ["LARGEST", "Bands", "bands", "bin_count", "bin_edges", "drawn", "running_mean", "window_of"]
 
 _TAIL = 0.002  # part of the values at either end that may be cut off
 _FAR = 4  # times the range of all others that values must reach to be cut off
 _MOST_WINDOW = 100
+_HUGE = 1e300
+LARGEST = 1e150
+"""Values of larger size are not drawn: their differences are too large for a float."""
+
+
+def drawn(values: Array) -> Array:
+    """As float64, with NaN for what cannot be drawn."""
+    numbers = np.asarray(values, np.float64)
+    return np.where(np.abs(numbers) <= LARGEST, numbers, np.nan)
 
 
 def window_of(count: int) -> int:
@@ -79,20 +88,21 @@ def bin_edges(values: Array, bins: int) -> tuple[Array, int]:
     if not len(values):
         return np.array([0.0, 1.0]), 0
     low, high = float(values.min()), float(values.max())
-    inner_low, inner_high = np.quantile(values, [_TAIL, 1 - _TAIL])
-    spread = inner_high - inner_low
+    inner_low, inner_high = (float(value) for value in np.quantile(values / 2, [_TAIL, 1 - _TAIL]))
+    spread = 2 * (inner_high - inner_low)
     if 0 < spread < np.inf and high - low > _FAR * spread:
-        low, high = max(low, inner_low - spread / 2), min(high, inner_high + spread / 2)
+        low, high = max(low, 2 * inner_low - spread / 2), min(high, 2 * inner_high + spread / 2)
     beyond = int(((values < low) | (values > high)).sum())
-    if np.array_equal(values, np.round(values)) and high - low < 2**52:
+    if high - low < 2**52 and np.array_equal(values, np.round(values)):
         width = max(1, int(np.ceil((np.floor(high) - np.ceil(low) + 1) / bins)))
         count = int((np.floor(high) - np.ceil(low)) // width) + 1
-        return np.ceil(low) - 0.5 + width * np.arange(count + 1.0), beyond
-    if (
-        not high > low
-        or not np.isfinite(high - low)
-        or len(np.unique(np.linspace(low, high, bins + 1))) <= bins
-    ):
-        half = 0.5 * max(abs(low), 1.0) if abs(low) < 1e300 else 0.1 * abs(low)
-        return np.array([low - half, low + half]), beyond
-    return np.linspace(low, high, bins + 1), beyond
+        found = np.ceil(low) - 0.5 + width * np.arange(count + 1.0)
+    else:
+        found = 2 * np.linspace(
+            low / 2, high / 2, bins + 1
+        )  # halves: the whole range may be too large a number
+        found[0], found[-1] = low, high
+    if not (np.diff(found) > 0).all():  # numbers that hardly differ, or do not
+        half = 0.5 * max(1.0, abs(low)) if abs(low) < _HUGE else 0.0
+        found = np.array([low - half, high + half]) if half else np.array([low * 0.9, low * 1.05])
+    return found, beyond

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.plots.series import drawn
 from tupli_mcap.plots.values import LeafValues
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Array, blocks
@@ -35,8 +36,9 @@ class Pictures:
 class Trace:
     """One episode.
 
-    values: leaf name -> (points, elements), float64, at the steps `at` (points). thinned: where it is more than 1, two
-    points stand for so many steps: the smallest and the largest value among them. totals: the running return.
+    values: leaf name -> (points, elements), float64, at the steps `at` (points); NaN for what cannot be
+    drawn. thinned: where it is more than 1, two points stand for so many steps: the smallest and the largest value
+    among them. totals: the running return.
     """
 
     episode: int
@@ -69,11 +71,11 @@ def trace(recording: Recording, position: int, leaves: list[LeafValues]) -> Trac
     for block in blocks(recording, np.array([position]), images=False, finals=False):
         for leaf in shown:
             column = block.leaves[leaf.leaf.name]
-            flat = column.reshape(len(column), -1)[:, leaf.elements].astype(np.float64)
-            parts[leaf.leaf.name] += thinners[leaf.leaf.name].put(flat)
+            flat = column.reshape(len(column), -1)[:, leaf.elements]
+            parts[leaf.leaf.name] += thinners[leaf.leaf.name].put(drawn(flat))
         running = total + _step_rewards(block.leaves, leaves).cumsum()
         total = float(running[-1])
-        totals += thinners[""].put(running[:, None])
+        totals += thinners[""].put(drawn(running)[:, None])
     values = {name: np.concatenate([*found, *thinners[name].rest()]) for name, found in parts.items()}
     running = np.concatenate([*totals, *thinners[""].rest()])[:, 0]
     seed = int(row["seed"]) if row["has_seed"] else None

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from tupli_mcap.messages.labels import Labels
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.names import element_names
+from tupli_mcap.plots.series import drawn
 from tupli_mcap.recording.blocks import Array
 
 __all__ = ["LeafValues"]
@@ -115,8 +116,8 @@ class LeafValues:
         return np.empty((0, len(self.elements)))
 
     def column(self, i: int) -> Array:
-        """The finite values of element `i` in the sample (float64)."""
-        values = self.sample[:, i].astype(np.float64)
+        """The values of element `i` in the sample that can be drawn (float64)."""
+        values = drawn(self.sample[:, i])
         return values[np.isfinite(values)]
 
 
