@@ -104,10 +104,12 @@ def test_recordings_are_compared(folder: Path, tmp_path: Path) -> None:
     runs = [folder / "runs" / "one.mcap", folder / "runs" / "two.mcap"]
     assert replay(*runs, "--compare", "--episode", "best", "--save", tmp_path / "out.rrd") == 0
     found = Rrd(tmp_path / "out.rrd")
-    last = [found.scalars(f"/compared/{i}/return")[-1, 0] for i in range(2)]
+    numbers = [int(returns_of(path).argmax()) for path in runs]
+    roots = [f"/compared/{path.stem}_{number}" for path, number in zip(runs, numbers, strict=True)]
+    last = [found.scalars(f"{root}/return")[-1, 0] for root in roots]
     assert last == [returns_of(path).max() for path in runs]
-    named = [found.rows(f"/compared/{i}/return", "SeriesLines:names")[0][0] for i in range(2)]
-    assert named[0].startswith("one ") and named[1].startswith("two ")
+    named = [found.rows(f"{root}/return", "SeriesLines:names")[0][0] for root in roots]
+    assert named == [f"one {numbers[0]}", f"two {numbers[1]}"]
 
 
 def test_recordings_of_other_spaces_are_other_rerun_recordings(folder: Path, tmp_path: Path) -> None:

@@ -77,10 +77,12 @@ def test_compare_puts_each_episode_below_its_own_root(cartpole: Path, tmp_path: 
     found = Rrd(viewer.save(cartpole, tmp_path / "out.rrd", "first,4", form="compare"))
     assert len(found.recordings) == 1
     with Recording(cartpole) as recording:
-        for i, number in enumerate([0, 4]):
+        for number in (0, 4):
             episode = recording.episodes[number]
-            assert found.rows(f"/compared/{i}/state/dims_1", "step") == list(range(len(episode)))
-            assert np.array_equal(found.scalars(f"/compared/{i}/state/dims_1")[:, 0], episode.states[:, 1])
+            assert found.rows(f"/compared/episode_{number}/state/dims_1", "step") == list(range(len(episode)))
+            assert np.array_equal(
+                found.scalars(f"/compared/episode_{number}/state/dims_1")[:, 0], episode.states[:, 1]
+            )
 
 
 def test_an_episode_into_a_stream_of_ones_own(cartpole: Path, tmp_path: Path) -> None:

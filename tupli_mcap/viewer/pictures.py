@@ -44,7 +44,7 @@ class Picture:
         send_blobs(place.stream, place.root + self.entity, times, rr.Image.descriptor_buffer(), values)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        return _side_by_side(self.title, [root + self.entity for root in roots])
+        return _side_by_side(self.title, roots, self.entity)
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Grid:
         )
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        return _tensors(self.title, [root + self.entity for root in roots])
+        return _tensors(self.title, roots, self.entity)
 
 
 _AXES = {3: ("row", "column"), 4: ("[0]", "[1]", "[2]")}
@@ -104,7 +104,7 @@ class HeatMap:
         send_tensors(place.stream, place.root + self.entity, at, maps, ("dimension", "step"))
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        return _tensors(self.title, [root + self.entity for root in roots])
+        return _tensors(self.title, roots, self.entity)
 
 
 def _pooled(values: Array) -> Array:
@@ -150,25 +150,30 @@ class Camera:
                 place.stream.send_columns(place.root + self.entity, at.columns, columns)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        return _side_by_side(self.title, [root + self.entity for root in roots])
+        return _side_by_side(self.title, roots, self.entity)
 
 
 _FRAMES_AT_ONCE = 64
 
 
-def _side_by_side(title: str, entities: Sequence[str]) -> Any:
+def _side_by_side(title: str, roots: Sequence[str], entity: str) -> Any:
     import rerun.blueprint as rrb
 
-    views = [rrb.Spatial2DView(name=title, origin=entity) for entity in entities]
+    views = [rrb.Spatial2DView(name=_named(title, root), origin=root + entity) for root in roots]
     return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)
 
 
-def _tensors(title: str, entities: Sequence[str]) -> Any:
+def _tensors(title: str, roots: Sequence[str], entity: str) -> Any:
     import rerun.blueprint as rrb
 
     colors = rrb.TensorScalarMapping(colormap="viridis", mag_filter="nearest")
     views = [
-        rrb.TensorView(name=title, origin=entity, scalar_mapping=colors, view_fit="fill")
-        for entity in entities
+        rrb.TensorView(name=_named(title, root), origin=root + entity, scalar_mapping=colors, view_fit="fill")
+        for root in roots
     ]
     return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)
+
+
+def _named(title: str, root: str) -> str:
+    """A view's title: of several episodes, which one it is comes first."""
+    return f"{root.rpartition('/')[2]}: {title}" if root else title

@@ -185,7 +185,9 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
         for position in item.positions:
             number = item.recording.episodes[position].number
             title = f"episode {number}" if len(chosen) == 1 else f"{stem} {number}"
-            root = f"/compared/{len(parts)}"
+            root = "/compared/" + re.sub(r"[^\w-]+", "_", title)
+            if root in {part.root for part in parts}:  # files of one name
+                root += f"_{len(parts)}"
             parts.append(
                 Part(
                     Chosen(item.recording, [position]), scene, root, title, PALETTE[len(parts) % len(PALETTE)]
