@@ -6,45 +6,112 @@ from pathlib import Path
 
 import pytest
 import viewed
+from rerun.experimental import ViewerState
 from typer.testing import CliRunner
 from viewing import HeadlessViewer
 
 from tupli_mcap.cli import app
 
+PLOT, LANES, PICTURE, TEXT, BARS = "TimeSeries", "StateTimeline", "2D", "TextDocument", "BarChart"
+ABOUT = {"recording": TEXT, "returns": BARS, "lengths": BARS}
+REWARDS = {"return": PLOT, "reward": PLOT}
+
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("viewed")
+def cart_pole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return viewed.cart_pole(tmp_path_factory.mktemp("viewed") / "cart_pole.mcap", episodes=3)
 
 
-def saved(recording: Path, *options: str) -> Path:
-    """The `.rrd` that `tupli-mcap replay` makes of a recording."""
+def shown(viewer: HeadlessViewer, recording: Path, *options: str) -> ViewerState:
+    """What the viewer says of the file that `tupli-mcap replay` makes of a recording; it complains of nothing."""
     goal = recording.with_suffix(".rrd")
     result = CliRunner().invoke(app, ["replay", str(recording), *options, "--save", str(goal), "--force"])
     assert result.exit_code == 0, result.output
-    return goal
-
-
-def classes(viewer: HeadlessViewer) -> dict[str, str]:
-    return {view.name: view.view_class for view in viewer.client.get_state().views}
-
-
-ABOUT = {"recording": "TextDocument", "returns": "BarChart", "lengths": "BarChart"}
-
-
-def test_cart_pole(viewer: HeadlessViewer, folder: Path) -> None:
-    state = viewer.show(saved(viewed.cart_pole(folder / "cart_pole.mcap")))
+    state = viewer.show(goal)
     assert viewer.problems() == []
-    assert (
-        classes(viewer).items()
-        >= {"state": "TimeSeries", "return": "TimeSeries", "reward": "TimeSeries"}.items()
-    )
-    assert classes(viewer).items() >= ABOUT.items()
-    empty = {name for name, filled in viewer.filled().items() if not filled}
-    assert empty <= {
-        "action"
-    }  # of a thousand changes the viewer tells the number, in grey, until one zooms in
-    (recording,) = state.recordings
-    assert recording.current_timeline == "step"
-    ranges = {timeline.name: (timeline.start, timeline.end) for timeline in recording.timelines}
-    assert ranges["step"][0] == 0 and ranges["step"][1] > 500
+    return state
+
+
+def views(state: ViewerState) -> dict[str, str]:
+    return {view.name: view.view_class for view in state.views}
+
+
+def ranges(state: ViewerState) -> dict[str, tuple[int | None, int | None]]:
+    return {line.name: (line.start, line.end) for line in state.recordings[0].timelines}
+
+
+def test_cart_pole(viewer: HeadlessViewer, cart_pole: Path) -> None:
+    state = shown(viewer, cart_pole)
+    assert views(state) == {"state": PLOT, "action": LANES, **REWARDS, **ABOUT}
+    assert viewer.filled() == dict.fromkeys(["state", "action", "return", "reward", "recording"], True)
+    assert state.recordings[0].current_timeline == "step"
+    steps, seconds = ranges(state)["step"], ranges(state)["episode_time"]
+    assert steps[0] == 0 and steps[1] > 400
+    assert seconds == (0, steps[1] * 20_000_000)  # CartPole's steps take 20 ms
+    assert ranges(state)["time"][0] > 1_700_000_000_000_000_000
+
+
+def test_one_of_several_episodes_apart(viewer: HeadlessViewer, cart_pole: Path) -> None:
+    state = shown(viewer, cart_pole, "--split")
+    assert views(state) == {"state": PLOT, "action": LANES, **REWARDS, **ABOUT}
+    (start, end), (first, last) = ranges(state)["step"], ranges(state)["episode_time"]
+    assert (start, first) == (0, 0) and end < 300 and last == end * 20_000_000
+
+
+def test_compared_episodes(viewer: HeadlessViewer, cart_pole: Path) -> None:
+    state = shown(viewer, cart_pole, "--compare", "--episode", "best,worst")
+    names = ("Cart Position", "Cart Velocity", "Pole Angle", "Pole Angular Velocity")
+    assert views(state).items() >= {f"state: {name}": PLOT for name in names}.items()
+    assert viewer.filled("state: Pole Angle", "return") == {"state: Pole Angle": True, "return": True}
+    assert ranges(state)["step"] == (0, 299)
+
+
+def test_pixels(viewer: HeadlessViewer, tmp_path: Path) -> None:
+    state = shown(viewer, viewed.atari(tmp_path / "atari.mcap", episodes=1, steps=60))
+    assert views(state) == {"state": PICTURE, "action": LANES, **REWARDS, **ABOUT}
+    (screen,) = (view for view in state.views if view.view_class == PICTURE)
+    viewer.seek("step", 40)
+    colors = viewer.screenshot(screen).reshape(-1, 3)
+    bricks = (colors == (200, 72, 72)).all(axis=1) | (colors == (66, 72, 200)).all(axis=1)
+    assert bricks.mean() > 0.02  # the top and the bottom row, as the Atari paints them
+    assert viewer.filled("action", "return") == {"action": True, "return": True}
+
+
+def test_dict(viewer: HeadlessViewer, tmp_path: Path) -> None:
+    state = shown(viewer, viewed.courier(tmp_path / "courier.mcap", episodes=1))
+    plots = dict.fromkeys([f"state · {name}" for name in ("position", "velocity", "goal", "battery")], PLOT)
+    rest = {"state · carrying": LANES, "action · gripper": LANES, "action · thrust": PLOT}
+    seen = {"state · camera": PICTURE, "state · task": TEXT, "state · task: log": "TextLog"}
+    assert views(state).items() >= {**plots, **rest, **seen, **REWARDS, **ABOUT}.items()
+    heat = "state · lidar: 24 dimensions, each from its lowest to its highest"
+    assert views(state)[heat] == "Tensor"
+    drawn = [
+        "state · position",
+        "state · carrying",
+        "state · camera",
+        "state · task",
+        "action · thrust",
+        heat,
+    ]
+    assert viewer.filled(*drawn) == dict.fromkeys(drawn, True)
+
+
+def test_many_dimensions(viewer: HeadlessViewer, tmp_path: Path) -> None:
+    state = shown(viewer, viewed.legged(tmp_path / "legged.mcap"))
+    heat = "state: 40 dimensions, each from its lowest to its highest"
+    assert views(state)[heat] == "Tensor"
+    assert views(state).items() >= {"action": PLOT, **REWARDS, **ABOUT}.items()
+    assert viewer.filled("action", heat) == {"action": True, heat: True}
+
+
+def test_text(viewer: HeadlessViewer, tmp_path: Path) -> None:
+    state = shown(viewer, viewed.talk(tmp_path / "talk.mcap"))
+    assert views(state).items() >= {"state": TEXT, "action": TEXT, **REWARDS, **ABOUT}.items()
+    viewer.seek("step", 1)
+    assert viewer.filled("state", "action") == {"state": True, "action": True}
+
+
+def test_vector(viewer: HeadlessViewer, tmp_path: Path) -> None:
+    state = shown(viewer, viewed.pendulums(tmp_path / "pendulums.mcap"))
+    assert views(state).items() >= {"state": PLOT, "action": PLOT, **REWARDS, **ABOUT}.items()
+    assert viewer.filled("state", "action") == {"state": True, "action": True}

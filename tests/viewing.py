@@ -20,11 +20,11 @@ from PIL import Image
 from rerun.experimental import View, ViewerClient, ViewerState
 
 VIEWER = Path(rerun_cli.__file__).parent / "rerun"  # the program itself: its Python shim would orphan it
-SIZE = (1000, 700)
+SIZE = (900, 640)
 _ADDRESS = re.compile(r"gRPC connections on 127\.0\.0\.1:(\d+)")
 _OPTIONS = ("--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen")
-_GRIDS = ("TimeSeries", "StateTimeline", "BarChart")
-_TITLE, _BAR = 30, 36  # rows of pixels
+_SOME = 100  # pixels of data that make a view filled
+_BAR = 36  # rows of pixels
 _FADED = 6.0  # seconds after which the viewer's notes on loading are gone
 _ENVIRONMENT = {"RUST_LOG": "info", "NO_COLOR": "1", "RERUN_APP_ONLY": "true", "DISPLAY": ""}
 
@@ -105,10 +105,11 @@ class HeadlessViewer:
         """Stop at a step of a sequence timeline."""
         self.client.set_time(timeline, sequence=step, play_state="paused")
 
-    def filled(self) -> dict[str, bool]:
-        """The name of every view in sight, and whether it shows any data; not those behind another tab."""
-        inks = {view.name: self.ink(view) for view in self.client.get_state().views if view.visible}
-        return {name: ink > 0.002 for name, ink in inks.items() if ink is not None}
+    def filled(self, *names: str) -> dict[str, bool]:
+        """The name of every view in sight (or of these), and whether it shows any data; not those behind a tab."""
+        state = self.client.get_state()
+        inks = {view.name: self.ink(view) for view in state.views if not names or view.name in names}
+        return {name: ink > _SOME for name, ink in inks.items() if ink is not None}
 
     def problems(self) -> list[str]:
         """What views and the viewer complained of since the last `show`."""
@@ -134,21 +135,21 @@ class HeadlessViewer:
         png = self.client.take_screenshot(None if view is None else view.view_id)
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
-    def ink(self, view: View) -> float | None:
-        """The part of a view's pixels that show data: coloured ones in plots (grids are grey), else all but black.
+    def ink(self, view: View) -> int | None:
+        """How many of a view's pixels show data: bright ones in texts, coloured ones elsewhere, where grids are grey.
 
         None where it is behind another tab.
         """
         try:
-            pixels = self.screenshot(view)[_TITLE:].astype(int)
+            pixels = self.screenshot(view).astype(int)
         except ConnectionError as err:
             if "NotFound" in str(err):
                 return None
             raise
         brightest = pixels.max(axis=2)
-        if view.view_class in _GRIDS:
-            return float((brightest - pixels.min(axis=2) > 60).mean())
-        return float((brightest > 60).mean())
+        if view.view_class in ("TextDocument", "TextLog"):
+            return int((brightest > 100).sum())
+        return int((brightest - pixels.min(axis=2) > 60).sum())
 
     def portrait(self, replay: Path, goal: Path, step: int) -> None:
         """A picture of a replay at a step, as a PNG, without the viewer's own bar and its notes on this machine."""

@@ -27,8 +27,8 @@ _SHARES: dict[type, float] = {
 }
 
 
-def blueprint_of(scene: Scene, roots: Sequence[str] = ("",)) -> Any:
-    """The blueprint of a scene whose panels are below each of `roots`."""
+def blueprint_of(scene: Scene, roots: Sequence[str] = ("",), *, listed: bool = False) -> Any:
+    """The blueprint of a scene whose panels are below each of `roots`; `listed` shows the list of recordings, too."""
     import rerun.blueprint as rrb
 
     # where there is nothing to plot, what is looked at has the room
@@ -54,7 +54,7 @@ def blueprint_of(scene: Scene, roots: Sequence[str] = ("",)) -> Any:
     ]
     return rrb.Blueprint(
         rrb.Horizontal(*columns, column_shares=[3, 2][-len(columns) :]),
-        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
+        rrb.BlueprintPanel(state=rrb.PanelState.Expanded if listed else rrb.PanelState.Collapsed),
         rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
         rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline="step"),
         auto_layout=False,

@@ -52,11 +52,13 @@ class Plan(NamedTuple):
     identity: str
     parts: Sequence[Part]
     shown: str
+    listed: bool = False  # it is one of several, which the viewer is to list
 
     @property
     def blueprint(self) -> Any:
         """The blueprint of the parts."""
-        return blueprint_of(self.parts[0].scene, list(dict.fromkeys(part.root for part in self.parts)))
+        roots = list(dict.fromkeys(part.root for part in self.parts))
+        return blueprint_of(self.parts[0].scene, roots, listed=self.listed)
 
     @property
     def application(self) -> str:
@@ -64,6 +66,7 @@ class Plan(NamedTuple):
         first = self.parts[0]
         recording = first.chosen.recording
         looks = _spaces_of(recording) + repr([part.root for part in self.parts] if first.root else "")
+        looks += "listed" * self.listed
         name = re.sub(r"[^\w-]+", "-", name_of(recording))  # the viewer warns of others
         return f"{name} {hashlib.sha256(looks.encode()).hexdigest()[:6]}"
 
@@ -128,6 +131,7 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
 
 
 def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
+    several = sum(len(item.positions) for item in chosen) > 1
     for item in chosen:
         scene = scene_of(item.recording, item.positions)
         for position in item.positions:
@@ -135,7 +139,7 @@ def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
             name = f"{Path(item.recording.name).stem} · episode {number}"
             part = Part(Chosen(item.recording, [position]), scene)
             told = _episode_told(item.recording, position)
-            yield Plan(name, f"{item.recording.uuid}-{number}", [part], told)
+            yield Plan(name, f"{item.recording.uuid}-{number}", [part], told, listed=several)
 
 
 def _joined(chosen: Sequence[Chosen]) -> Plan:
