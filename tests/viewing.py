@@ -136,7 +136,9 @@ class HeadlessViewer:
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
     def ink(self, view: View) -> int | None:
-        """How many of a view's pixels show data: bright ones in texts, coloured ones elsewhere, where grids are grey.
+        """How many of a view's pixels show data: bright ones of a text, coloured ones elsewhere.
+
+        Grids are grey, and what stands in an empty text is dim.
 
         None where it is behind another tab.
         """
@@ -147,8 +149,8 @@ class HeadlessViewer:
                 return None
             raise
         brightest = pixels.max(axis=2)
-        if view.view_class in ("TextDocument", "TextLog"):
-            return int((brightest > 100).sum())
+        if view.view_class == "TextDocument":
+            return int((brightest > 170).sum())
         return int((brightest - pixels.min(axis=2) > 60).sum())
 
     def portrait(self, replay: Path, goal: Path, step: int) -> None:
