@@ -24,8 +24,10 @@ import pytest
 from environments import Sampler
 from gymnasium import spaces
 from mcap_ros2._dynamic import generate_dynamic
+from typer.testing import CliRunner
 
 from tupli_mcap import RecordEpisodes, Recording
+from tupli_mcap.cli.app import app
 from tupli_mcap.errors import MissingExtraError, RecordingError
 from tupli_mcap.live import LiveSession
 from tupli_mcap.live.target import parse_target
@@ -223,6 +225,40 @@ def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:
         assert np.array(value[0], np.uint8).tobytes() == cams[row].tobytes()
 
 
+def test_frames_come_to_rerun(tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    with receiver(port, tmp_path / "r.rrd"):
+        inner = gym.make("CartPole-v1", render_mode="rgb_array")
+        with RecordEpisodes(inner, path, frames=5, live=url(port)) as env:
+            roll(env, 100, 0.02)
+    rows, blobs = shown(tmp_path / "r.rrd", "/camera/render", "EncodedImage:blob")
+    with Recording(path) as recording:
+        pictures: dict[int, list[bytes]] = {}  # a final state comes at the row of the next first one
+        for episode, first in zip(recording.episodes, recording.index["first_row"].tolist(), strict=True):
+            found = episode.frames
+            for i, step in enumerate(found.steps.tolist()):
+                pictures.setdefault(first + step, []).append(found.encoded(i).data)
+    assert len(rows) > 3
+    for row, blob in zip(rows.tolist(), blobs, strict=True):
+        assert bytes(blob[0]) in pictures[row]
+
+
+def test_the_command_records_live(tmp_path: Path) -> None:
+    port = free_port()
+    client = Client(port)
+    command = ["record", "CartPole-v1", "-o", str(tmp_path / "r.mcap"), "--seed", "1", "--steps", "3000"]
+    done = CliRunner().invoke(app, [*command, "--live", f"foxglove://127.0.0.1:{port}"])
+    assert done.exit_code == 0, done.output
+    client.join()
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert recording.num_steps == 3000
+    done = CliRunner().invoke(
+        app, ["record", "CartPole-v1", "-o", str(tmp_path / "n.mcap"), "--live", "rviz"]
+    )
+    assert done.exit_code == 1
+    assert "live: expected 'rerun', 'foxglove'" in done.output
+
+
 def test_without_a_viewer_there_is_one_warning(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     with pytest.warns(UserWarning, match="no Rerun viewer answers at") as said:
@@ -293,6 +329,25 @@ def test_no_display_to_start_a_viewer_on(tmp_path: Path, monkeypatch: pytest.Mon
     assert_exact(tmp_path / "r.mcap", 300)
 
 
+def test_steps_that_are_left_out_break_the_lines(tmp_path: Path) -> None:
+    """What comes faster than it can be shown is thinned to the newest; no line joins what is not next to each other."""
+    path, port = tmp_path / "r.mcap", free_port()
+    with receiver(port, tmp_path / "r.rrd"):
+        with RecordEpisodes(gym.make("CartPole-v1"), path, live=url(port), chunk_size=4096) as env:
+            roll(env, 6000)
+    rows, values = shown(tmp_path / "r.rrd", "/state")
+    with Recording(path) as recording:
+        states = recording.read().states
+    order = np.argsort(rows, kind="stable")
+    rows, table = rows[order], np.array(values, np.float32)[order]
+    missing = np.isnan(table).all(axis=1)
+    assert len(rows) < 6000
+    assert np.array_equal(table[~missing], states[rows[~missing]])
+    shown_next_to = np.diff(rows) > 1
+    assert (missing[1:] | ~shown_next_to).all()
+    assert rows.max() == 5999
+
+
 # ---- Foxglove
 
 
@@ -309,6 +364,8 @@ class Client:
     async def _listen(self) -> None:
         async with aiohttp.ClientSession() as session:
             place = f"ws://127.0.0.1:{self._port}"
+            while not answers(self._port):
+                await asyncio.sleep(0.05)
             async with session.ws_connect(
                 place, protocols=("foxglove.sdk.v1", "foxglove.websocket.v1")
             ) as ws:

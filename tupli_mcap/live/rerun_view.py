@@ -57,6 +57,7 @@ class RerunView:
     ) -> None:
         try:
             import rerun
+            import rerun.blueprint
         except ImportError as err:
             raise MissingExtraError(
                 "a live view in Rerun needs rerun-sdk: pip install 'tupli-mcap[rerun]'"

@@ -22,7 +22,7 @@ from tupli_mcap.recording.writer import RecordingWriter
 __all__ = ["LiveSession", "LiveView", "open_session"]
 
 _SHORTEST_REST = 1 / 30  # seconds between two looks
-_LONGEST_REST = 2.0
+_LONGEST_REST = 1.0
 _REST = 25.0  # times as long as it was at work
 _FAREWELL = 3.0  # seconds that closing waits for the thread, at most
 

@@ -6,6 +6,7 @@ checked by its sequence numbers afterwards, and what was torn or overtaken is le
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.labels import LABELS_NAME, Labels
 from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.cameras import EncodedFrame, decode_frame
 from tupli_mcap.recording.index import EPISODE_ROWS
 from tupli_mcap.recording.logs import EventLog, StepLog, iter_records
 from tupli_mcap.recording.rows import HOLE, SingleRows
@@ -121,12 +123,37 @@ class Watcher:
         return found
 
     def events(self) -> list[tuple[int, int, bytes]]:
-        """(channel, log_time, CDR message) of new starts, ends, final states and infos."""
+        """(channel, log_time, CDR message) of new starts, ends, final states, infos and frames."""
+        frames = [(f"frames/{env}", log) for env, log in enumerate(self._writer.frames)]
         found = []
-        for name, log in (("events", self._writer.events), ("infos", self._writer.infos)):
+        for name, log in (("events", self._writer.events), ("infos", self._writer.infos), *frames):
             if log is not None:
                 found += self._new_events(name, log)
         return found
+
+    def camera(self, env: int) -> str | None:
+        """The camera whose frames are recorded, if any."""
+        cameras = self._writer.channels.cameras
+        return self._writer.container.channels[cameras[env][0]].topic.rpartition("/")[2] if cameras else None
+
+    def frames(self, env: int, most: int) -> list[tuple[int, EncodedFrame]]:
+        """The newest of the new frames, each with the row of the step whose state it shows."""
+        if not self._writer.frames:
+            return []
+        events = self._new_events(f"frames/{env}", self._writer.frames[env])
+        camera, told = self._writer.channels.cameras[env]
+        found = []
+        for (one, _, picture), (other, _, pair) in itertools.pairwise(events):
+            if (one, other) == (camera, told):
+                episode, step = np.frombuffer(pair, "<u4", 2, BODY - _HEADER).tolist()
+                found.append((episode, step, picture))
+        return [
+            (
+                self._begin_of(env, episode, 1 << 62) + step,
+                decode_frame(memoryview(picture)[BODY - _HEADER :])[0],
+            )
+            for episode, step, picture in found[-most:]
+        ]
 
     def _new_records(self, env: int) -> tuple[int, int, Array | None, list[tuple[int, bytes]]] | None:
         writer, seen = self._writer, self._seen.get(env, -1)

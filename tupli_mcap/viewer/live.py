@@ -20,15 +20,15 @@ from tupli_mcap.recording.watching import NewSteps, Watcher
 from tupli_mcap.viewer.about import plain
 from tupli_mcap.viewer.arrange import blueprint_of
 from tupli_mcap.viewer.blocks import Array, Block, Piece
-from tupli_mcap.viewer.panels import Panel, Place
-from tupli_mcap.viewer.pictures import HeatMap, Picture
+from tupli_mcap.viewer.panels import Place, Series
+from tupli_mcap.viewer.pictures import Camera, HeatMap, Picture
 from tupli_mcap.viewer.scene import live_scene
-from tupli_mcap.viewer.sending import Times
+from tupli_mcap.viewer.sending import Times, send_scalars
 
 __all__ = ["LivePicture", "Sketch"]
 
 _STEPS = 1000  # of the newest, at a time
-_DECODED = 50  # where each message is decoded on its own
+_DECODED = 200  # where each message is decoded on its own
 _IMAGES = 3
 _SAMPLE, _PATIENCE = 100, 1.0  # steps, and seconds to wait for them, before it is decided what shares an axis
 _BARS = 500
@@ -89,11 +89,11 @@ class LivePicture:
         self._lengths: list[int] = []
         self._episodes = 0
         self._next_overview = 0.0
-        self._scene = live_scene(
-            layout, watcher.labels, [self._columns(steps.newest(_DECODED)) for steps in first]
-        )
-        # a heat map is of a whole episode
-        self._panels: list[Panel] = [panel for panel in self._scene.panels if not isinstance(panel, HeatMap)]
+        sample = [self._columns(steps.newest(_DECODED)) for steps in first]
+        self._scene = live_scene(layout, watcher.labels, sample, watcher.camera(0))
+        # a heat map is of a whole episode, and frames come by themselves
+        self._panels = [panel for panel in self._scene.panels if not isinstance(panel, HeatMap | Camera)]
+        self._cameras = [panel for panel in self._scene.beside if isinstance(panel, Camera)]
         looks = hashlib.sha256(repr(layout.to_metadata()).encode()).hexdigest()[:6]
         self.application = f"{re.sub(r'[^0-9A-Za-z_-]+', '-', title)[:40]} live {looks}"
         self.blueprint = blueprint_of(self._scene)
@@ -111,16 +111,25 @@ class LivePicture:
         for new in (*waiting, *steps):
             shown = new.newest(_STEPS if self._decoder is None else _DECODED)
             if shown.first != self._next_row:
-                self._scene.rewards[0].miss()
+                self._leave_out(stream, shown)
             self._next_row = shown.first + len(shown)
             self._send_steps(stream, shown)
             self._send_images(stream, watcher, shown)
+        self._send_frames(stream, watcher)
         self._episodes += len(ended)
         self._returns = [*self._returns, *ended["return"].tolist()][-_BARS:]
         self._lengths = [*self._lengths, *ended["length"].tolist()][-_BARS:]
         if time.monotonic() >= self._next_overview or watcher.is_over:
             self._send_overview(stream)
             self._next_overview = time.monotonic() + _EVERY
+
+    def _leave_out(self, stream: Any, after: NewSteps) -> None:
+        """Breaks the lines where steps are missing before those that follow."""
+        self._scene.rewards[0].miss()
+        times = self._times(np.array([after.first - 1]), after.times[:1])
+        lines = [(panel.entity, len(panel.dims)) for panel in self._panels if isinstance(panel, Series)]
+        for entity, width in (*lines, ("/reward", 1)):
+            send_scalars(stream, entity, times, np.full((1, width), np.nan))
 
     def _send_steps(self, stream: Any, steps: NewSteps) -> None:
         columns = self._columns(steps)
@@ -173,6 +182,20 @@ class LivePicture:
                     nobody: Any = None  # a picture asks only for its values
                     block = Block(nobody, part, [], rows, times)
                     panel.send(Place(stream), block, self._times(rows, times))
+
+    def _send_frames(self, stream: Any, watcher: Watcher) -> None:
+        import rerun as rr
+
+        for panel in self._cameras:
+            for row, frame in watcher.frames(0, _IMAGES):
+                stream.reset_time()
+                stream.set_time("step", sequence=row)
+                stream.set_time("time", timestamp=np.datetime64(frame.time_ns, "ns"))
+                if self._seconds is not None:
+                    stream.set_time("episode_time", duration=row * self._seconds)
+                stream.log(
+                    panel.entity, rr.EncodedImage(contents=frame.data, media_type=f"image/{frame.form}")
+                )
 
     def _nested(self, leaf: Leaf, values: Array) -> Any:
         """A state of this leaf only."""

@@ -84,9 +84,11 @@ def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = Fa
     return scene
 
 
-def live_scene(layout: StepLayout, labels: Labels, sample: Sequence[Any]) -> Scene:
+def live_scene(layout: StepLayout, labels: Labels, sample: Sequence[Any], camera: str | None) -> Scene:
     """The panels for a rollout that goes on; `sample` has columns of its first steps."""
     scene = Scene(rewards=[Rewards(layout.reward)], grows=True)
+    if camera is not None:
+        scene.beside.append(Camera(camera, f"/camera/{escaped(camera)}", f"camera {camera}"))
     material = _Material(labels, sample, _MOST_LANE_ROWS + 1, False)
     for leaf in layout.state:
         _add(scene, scene.states, leaf, "states", material)
