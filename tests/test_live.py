@@ -427,11 +427,12 @@ def test_foxglove_gets_the_messages_of_the_file(kind: str, tmp_path: Path) -> No
     unknown = [message for message in client.messages if message not in known]
     assert not unknown
     steps = [known[m] for m in client.messages if m[0] == f"{top}/step"]
-    assert len(steps) > 150
+    assert len(steps) > 50
     assert steps == sorted(set(steps))
     schema = next(c for c in client.channels.values() if c["topic"] == f"{top}/step")
     decode = generate_dynamic(schema["schemaName"], schema["schema"])["tupli_mcap/Step"]
-    assert decode(next(m[2] for m in client.messages if m[0] == f"{top}/step")).reward == 1.0
+    first = decode(next(m[2] for m in client.messages if m[0] == f"{top}/step"))
+    assert first.reward == (first.step + 1) / 2
 
 
 def test_foxgloves_port_is_taken(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ _LISTENER = Path(__file__).with_name("listener.py")
 
 def live(run: Run) -> Iterator[Line]:
     """CartPole under a random policy, and an environment that returns a screen of 210 x 160 x 3 at once."""
-    for workload, steps in ((cartpole(run.steps), run.steps), (screens(), max(run.steps // 20, 1000))):
+    for workload, steps in ((cartpole(run.steps), run.steps), (screens(), max(run.steps // 10, 1000))):
         yield from _compare(run, workload, steps)
 
 

@@ -74,6 +74,7 @@ class RerunView:
         self._stream: Any = None
         self._is_behind = False
         self._next_try = 0.0
+        self._answers = False
         self._expected = time.monotonic()  # until when a missing viewer is no surprise
         if not target.url and not target.answers():
             self._start_viewer()
@@ -99,33 +100,37 @@ class RerunView:
         self._expected = time.monotonic() + _STARTING
 
     def show(self, watcher: Watcher) -> None:
+        if self._stream is None and not self._is_there():
+            return
         if self._picture is None:
             self._picture = self._draw(watcher)
         if self._picture is None:
             return
-        if self._stream is None and not self._connect(self._picture):
-            return
+        if self._stream is None:
+            self._connect(self._picture)
         patience = _FAREWELL if watcher.is_over else _PATIENCE
         if self._is_behind and not self._caught_up(patience):
             return
         self._picture.send(self._stream, watcher)
         self._caught_up(patience)
 
-    def _connect(self, picture: Picture) -> bool:
+    def _is_there(self) -> bool:
+        """True if a viewer answers: without one the SDK would keep what it is sent, and wait for it at the end."""
         now = time.monotonic()
         if now < self._next_try:
-            return False
+            return self._answers
         self._next_try = now + _TRY_AGAIN
-        if not self._target.answers():  # the SDK would keep what it is sent, and wait for it at the end
-            if now > self._expected:
-                self._say(f"no Rerun viewer answers at {self._url}; the rollout is shown once one does")
-            return False
+        self._answers = self._target.answers()
+        if not self._answers and now > self._expected:
+            self._say(f"no Rerun viewer answers at {self._url}; the rollout is shown once one does")
+        return self._answers
+
+    def _connect(self, picture: Picture) -> None:
         self._stream = self._sdk.RecordingStream(picture.application, recording_id=self._identity)
         self._stream.connect_grpc(self._url, default_blueprint=picture.blueprint)
         self._stream.send_recording_name(self._title)
         picture.declare(self._stream)
         self._is_behind = True
-        return True
 
     def _caught_up(self, patience: float) -> bool:
         """True if the viewer has everything; what it cannot take yet is not added to."""
@@ -141,6 +146,7 @@ class RerunView:
 
     def _lose(self) -> None:
         self._stream = None  # without a flush, which would wait for it
+        self._next_try = 0.0
         self._say(f"the Rerun viewer at {self._url} is gone; the rollout is shown again once it is back")
 
     def _say(self, text: str) -> None:

@@ -74,6 +74,9 @@ class Watcher:
         self._ends: dict[int, int] = {}  # where its last ended episode ended
         self._recent: Array = np.zeros(0, EPISODE_ROWS)
         self._episodes = writer.index.count  # of earlier sessions: not shown
+        self._pictures: dict[
+            int, list[tuple[int, int, bytes]]
+        ] = {}  # by sub-environment: episode, step, message
         self._places: dict[str, tuple[int, int]] = {}  # log -> half and position
 
     @property
@@ -142,18 +145,19 @@ class Watcher:
             return []
         events = self._new_events(f"frames/{env}", self._writer.frames[env])
         camera, told = self._writer.channels.cameras[env]
-        found = []
-        for (one, _, picture), (other, _, pair) in itertools.pairwise(events):
-            if (one, other) == (camera, told):
+        found = self._pictures.get(env, [])
+        for (one, _, pair), (other, _, picture) in itertools.pairwise(events):
+            if (one, other) == (told, camera):
                 episode, step = np.frombuffer(pair, "<u4", 2, BODY - _HEADER).tolist()
                 found.append((episode, step, picture))
+        rows = [self._begin_of(env, episode, -1) for episode, _, _ in found]
+        # the steps of others have not been looked at yet
+        self._pictures[env] = [new for new, row in zip(found, rows, strict=True) if row < 0][-most:]
         return [
-            (
-                self._begin_of(env, episode, 1 << 62) + step,
-                decode_frame(memoryview(picture)[BODY - _HEADER :])[0],
-            )
-            for episode, step, picture in found[-most:]
-        ]
+            (row + step, decode_frame(memoryview(picture)[BODY - _HEADER :])[0])
+            for (_, step, picture), row in zip(found, rows, strict=True)
+            if row >= 0
+        ][-most:]
 
     def _new_records(self, env: int) -> tuple[int, int, Array | None, list[tuple[int, bytes]]] | None:
         writer, seen = self._writer, self._seen.get(env, -1)
@@ -220,12 +224,13 @@ class Watcher:
         if rows is None:
             pairs = np.array([np.frombuffer(m, "<u4", 2, BODY - _HEADER) for _, m in messages], np.int64)
             times = np.array([time_ns for time_ns, _ in messages], np.int64)
+            self._starts[env] = int(pairs[-1, 0]), first + len(messages) - 1 - int(pairs[-1, 1])
             return NewSteps(env, first, None, messages, pairs[:, 0], pairs[:, 1], times)
         episodes = rows["episode"].astype(np.int64)
         index = np.arange(first, first + len(rows))
         begins = np.zeros(len(rows), np.int64)
         begins[1:] = np.where(episodes[1:] != episodes[:-1], index[1:], 0)
-        begins[0] = self._begin_of(env, int(episodes[0]), first)
+        begins[0] = self._begin_of(env, int(episodes[0]), min(self._ends.get(env, 0), first))
         np.maximum.accumulate(begins, out=begins)
         self._starts[env] = int(episodes[-1]), int(begins[-1])
         steps = index - begins
@@ -233,15 +238,13 @@ class Watcher:
         times = np.maximum.accumulate(rows["#log_time"].astype(np.int64))
         return NewSteps(env, first, rows, [], episodes, steps, times)
 
-    def _begin_of(self, env: int, episode: int, row: int) -> int:
-        """The first row of the episode that `row` belongs to."""
+    def _begin_of(self, env: int, episode: int, unknown: int) -> int:
+        """The first row of an episode; `unknown` if it is neither the last one looked at nor one that has ended."""
         known, begin = self._starts.get(env, (-1, 0))
         if known == episode:
             return begin
         ended = self._recent[(self._recent["episode"] == episode) & (self._recent["env"] == env)]
-        if len(ended):
-            return min(int(ended["first_row"][-1]), row)
-        return min(self._ends.get(env, 0), row)  # it is still running
+        return int(ended["first_row"][-1]) if len(ended) else unknown
 
 
 def _intact(table: Array, half: int, row: int, seen: int) -> Array:
