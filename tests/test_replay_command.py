@@ -130,6 +130,11 @@ BAD = [
     (["{one}", "{pendulum}", "--compare"], r"expected recordings of the same spaces to compare", 1),
     (["{one}", "--compare", "--split"], r"give one of them", 2),
     (["{one}", "--web"], r"give one of them", 2),
+    (
+        ["{one}", "--compare", "--filter", "n_tuples > 0", "{runs}"],
+        r"at most 16 episodes to compare, found \d+",
+        1,
+    ),
 ]
 
 
@@ -147,6 +152,13 @@ def test_bad_input_is_one_line_and_no_file(
     assert told.startswith("error: ") and told.count("\n") == 1
     assert re.search(said, told)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_has_the_name_the_viewer_wants(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert replay(folder / "runs" / "one.mcap", "--save", folder / "out.mcap") == 1
+    assert "expected a name that ends in .rrd" in capfd.readouterr().err
+    assert replay(folder / "runs" / "one.mcap", "--save", folder / "none" / "out.rrd") == 1
+    assert "there is no directory" in capfd.readouterr().err
 
 
 def test_without_a_display_it_names_the_other_ways(

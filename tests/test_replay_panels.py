@@ -107,6 +107,24 @@ def test_images_and_grids(tmp_path: Path) -> None:
     assert np.array_equal(grids.reshape(20, 5, 4), states["map"])
 
 
+def test_camera_frames_are_sent_as_they_are(tmp_path: Path) -> None:
+    pytest.importorskip("PIL")
+    env = gym.make("CartPole-v1", render_mode="rgb_array")
+    path = tmp_path / "filmed.mcap"
+    with RecordEpisodes(env, path, frames=3) as recorder:
+        recorder.reset(seed=1)
+        for _ in range(8):
+            recorder.step(0)
+    found = Rrd(viewer.save(path, tmp_path / "filmed.rrd"))
+    assert found.rows("/camera/render", "step") == [0, 3, 6]
+    with Recording(path) as recording:
+        encoded = [recording.frames(0).encoded(i) for i in range(3)]
+    assert [bytes(row[0]) for row in found.rows("/camera/render", "EncodedImage:blob")] == [
+        frame.data for frame in encoded
+    ]
+    assert found.rows("/camera/render", "EncodedImage:media_type") == [[f"image/{encoded[0].form}"]] * 3
+
+
 def test_texts_and_values_of_variable_size(tmp_path: Path) -> None:
     space = spaces.Dict(
         {"says": spaces.Text(8), "list": spaces.Sequence(spaces.Discrete(4)), "none": Box(0, 1, (0, 3))}

@@ -16,6 +16,8 @@ from tupli_mcap.viewer.sending import Times, blob_array, column_of, send_blobs, 
 __all__ = ["Camera", "Grid", "HeatMap", "Picture"]
 
 _MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
+_AXES = {3: ("row", "column"), 4: ("[0]", "[1]", "[2]")}  # by dimensions of a column of steps
+_FRAMES_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -74,9 +76,6 @@ class Grid:
         return _tensors(self.title, roots, self.entity)
 
 
-_AXES = {3: ("row", "column"), 4: ("[0]", "[1]", "[2]")}
-
-
 @dataclass(frozen=True)
 class HeatMap:
     """Many dimensions of a leaf over the steps of an episode: one picture an episode, at its first step.
@@ -133,9 +132,11 @@ class Camera:
         import pyarrow as pa
         import rerun as rr
 
+        if self.name not in block.recording.cameras:  # another recording beside it may have one
+            return
         for piece in block.pieces:
             frames = block.recording.frames(piece.position, self.name)
-            steps = frames.steps
+            steps = frames.steps  # that after the last step belongs to no row
             chosen = np.flatnonzero((steps >= piece.step) & (steps < piece.step + piece.end - piece.begin))
             for few in np.array_split(chosen, -(-len(chosen) // _FRAMES_AT_ONCE)) if len(chosen) else ():
                 encoded = [frames.encoded(int(i)) for i in few]
@@ -151,9 +152,6 @@ class Camera:
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         return _side_by_side(self.title, roots, self.entity)
-
-
-_FRAMES_AT_ONCE = 64
 
 
 def _side_by_side(title: str, roots: Sequence[str], entity: str) -> Any:

@@ -114,13 +114,14 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
     if form == "split":
         if total > _MOST_SPLIT:
             raise RecordingError(
-                f"expected at most {_MOST_SPLIT} episodes to show apart, found {total}; choose fewer, or join them"
+                f"expected at most {_MOST_SPLIT} episodes to show apart, found {total}; "
+                "choose some (--episode), or join them"
             )
         yield from _split(chosen)
     elif form == "compare":
         if total > _MOST_COMPARED:
             raise RecordingError(
-                f"expected at most {_MOST_COMPARED} episodes to compare, found {total}; choose fewer"
+                f"expected at most {_MOST_COMPARED} episodes to compare, found {total}; choose some (--episode)"
             )
         yield _compared(chosen)
     else:

@@ -34,9 +34,13 @@ def to_file(plans: Iterable[Plan], target: str | os.PathLike[str], *, force: boo
     """Writes a `.rrd` with its blueprint; it is there as a whole or not at all.
 
     Raises:
-        RecordingError: it exists and `force` is False, or the system refuses.
+        RecordingError: its name does not end in .rrd, it exists and `force` is False, or the system refuses.
     """
     goal = Path(target)
+    if goal.suffix != ".rrd":
+        raise RecordingError(
+            f"expected a name that ends in .rrd, by which the viewer knows such files, found {str(goal)!r}"
+        )
     if goal.exists() and not force:
         raise RecordingError(f"{goal} exists already; choose another name, or replace it with --force")
     if not goal.parent.is_dir():
