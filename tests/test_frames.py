@@ -372,6 +372,24 @@ KILLED = textwrap.dedent(
 )
 
 
+KILLED_VECTOR = textwrap.dedent(
+    """
+    import os, signal, sys
+    sys.path[:0] = [{tests!r}]
+    import numpy as np
+    from drawing import Drawing
+    from gymnasium.vector import SyncVectorEnv
+    from tupli_mcap.vector import RecordEpisodes
+    envs = SyncVectorEnv([Drawing, Drawing])
+    env = RecordEpisodes(envs, {path!r}, attachments={{}}, frames=True, chunk_size=500)
+    env.reset(seed=3)
+    for t in range(6 + 1 + 6 + 1 + 3):
+        env.step(np.array([t % 3, 1]))
+    os.kill(os.getpid(), signal.SIGKILL)
+    """
+)
+
+
 class TestKilled:
     def kill(
         self, path: Path, *, every: int = 1, chunk: int = 2000, episodes: int = 5, mode: str = "x"
@@ -397,6 +415,21 @@ class TestKilled:
             assert recording.complete
             assert [len(e) for e in recording.episodes] == [6] * 5 + [4] + [6] * 2 + [4, 6]
         check(path, every)
+        assert problems(path) == []
+
+    def test_of_sub_environments(self, tmp_path: Path) -> None:
+        path = tmp_path / "r.mcap"
+        code = KILLED_VECTOR.format(tests=str(Path(__file__).parent), path=str(path))
+        done = subprocess.run([sys.executable, "-c", code], timeout=60, check=False, stderr=subprocess.PIPE)
+        assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+        before = check(path)
+        assert before == 2 * (7 + 7 + 4)
+        with RecordVector(
+            SyncVectorEnv([Drawing] * 2), path, attachments={}, mode="a", frames=True
+        ) as recorder:
+            recorder.reset(seed=1)
+            recorder.step(np.array([0, 2]))
+        assert check(path) == before + 4
         assert problems(path) == []
 
     def test_recover_keeps_them(self, tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from tupli_mcap.messages.leaves import ROS_TYPES
 from tupli_mcap.messages.spaces import space_to_json
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.cameras import FRAME_LAYOUT, encode_pair
 from tupli_mcap.recording.container import CHUNK_ROWS, COMPRESSIONS, PROFILE
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import END_NAMES, EpisodeEnd, EpisodeStart, record
@@ -112,6 +113,12 @@ class TestTables:
         assert place("message-record", "body") == BODY == RECORD_HEADER.size + len(CDR_HEADER)
         assert [(f"#{row['field']}", int(row["offset"])) for row in table("message-record")[:-1]] == [
             (name, offset) for name, _, offset in HEADER_FIELDS
+        ]
+
+    def test_frame(self) -> None:
+        assert read_by_table("frame", encode_pair(3, 9)) == {"episode": 3, "step": 9}
+        assert [(row["field"], int(row["offset"])) for row in table("frame")] == [
+            (field.name, field.offset) for field in FRAME_LAYOUT.fields
         ]
 
     def test_episode_start(self) -> None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import IMAGE_SCHEMA, MessageLayout
 from tupli_mcap.recording.events import read_strings
 
@@ -22,7 +22,6 @@ __all__ = [
     "CameraTopics",
     "EncodedFrame",
     "camera_names",
-    "check_camera",
     "decode_frame",
     "encode_frame",
     "encode_pair",
@@ -40,7 +39,6 @@ FRAME_LAYOUT = MessageLayout.of([("episode", np.dtype(np.uint32), ()), ("step", 
 _STAMP = struct.Struct("<iI")
 _COUNT = struct.Struct("<I")
 _PAIR = struct.Struct("<II")
-_CAMERA = re.compile("[a-z](_?[a-z0-9]+)*")
 _TOPIC = re.compile("(/env_0)?/frame/([a-z](?:_?[a-z0-9]+)*)")
 
 
@@ -61,15 +59,6 @@ def camera_names(topics: Mapping[str, int]) -> tuple[str, ...]:
     """The cameras of a recording, by its topics."""
     found = (_TOPIC.fullmatch(topic) for topic in topics)
     return tuple(sorted(match[2] for match in found if match is not None))
-
-
-def check_camera(name: str) -> str:
-    """A name a camera may have; RecordingError otherwise."""
-    if not _CAMERA.fullmatch(name):
-        raise RecordingError(
-            f"expected the name of a camera in lower-case letters, digits and single _, found {name!r:.60}"
-        )
-    return name
 
 
 class EncodedFrame(NamedTuple):
