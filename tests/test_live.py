@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gc
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -346,6 +347,49 @@ def test_steps_that_are_left_out_break_the_lines(tmp_path: Path) -> None:
     shown_next_to = np.diff(rows) > 1
     assert (missing[1:] | ~shown_next_to).all()
     assert rows.max() == 5999
+
+
+def roll_until(env: RecordEpisodes, condition: Callable[[], bool]) -> None:
+    env.reset(seed=1)
+    end = time.monotonic() + 45
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        if any(env.step(0)[2:4]):
+            env.reset()
+        time.sleep(0.01)
+
+
+def test_a_viewer_that_cannot_start_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if answers(9876):
+        pytest.skip("a Rerun viewer runs on this machine")
+    monkeypatch.setenv("DISPLAY", ":77")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", live="rerun") as env:
+            roll_until(env, lambda: bool(said))
+    assert [w.category for w in said] == [UserWarning]
+    assert "Rerun viewer" in str(said[0].message)
+
+
+@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="Xvfb is not installed")
+def test_a_viewer_is_started_and_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if answers(9876):
+        pytest.skip("a Rerun viewer runs on this machine")
+    screen = subprocess.Popen(["Xvfb", ":78", "-screen", "0", "800x600x24"], stderr=subprocess.DEVNULL)
+    monkeypatch.setenv("DISPLAY", ":78")
+    viewer = None
+    try:
+        with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", live="rerun") as env:
+            view = env._live._view  # type: ignore[union-attr]
+            viewer = view._viewer.pid  # type: ignore[attr-defined]
+            roll_until(env, lambda: view._stream is not None)  # type: ignore[attr-defined]
+        assert answers(9876)
+    finally:
+        if viewer is not None:
+            os.killpg(viewer, signal.SIGKILL)
+        screen.terminate()
+        screen.wait()
 
 
 # ---- Foxglove

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -10,7 +11,6 @@ import uuid
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from tupli_mcap.errors import MissingExtraError
 from tupli_mcap.live.target import Target
 from tupli_mcap.recording.watching import Watcher
 
@@ -55,13 +55,9 @@ class RerunView:
         draw: Callable[[Watcher], Picture | None],
         warn: Callable[[str], None],
     ) -> None:
-        try:
-            import rerun
-            import rerun.blueprint
-        except ImportError as err:
-            raise MissingExtraError(
-                "a live view in Rerun needs rerun-sdk: pip install 'tupli-mcap[rerun]'"
-            ) from err
+        # a layer above this one has the error that names the extra
+        rerun = importlib.import_module("tupli_mcap.viewer.sdk").rerun_sdk()
+        importlib.import_module("rerun.blueprint")
         rerun.Scalars.columns(scalars=[0.0])  # imports now what would hold the rollout up later
         self._sdk = rerun
         self._target = target
@@ -75,6 +71,7 @@ class RerunView:
         self._is_behind = False
         self._next_try = 0.0
         self._answers = False
+        self._viewer: subprocess.Popen[bytes] | None = None
         self._expected = time.monotonic()  # until when a missing viewer is no surprise
         if not target.url and not target.answers():
             self._start_viewer()
@@ -96,7 +93,9 @@ class RerunView:
             str(self._target.port),
         ]
         quiet = subprocess.DEVNULL
-        subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+        self._viewer = subprocess.Popen(
+            command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True
+        )
         self._expected = time.monotonic() + _STARTING
 
     def show(self, watcher: Watcher) -> None:
@@ -121,6 +120,8 @@ class RerunView:
             return self._answers
         self._next_try = now + _TRY_AGAIN
         self._answers = self._target.answers()
+        if self._viewer is not None and self._viewer.poll() is not None:  # it could not start, or was closed
+            self._expected = 0.0
         if not self._answers and now > self._expected:
             self._say(f"no Rerun viewer answers at {self._url}; the rollout is shown once one does")
         return self._answers
@@ -156,3 +157,5 @@ class RerunView:
 
     def close(self) -> None:
         self._stream = None
+        if self._viewer is not None and self._viewer.poll() is None:
+            self._viewer.returncode = 0  # it stays open, which is no leak to warn of
