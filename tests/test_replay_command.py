@@ -171,6 +171,11 @@ def test_without_a_display_it_names_the_other_ways(
     assert "there is no display" in told and "--save FILE.rrd" in told and "--web" in told
 
 
+def test_a_url_that_is_none_is_told(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert replay(folder / "runs" / "one.mcap", "--connect", "viewer.example") == 1
+    assert "error: the viewer at viewer.example took nothing" in capfd.readouterr().err
+
+
 def test_without_a_viewer_it_says_how_to_get_one(
     folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

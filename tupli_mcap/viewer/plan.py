@@ -135,6 +135,7 @@ def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
     several = sum(len(item.positions) for item in chosen) > 1
     for item in chosen:
         scene = scene_of(item.recording, item.positions)
+        scene.rows = int(item.recording.index["length"][list(item.positions)].max())
         for position in item.positions:
             number = item.recording.episodes[position].number
             name = f"{Path(item.recording.name).stem} · episode {number}"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -87,13 +88,21 @@ def to_viewer(plans: Iterable[Plan], url: str) -> None:
     for plan in plans:
         stream = plan.new_stream()
         try:
-            stream.connect_grpc(url, default_blueprint=plan.blueprint)
+            with _viewer_errors(url):
+                stream.connect_grpc(url, default_blueprint=plan.blueprint)
             plan.send(stream)
-            stream.flush(timeout_sec=_FLUSH_SECONDS)
-        except (RuntimeError, ValueError) as err:
-            raise ViewerError(f"the viewer at {url} took nothing: {err}") from err
+            with _viewer_errors(url):
+                stream.flush(timeout_sec=_FLUSH_SECONDS)
         finally:
             stream.disconnect()
+
+
+@contextlib.contextmanager
+def _viewer_errors(url: str) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, ValueError) as err:
+        raise ViewerError(f"the viewer at {url} took nothing: {err}") from err
 
 
 def to_window(plans: Iterable[Plan]) -> int:
