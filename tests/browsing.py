@@ -27,6 +27,9 @@ _FLAGS = (
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
 )
+FILLED = (
+    0.02  # of the pixels are coloured where curves are shown; on the viewer's welcome page, less than 0.01
+)
 _TOP = 40  # rows of pixels of the viewer's own bar, whose signs are coloured
 
 
@@ -93,7 +96,7 @@ def _settled(page: Page, end: float) -> np.ndarray:
     while time.monotonic() < end:
         page.wait_for_timeout(300)
         before, picture = picture, _picture(page)
-        if _ink(picture) > 0.002 and _ink(before) > 0.002 and np.abs(picture - before).mean() < 2:
+        if min(_ink(picture), _ink(before)) > FILLED and np.abs(picture - before).mean() < 2:
             break
     return picture
 

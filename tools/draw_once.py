@@ -1,6 +1,6 @@
-"""Lets this environment's own viewer draw a replay once, without a screen, and looks whether there is anything on it.
+"""Lets this environment's own viewer draw a replay, without a screen, and looks whether there is anything on it.
 
-Needs no more of rerun-sdk than its program, so that it runs under old versions too.
+Needs little of rerun-sdk, so that it runs under old versions too.
 """
 
 from __future__ import annotations
@@ -8,37 +8,53 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
-import rerun_cli
 from PIL import Image
+from rerun.experimental import ViewerClient
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import viewed
 
 from tupli_mcap import viewer
+from tupli_mcap.viewer.binary import viewer_program
+from tupli_mcap.viewer.process import free_port
+
+_SECONDS = 60.0
+_ENOUGH = 0.03  # of the window is in colour where curves are drawn
 
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         replay = viewer.save(viewed.courier(Path(folder) / "courier.mcap"), Path(folder) / "courier.rrd")
-        picture = Path(folder) / "courier.png"
-        program = Path(rerun_cli.__file__).parent / "rerun"
-        options = ["--headless", "--bind", "127.0.0.1", "--port", "auto", "--window-size", "1000x700"]
-        run = subprocess.run(
-            [program, replay, *options, "--screenshot-to", picture],
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-        if not picture.exists():
-            sys.exit(f"expected a picture, found exit code {run.returncode}: {run.stderr[-2000:]}")
-        pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
-    coloured = float((pixels.max(axis=2) - pixels.min(axis=2) > 60).mean())
-    print(f"drawn: {coloured:.1%} of the window is in colour")
-    if coloured < 0.01:
-        sys.exit("expected curves in colour, found an empty window")
+        port = free_port()
+        options = ["--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", "1000x700"]
+        process = subprocess.Popen([viewer_program(), replay, *options], stderr=subprocess.DEVNULL)
+        try:
+            found = drawn(port, Path(folder) / "courier.png")
+        finally:
+            process.terminate()
+            process.wait(20)
+    print(f"drawn: {found:.1%} of the window is in colour")
+    sys.exit(found < _ENOUGH)
+
+
+def drawn(port: int, picture: Path) -> float:
+    """How much of the window is in colour, as soon as it is enough."""
+    found, end = 0.0, time.monotonic() + _SECONDS
+    while found < _ENOUGH and time.monotonic() < end:
+        time.sleep(1.0)
+        try:
+            ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy").save_screenshot(str(picture))
+        except (ConnectionError, RuntimeError):  # it does not listen yet
+            continue
+        time.sleep(1.0)  # old versions answer before they have written it
+        if picture.exists():
+            pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+            found = float((pixels.max(axis=2) - pixels.min(axis=2) > 60).mean())
+    return found
 
 
 if __name__ == "__main__":

@@ -19,13 +19,13 @@ import viewed
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("file", type=Path, nargs="?", help="a recording; by default CartPole's is made")
+    parser.add_argument("file", type=Path, nargs="?", help="a recording; by default one is made")
     parser.add_argument("--screenshot", type=Path, help="where to write what Chromium shows")
     options = parser.parse_args()
     if browsing.CHROMIUM is None:
         sys.exit("expected chromium on the PATH, found none; `tools/setup-viewer web` installs it")
     with tempfile.TemporaryDirectory() as folder:
-        recording = options.file or viewed.cart_pole(Path(folder) / "cartpole.mcap")
+        recording = options.file or viewed.courier(Path(folder) / "courier.mcap")
         with browsing.served(recording) as (url, addresses):
             print(f"{url}, listening on {', '.join(sorted(addresses))}")
             seen = browsing.browse(url)
@@ -34,7 +34,7 @@ def main() -> None:
     print(
         f"{seen.ink:.1%} of the page is in colour, {len(seen.complaints)} complaints {seen.complaints or ''}"
     )
-    sys.exit(seen.ink < 0.01 or bool(seen.complaints) or addresses != {"127.0.0.1"})
+    sys.exit(seen.ink < browsing.FILLED or bool(seen.complaints) or addresses != {"127.0.0.1"})
 
 
 if __name__ == "__main__":

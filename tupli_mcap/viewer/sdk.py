@@ -9,7 +9,7 @@ from tupli_mcap.errors import MissingExtraError, TupliError
 
 __all__ = ["OLDEST", "ViewerError", "rerun_sdk"]
 
-OLDEST = (0, 41)
+OLDEST = (0, 39)
 
 
 class ViewerError(TupliError):
