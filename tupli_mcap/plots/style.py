@@ -31,6 +31,7 @@ _RC: dict[str, Any] = {
     "axes.titlesize": 9,
     "axes.titlelocation": "left",
     "axes.titlepad": 4,
+    "axes.titley": 1.0,  # else it is looked for anew in every drawing
     "axes.labelsize": 8.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
