@@ -192,6 +192,19 @@ def test_a_watcher_in_another_thread_sees_what_is_recorded(
                 assert record["data"].tobytes() == episode.states["cam"][step].tobytes()
 
 
+def test_a_watcher_numbers_the_steps_of_an_appended_recording(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        roll(env, 50)
+    with RecordEpisodes(gym.make("CartPole-v1"), path, mode="a") as env:
+        watcher = Watcher(env._writer)
+        env.reset(seed=3)
+        for _ in range(5):
+            env.step(0)
+        ((new,), ended) = watcher.look(1)
+    assert (new.first, new.steps.tolist(), len(ended)) == (50, [0, 1, 2, 3, 4], 0)
+
+
 # ---- Rerun
 
 

@@ -72,11 +72,11 @@ class Watcher:
         self._seen: dict[int, int] = {}  # rows of each sub-environment
         self._starts: dict[int, tuple[int, int]] = {}  # its last row's episode, and where that began
         self._ends: dict[int, int] = {}  # where its last ended episode ended
+        self._note_ends(np.frombuffer(bytes(writer.index.rows), EPISODE_ROWS))
         self._recent: Array = np.zeros(0, EPISODE_ROWS)
         self._episodes = writer.index.count  # of earlier sessions: not shown
-        self._pictures: dict[
-            int, list[tuple[int, int, bytes]]
-        ] = {}  # by sub-environment: episode, step, message
+        # frames of steps that have not been looked at: episode, step, message
+        self._pictures: dict[int, list[tuple[int, int, bytes]]] = {}
         self._places: dict[str, tuple[int, int]] = {}  # log -> half and position
 
     @property
@@ -110,9 +110,8 @@ class Watcher:
     def look(self, envs: int) -> tuple[list[NewSteps], Array]:
         """The new steps of the first `envs` sub-environments, and the episodes that have ended (EPISODE_ROWS)."""
         found = [self._new_records(env) for env in range(min(envs, self.num_envs))]
-        ended = (
-            self._ended()
-        )  # after the rows: an episode that is not there by now has begun where the last one ended
+        # after the rows: an episode that is not there by now has begun where the last one ended
+        ended = self._ended()
         return [self._placed(*new) for new in found if new is not None], ended
 
     def images(self, leaf: int, env: int, rows: range) -> dict[int, Array]:
@@ -202,20 +201,20 @@ class Watcher:
             return
 
     def _ended(self) -> Array:
-        index = self._writer.index
-        new = index.count - self._episodes
-        size = EPISODE_ROWS.itemsize
-        first = index.count - min(new, _EPISODES)
+        index, size = self._writer.index, EPISODE_ROWS.itemsize
+        count = index.count  # read once: it may grow meanwhile
+        first = max(self._episodes, count - _EPISODES)
         # a copy: a view would keep the recorder from adding to it
-        found = np.frombuffer(
-            bytes(index.rows[first * size : (first + min(new, _EPISODES)) * size]), EPISODE_ROWS
-        )
-        self._episodes += new
-        for env in np.unique(found["env"]).tolist():
-            last = found[np.flatnonzero(found["env"] == env)[-1]]
-            self._ends[env] = int(last["first_row"] + last["length"])
+        found = np.frombuffer(bytes(index.rows[first * size : count * size]), EPISODE_ROWS)
+        self._episodes = count
+        self._note_ends(found)
         self._recent = np.concatenate([self._recent[-_EPISODES:], found])
         return found
+
+    def _note_ends(self, episodes: Array) -> None:
+        for env in np.unique(episodes["env"]).tolist():
+            last = episodes[np.flatnonzero(episodes["env"] == env)[-1]]
+            self._ends[env] = int(last["first_row"] + last["length"])
 
     def _placed(
         self, env: int, first: int, rows: Array | None, messages: list[tuple[int, bytes]]
