@@ -20,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from mcap.writer import Writer
+from typer.core import TyperGroup
 from typer.testing import CliRunner
 
 from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper, trust, write_recording
@@ -312,6 +313,14 @@ class TestRecord:
         (told,) = run("ls", "a.mcap", "--json").json
         assert told["state"] == "recovered"
         assert told["steps"] > 20_000
+
+    def test_ctrl_c_while_the_words_are_read(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def interrupted(*_: Any) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(TyperGroup, "parse_args", interrupted)
+        result = CliRunner().invoke(app, ["ls"])
+        assert (result.exit_code, result.stderr) == (1, "error: interrupted\n")
 
     def test_ctrl_c_keeps_what_was_recorded(self, here: Path) -> None:
         args = [TOOL, "record", "CartPole-v1", "-o", "a.mcap", "--steps", "100000000"]

@@ -6,11 +6,12 @@ what it calls, so that help and completion stay quick.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -63,15 +64,26 @@ class _Group(TyperGroup):
             return code
         sys.exit(code if isinstance(code, int) else 0)
 
+    def make_context(self, *args: Any, **extra: Any) -> Any:
+        with _before_typer():
+            return super().make_context(*args, **extra)
+
     def invoke(self, ctx: Any) -> Any:
-        try:
+        with _before_typer():
             return super().invoke(ctx)
-        except KeyboardInterrupt as err:  # before typer makes something else of it
-            raise _InterruptedError from err
 
 
 class _InterruptedError(TupliError):
     """The user pressed Ctrl-C."""
+
+
+@contextlib.contextmanager
+def _before_typer() -> Iterator[None]:
+    """Takes Ctrl-C down before typer makes something else of it."""
+    try:
+        yield
+    except KeyboardInterrupt as err:
+        raise _InterruptedError from err
 
 
 def _report(err: BaseException) -> int:
