@@ -102,6 +102,60 @@ def test_an_unfinished_recording_is_no_damage(tmp_path: Path) -> None:
     assert any("tupli-mcap recover" in problem.advice for problem in report.problems)
 
 
+def kill_while_recording(path: Path, steps: int, **options: Any) -> None:
+    """A recording whose process was killed after some steps."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            env = RecordEpisodes(Sampler(BOX, spaces.Discrete(3)), path, **options)
+            env.reset(seed=1)
+            for _ in range(steps):
+                env.step(0)
+        finally:
+            os._exit(0)
+    os.waitpid(pid, 0)
+
+
+@pytest.mark.parametrize("content", ["another", b"", b"nonsense" * 10])
+def test_a_journal_of_no_use_is_not_called_all_there(tmp_path: Path, content: bytes | str) -> None:
+    path, other = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    kill_while_recording(path, 5)
+    kill_while_recording(other, 5)
+    journal_path(path).write_bytes(journal_path(other).read_bytes() if isinstance(content, str) else content)
+    code, out, _ = tell("verify", path)
+    assert code == 0
+    assert "all finished steps are there" not in out
+    assert "steps not yet in a chunk are not here" in out
+    assert "lost: steps not yet in a chunk" in tell("recover", path)[1]
+
+
+def test_a_journal_elsewhere_is_found(tmp_path: Path) -> None:
+    path, directory = tmp_path / "a.mcap", tmp_path / "journals"
+    directory.mkdir()
+    kill_while_recording(path, 5, journal_dir=directory)
+    assert "all finished steps are there" in tell("verify", path)[1]
+    (journal,) = directory.iterdir()
+    journal.unlink()
+    assert f"there is no journal at {journal}" in " ".join(tell("verify", path)[1].split())
+
+
+def test_killed_before_the_first_step_nothing_is_lost(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    kill_while_recording(path, 0)
+    assert "journal" not in tell("verify", path)[1]
+    assert "lost:" not in tell("recover", path)[1]
+
+
+def test_a_file_that_is_cut_off_is_damaged_unless_a_journal_goes_on(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    last = next(item for item in places(path) if item.chunk is not None)
+    os.truncate(path, last.offset + last.length - 10)
+    code, out, _ = tell("verify", path)
+    assert code == 1
+    assert "the last record is cut off" in out
+    assert "if the file was cut off" in " ".join(tell("recover", path)[1].split())
+
+
 # ---- damage
 
 

@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 __all__ = ["register"]
 
 _STATES = {"unfinished": "not finished", "recording": "being recorded"}
+_NO_JOURNAL = {
+    "missing": "which is not beside the file; if the file was cut off, all that followed too",
+    "stale": "which is not the one beside the file",
+    "damaged": "as far as that is damaged",
+}
 _NOTHING = "nothing to be done"
 _SHOWN = 20  # damaged places, lost episodes: what is beyond is in --json
 
@@ -232,6 +237,6 @@ def _losses(report: RecoveryReport) -> list[str]:
         found.append(f"lost: {counted(count, 'message')} of {topic}")
     if report.attachments_lost:
         found.append(f"lost: the attachments {', '.join(report.attachments_lost[:_SHOWN])}")
-    if report.journal == "missing":
-        found.append("lost: steps not yet in a chunk, with the journal, which is not beside the file")
+    if report.journal in _NO_JOURNAL:
+        found.append(f"lost: steps not yet in a chunk, with the journal, {_NO_JOURNAL[report.journal]}")
     return found

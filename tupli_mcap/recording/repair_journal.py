@@ -33,6 +33,8 @@ def add_journal(gathered: Gathered) -> None:
         path = recorded_journal(path, gathered.metadata or {})
         journal = read_journal(path)
     except FileNotFoundError:
+        if not gathered.channels and not gathered.damages:
+            return  # a journal is made before the channels: there was no step
         gathered.journal = "missing"
         elsewhere = misplaced_journal(gathered.source.path, gathered.metadata or {})
         if elsewhere is not None:

@@ -14,9 +14,10 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
 from tupli_mcap.recording.infos import info_schema
-from tupli_mcap.recording.journal import journal_path
+from tupli_mcap.recording.journal import journal_info, recorded_journal
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recover import belongs, head
 from tupli_mcap.recording.repair_gather import may_be_recording
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.source import PathSource, Source
@@ -72,36 +73,51 @@ def _verify(source: Source, findings: Findings) -> None:
         report.kind = "mcap"
         verify_foreign(source, tail, findings)
         return
-    if not has_summary(source) and (tail.index is None or _has_journal(source)):
+    lost = "" if has_summary(source) else _lost_journal(source)
+    if not has_summary(source) and (tail.index is None or not lost):
         report.state = "recording" if live else "unfinished"
-        _note_unfinished(source, findings)
-    structure = Structure(source, tail, findings)
+    structure = Structure(source, tail, findings, journal_lost=bool(lost))
     structure.run()
+    if report.state != "complete":
+        _note_unfinished(structure, lost, findings)
     _contents(source, structure, findings)
     if live and report.state == "complete":
         report.state = "recording"
 
 
-def _note_unfinished(source: Source, findings: Findings) -> None:
+def _note_unfinished(structure: Structure, lost: str, findings: Findings) -> None:
     if findings.report.state == "recording":
         findings.note("file", "a writer is at work on it", "verify it again once it is closed")
         return
-    here = _has_journal(source)
     findings.note(
         "file",
-        f"its writer did not finish it{'; all finished steps are there' if here else ''}",
+        f"its writer did not finish it{'' if lost else '; all finished steps are there'}",
         "append to it, or write a finished copy with tupli-mcap recover",
     )
-    if not here:
+    if lost and structure.channels:  # a journal is made before the channels
         findings.note(
             "journal",
-            "there is no journal beside it: steps not yet in a chunk are not here",
+            f"{lost}: steps not yet in a chunk are not here",
             "keep a recording and its journal together",
         )
 
 
-def _has_journal(source: Source) -> bool:
-    return source.path is not None and journal_path(source.path).exists()
+def _lost_journal(source: Source) -> str:
+    """Why the journal of an unfinished recording is of no use; empty if it is there."""
+    if source.path is None:
+        return "there is no journal beside it"
+    try:
+        metadata = head(source)
+    except FormatError:
+        return "which journal is its own is not known"
+    try:
+        place = recorded_journal(source.path, metadata)
+        info = journal_info(place)
+    except FileNotFoundError:
+        return f"there is no journal {f'at {place}' if 'journal' in metadata else 'beside it'}"
+    except (OSError, FormatError) as err:
+        return f"its journal cannot be read ({err})"
+    return "" if belongs(info, metadata) else f"{place.name} is the journal of another recording"
 
 
 def _contents(source: Source, structure: Structure, findings: Findings) -> None:

@@ -40,12 +40,16 @@ class _Waiting(NamedTuple):
 
 
 class Structure:
-    """Walks the data section of a recording, then holds the summary and the index against it."""
+    """Walks the data section of a recording, then holds the summary and the index against it.
 
-    def __init__(self, source: Source, tail: Tail, findings: Findings) -> None:
+    journal_lost: there is no journal that holds what a killed writer was about to write.
+    """
+
+    def __init__(self, source: Source, tail: Tail, findings: Findings, *, journal_lost: bool = False) -> None:
         self._source = source
         self._tail = tail
         self._findings = findings
+        self._journal_lost = journal_lost
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self._table: list[tuple[int, ...]] = []
@@ -82,8 +86,12 @@ class Structure:
         self._behind_damage = True
         if not self._tail.finished and damage.end == self._source.size and self._is_cut(damage):
             what = f"the last record is cut off, {damage.end - damage.offset} bytes are left of it"
-            self._findings.note("record", what, "nothing to be done", offset=damage.offset)
-            return  # a killed writer's last write
+            if not (self._journal_lost and self.channels):
+                self._findings.note("record", what, "nothing to be done", offset=damage.offset)
+                return  # a killed writer's last write
+            self.missing = True
+            self._findings.error("record", f"{what}, and no journal holds it", offset=damage.offset)
+            return
         self.missing = True
         kind = _KINDS.get(Opcode(damage.opcode), "record") if 0 < damage.opcode < 16 else "record"
         size = damage.end - damage.offset
