@@ -226,6 +226,14 @@ class TestRecord:
         assert line.startswith("Invalid value for '--policy': expected module:function, found 'math'; see ")
         assert not Path("a.mcap").exists()
 
+    def test_policies_that_exit(self, here: Path) -> None:
+        Path("script.py").write_text("raise SystemExit\n")
+        line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "script:act")
+        assert line == "the policy 'script:act' cannot be imported: SystemExit"
+        Path("leaving.py").write_text("import sys\ndef act(state):\n    sys.exit(0)\n")
+        line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "leaving:act")
+        assert line == "the policy or the environment failed at step 0: SystemExit: 0"
+
     def test_policies_that_fail(self, here: Path) -> None:
         line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "math:factorial")
         assert line.startswith("the policy or the environment failed at step 0: TypeError: ")

@@ -491,6 +491,7 @@ class Breaking(gym.Env[Any, Any]):
     )
     action_space = gym.spaces.Discrete(2)
     breaks_at: int | None = None
+    breaks_with: BaseException = RuntimeError("no more\nfuel")
     places = 9
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
@@ -503,7 +504,7 @@ class Breaking(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self.steps == self.breaks_at:
-            raise RuntimeError("no more\nfuel")
+            raise self.breaks_with
         self.steps += 1
         return self._state(), 0.0, False, False, {}
 
@@ -516,6 +517,15 @@ def test_an_error_of_the_environment_is_a_divergence(tmp_path: Path) -> None:
     first = certify(path, env=broken).first
     assert first is not None
     assert (first.kind, first.step, first.found) == ("error", 6, "RuntimeError: no more fuel")
+
+
+def test_an_environment_that_exits_does_not_agree(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", Breaking(), 10)
+    leaving = Breaking()
+    leaving.breaks_at, leaving.breaks_with = 6, SystemExit(0)
+    first = certify(path, env=leaving).first
+    assert first is not None
+    assert (first.kind, first.step, first.found) == ("error", 6, "SystemExit: 0")
 
 
 def test_another_shape_is_a_divergence_at_its_key(tmp_path: Path) -> None:

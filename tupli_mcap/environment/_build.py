@@ -49,7 +49,7 @@ def build(
         )
     try:
         env = _unpickle(record) if record.spec is None else make_from_spec(record.spec, render_mode)
-    except Exception as err:
+    except (Exception, SystemExit) as err:
         made_with = ", ".join(f"{name} {version}" for name, version in list(record.versions.items())[:20])
         raise TupliError(
             f"the environment {record.name[:200]!r} cannot be rebuilt here with Python "

@@ -24,7 +24,7 @@ __all__ = ["EnvironmentFailedError", "Moment", "Replayer", "recorded_actions"]
 class EnvironmentFailedError(TupliError):
     """The environment raised: at `step` (-1: in reset)."""
 
-    def __init__(self, step: int, cause: Exception) -> None:
+    def __init__(self, step: int, cause: BaseException) -> None:
         self.step = step
         self.cause = cause
         where = "reset" if step < 0 else f"step {step}"
@@ -94,7 +94,7 @@ class Replayer:
         for i, action in enumerate(actions):
             try:
                 moment = Moment(*step(action))
-            except Exception as err:
+            except (Exception, SystemExit) as err:
                 raise EnvironmentFailedError(i, err) from err
             self._last, self._last_action = moment, action
             yield moment
@@ -106,7 +106,7 @@ class Replayer:
         if plan.auto and self._resets_itself and self._last is not None:
             try:
                 state, *_ = env.step(self._last_action)  # the action is not looked at
-            except Exception as err:
+            except (Exception, SystemExit) as err:
                 raise EnvironmentFailedError(-1, err) from err
             self._last = Moment(state)
             return self._last
@@ -118,7 +118,7 @@ class Replayer:
             self._used = True
             try:
                 state, info = env.reset(seed=seed, options=options)
-            except Exception as err:
+            except (Exception, SystemExit) as err:
                 raise EnvironmentFailedError(-1, err) from err
             moment = Moment(state, info=info)
         self._last = moment

@@ -286,7 +286,7 @@ class _Renderer(Certifier):
         where = f"{self._recording.name}: episode {number}, step {step}"
         try:
             rendered: Any = env.render()
-        except Exception as err:  # an environment's own code
+        except (Exception, SystemExit) as err:  # an environment's own code
             raise self._cannot_render(
                 f"at step {step} of episode {number} it fails with {brief(err)}"
             ) from err

@@ -132,7 +132,7 @@ def load_policy(name: str) -> Policy:
         value: Any = importlib.import_module(module_name)
         for part in function_name.split("."):
             value = getattr(value, part)
-    except Exception as err:  # whatever the module does when it is imported
+    except (Exception, SystemExit) as err:  # whatever the module does when it is imported
         raise RecordingError(f"the policy {name!r} cannot be imported: {_reason(err)}") from err
     if not callable(value):
         raise RecordingError(f"the policy {name!r} must be a function, found {type(value).__name__}")
@@ -148,7 +148,7 @@ def _make(
 
     try:
         return make() if num_envs == 1 else gym.vector.SyncVectorEnv([make] * num_envs)
-    except Exception as err:  # an environment's constructor may raise anything
+    except (Exception, SystemExit) as err:  # an environment's constructor may raise anything
         raise RecordingError(f"the environment {env_id!r} cannot be made: {_reason(err)}") from err
 
 
@@ -221,7 +221,7 @@ def _failures(done: int, path: Path) -> Iterator[None]:
         yield
     except (TupliError, OSError):
         raise
-    except Exception as err:
+    except (Exception, SystemExit) as err:
         raise RecordingError(
             f"the policy or the environment failed at step {done}: {_reason(err)}"
             + (f"; {path} holds the steps before it" if done else "")
@@ -247,5 +247,6 @@ def _episodes_in(path: Path) -> int:
         return len(recording)
 
 
-def _reason(err: Exception) -> str:
-    return f"{type(err).__name__}: {' '.join(str(err).split())[:300]}"
+def _reason(err: BaseException) -> str:
+    text = " ".join(str(err).split())[:300]
+    return f"{type(err).__name__}: {text}" if text else type(err).__name__
