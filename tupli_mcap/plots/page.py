@@ -46,7 +46,6 @@ class Page:
 
     def __init__(self) -> None:
         self._items: list[str | Row] = []
-        self._lines: list[tuple[str, float, str]] = []
 
     def heading(self, text: str) -> None:
         self._items.append(text)
