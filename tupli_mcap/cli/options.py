@@ -33,9 +33,11 @@ _SHORTEST_ID = 4
 
 def filter_of(text: str | None) -> BaseFilter | None:
     """The filter that an option's text describes."""
+    if text is None:  # the schema takes a while to import
+        return None
     from tupli_mcap.schema import parse_filter
 
-    return None if text is None else parse_filter(text)
+    return parse_filter(text)
 
 
 def open_storage(path: Path, *, create: bool = False) -> FileStorage:
