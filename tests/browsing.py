@@ -73,7 +73,7 @@ def served(recording: Path, *options: str) -> Iterator[tuple[str, set[str]]]:
         process.communicate(timeout=20)
 
 
-def browse(url: str, seconds: float = 90.0, size: tuple[int, int] = (1000, 700)) -> Seen:
+def browse(url: str, seconds: float = 150.0, size: tuple[int, int] = (1000, 700)) -> Seen:
     """Open a page and wait until two pictures in a row are the same and coloured, or the time is over.
 
     It reaches this machine only: what the page asks of others is refused.

@@ -86,7 +86,11 @@ class HeadlessViewer:
             self.client.close("all")
         self._seen = self._last_log()
         self.client.open([str(path) for path in paths])
-        return self.settled()
+        try:
+            return self.settled()
+        except TimeoutError:  # a busy viewer may say that a file holds no recording before it has read it
+            self.client.open([str(path) for path in paths])
+            return self.settled()
 
     def settled(self) -> ViewerState:
         """The state once nothing loads any more and every view has been drawn at least once."""

@@ -129,7 +129,10 @@ def replay(lab: Path, *, window: bool) -> None:
 def draw(replay: Path) -> Path | None:
     """A picture of a replay, where this machine can draw without a display."""
     picture = replay.with_suffix(".png")
-    with contextlib.suppress(NoViewerError), tempfile.TemporaryDirectory() as folder:
+    with (
+        contextlib.suppress(NoViewerError, TimeoutError, ConnectionError),
+        tempfile.TemporaryDirectory() as folder,
+    ):
         window = HeadlessViewer(Path(folder), (1280, 860))
         with window:
             window.portrait(replay, picture, 60)
