@@ -112,6 +112,25 @@ class TestASecondWriter:
             roll(env, 5)
         assert Recording(path).num_steps == 5
 
+    def test_is_told_of_a_file_deleted_under_it(self, tmp_path: Path) -> None:
+        path = tmp_path / "r.mcap"
+        env = cart_pole(path)
+        roll(env, 5)
+        path.unlink()
+        with pytest.warns(
+            RuntimeWarning, match=r"r\.mcap was deleted while it is recorded, and nothing"
+        ) as told:
+            env.flush()
+            env.close()
+        assert len(told) == 1
+
+    def test_is_not_told_of_a_file_that_was_renamed(self, tmp_path: Path) -> None:
+        env = cart_pole(tmp_path / "r.mcap")
+        roll(env, 5)
+        (tmp_path / "r.mcap").rename(tmp_path / "s.mcap")
+        env.close()
+        assert Recording(tmp_path / "s.mcap").num_steps == 5
+
     def test_is_not_who_only_asks(self, tmp_path: Path) -> None:
         path = tmp_path / "r.mcap"
         with cart_pole(path) as env:

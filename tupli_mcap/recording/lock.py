@@ -143,6 +143,13 @@ class FileLock:
         self._temporary = None
         self._close_old()
 
+    @property
+    def is_deleted(self) -> bool:
+        """True if somebody has taken the file's last name since it was published."""
+        with contextlib.suppress(OSError):
+            return self._temporary is None and os.fstat(self.fd).st_nlink == 0
+        return False
+
     def release(self) -> None:
         """Unlocks and closes, and removes a file that was not published; in a forked child, where the descriptors are
         closed already, nothing happens.

@@ -62,6 +62,7 @@ class RecordingWriter:
         self.closed = False
         self.failed: RecordingError | None = None
         self._broken_off = False
+        self._told_deleted = False
         self._old_journal: Path | None = None  # on append: where a writer that was killed has left its own
         self.whole = _Whole(self)
         self.layout: StepLayout | None = None
@@ -314,6 +315,18 @@ class RecordingWriter:
             )
         with self.whole:
             self.container.add_chunk(rows)
+        self._warn_if_deleted()
+
+    def _warn_if_deleted(self) -> None:
+        """Once: what is written to a file without a name is lost when it is closed."""
+        if self.lock.is_deleted and not self._told_deleted:
+            self._told_deleted = True
+            warnings.warn(
+                f"{self.path} was deleted while it is recorded, and nothing of it will be left; "
+                "record to another file",
+                RuntimeWarning,
+                stacklevel=2,
+            )
 
     def _settle(self) -> None:
         """Waits until what was written is on the disk: the journal first, for it holds the ends of the episodes."""
@@ -420,6 +433,7 @@ class RecordingWriter:
             data = self.index.encode(self.container.chunk_rows)
             self.container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, time.time_ns())
             self.container.finish()
+            self._warn_if_deleted()
             if self._durable:  # before the journal goes
                 sync_file(self.lock.fd, str(self.path))
                 sync_directory(self._place.parent)
