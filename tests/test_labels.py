@@ -109,6 +109,14 @@ def test_only_what_is_whole_is_taken(tmp_path: Path) -> None:
     assert record(Arm(), tmp_path / "r.mcap").labels == Labels({}, {"action": ("open", "close")}, None)
 
 
+class Longer(Arm):
+    """An arm that says no more than what it is."""
+
+
+def test_a_subclass_need_not_say_it_again(tmp_path: Path) -> None:
+    assert record(Longer(), tmp_path / "r.mcap").labels.values == {"action": ("open", "close")}
+
+
 class Joystick(Arm):
     """## Action Space
     - 0: something else

@@ -34,7 +34,7 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
         inner = envs[0].unwrapped if envs and isinstance(envs[0], gym.Env) else inner
     else:
         state, action = env.observation_space, env.action_space
-    text = type(inner).__doc__ or ""
+    texts = [cls.__doc__ or "" for cls in type(inner).__mro__]  # a subclass need not say it again
     found = Labels({}, {}, _step_seconds(inner))
     for name, space, unwrapped in (
         ("state", state, getattr(inner, "observation_space", None)),
@@ -42,7 +42,8 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
     ):
         if not _same_dimensions(space, unwrapped):
             continue  # a wrapper has made something else of it
-        section = _section(text, "observation space" if name == "state" else "action space")
+        heading = "observation space" if name == "state" else "action space"
+        section = next(filter(None, (_section(text, heading) for text in texts)), "")
         if isinstance(space, spaces.Discrete):
             names = (name == "action" and _meanings(inner, int(space.n))) or _names(section, int(space.n))
             if names:
