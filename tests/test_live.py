@@ -415,8 +415,12 @@ class Client:
         self.channels: dict[int, dict[str, Any]] = {}
         self.messages: list[tuple[str, int, bytes]] = []
         self._port = port
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._listen()), daemon=True)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
+
+    def _run(self) -> None:
+        with contextlib.suppress(aiohttp.ClientError):  # the rollout may be over before we have asked for it
+            asyncio.run(self._listen())
 
     async def _listen(self) -> None:
         async with aiohttp.ClientSession() as session:

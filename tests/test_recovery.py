@@ -30,6 +30,8 @@ from tupli_mcap import (
 )
 from tupli_mcap.recording import recover
 from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.journal import JournalContents, RowArea
+from tupli_mcap.recording.salvage import Salvage
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)
@@ -492,3 +494,11 @@ def test_killed_again_while_appending_nothing_changes(tmp_path: Path) -> None:
         assert told(path) == known
         recorder(path, mode="a").close()
         assert told(path) == known
+
+
+def test_a_journal_of_fewer_channels_is_refused() -> None:
+    dtype = np.dtype([(f"#{name}", "<u8") for name in ("opcode", "channel", "log_time", "sequence")])
+    area = RowArea("steps", dtype.itemsize, rows=4, channels=0)
+    contents = JournalContents({}, {"steps": area}, {"steps": np.empty(0, np.uint8)})
+    with pytest.raises(FormatError, match="'steps' has rows of 0 channels, none of number 0"):
+        Salvage(contents, area, 0, dtype, 1)

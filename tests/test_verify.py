@@ -123,17 +123,18 @@ def test_a_journal_of_no_use_is_not_called_all_there(tmp_path: Path, content: by
     kill_while_recording(other, 5)
     journal_path(path).write_bytes(journal_path(other).read_bytes() if isinstance(content, str) else content)
     code, out, _ = tell("verify", path)
+    out = " ".join(out.split())  # lines are broken where paths are long
     assert code == 0
     assert "all finished steps are there" not in out
     assert "steps not yet in a chunk are not here" in out
-    assert "lost: steps not yet in a chunk" in tell("recover", path)[1]
+    assert "lost: steps not yet in a chunk" in " ".join(tell("recover", path)[1].split())
 
 
 def test_a_journal_elsewhere_is_found(tmp_path: Path) -> None:
     path, directory = tmp_path / "a.mcap", tmp_path / "journals"
     directory.mkdir()
     kill_while_recording(path, 5, journal_dir=directory)
-    assert "all finished steps are there" in tell("verify", path)[1]
+    assert "all finished steps are there" in " ".join(tell("verify", path)[1].split())
     (journal,) = directory.iterdir()
     journal.unlink()
     assert f"there is no journal at {journal}" in " ".join(tell("verify", path)[1].split())

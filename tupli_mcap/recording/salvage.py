@@ -48,6 +48,10 @@ class Salvage:
             raise FormatError(
                 f"the journal's area {area.name!r} has rows of {area.row_size} bytes, not {dtype.itemsize}"
             )
+        if block >= area.channels:
+            raise FormatError(
+                f"the journal's area {area.name!r} has rows of {area.channels} channels, none of number {block}"
+            )
         self._bytes = np.ascontiguousarray(contents.data[area.name].reshape(shape)[:, block])
         self._area = area
         self._block = block
