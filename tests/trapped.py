@@ -13,6 +13,7 @@ import json
 import os
 import pickle
 import sys
+import tempfile
 import traceback
 import urllib.parse
 import warnings
@@ -46,7 +47,8 @@ from tupli_mcap.recording.describe import describe
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.signature import check_signature
 from tupli_mcap.recording.verify import verify_recording
-from tupli_mcap.replay import certify, read_certificate
+from tupli_mcap.replay import certify, read_certificate, render
+from tupli_mcap.viewer.companions import write_companions
 
 # Starting programs, networks, native code, other processes: never, whatever the arguments are.
 FORBIDDEN = (
@@ -177,6 +179,11 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
     yield "import", lambda: _import(path, work / "lab")
     yield "view", lambda: viewer.save(path, work / f"{name}.rrd", force=True)
     yield "plot", lambda: plots.report(path)
+    yield "render", lambda: render(path, work / f"rendered_{name}", overwrite=True)
+    yield (
+        "companions",
+        lambda: _with(path, lambda r: write_companions(r, work / f"companions_{name}", force=True)),
+    )
     for command in ("info", "ls", "episodes", "verify", "doctor"):
         yield f"tupli-mcap {command}", _cli(command, str(path))
     yield "tupli-mcap info --json", _cli("info", str(path), "--json")
@@ -321,6 +328,7 @@ def _cli(*words: str) -> Callable[[], Any]:
 def main(corpus: Path, target: Path) -> None:
     os.environ["TUPLI_MCAP_CONFIG_DIR"] = str(target / "config")
     os.environ.pop("TUPLI_MCAP_STORAGE", None)
+    tempfile.tempdir = str(target)
     warnings.simplefilter("ignore")
     trap = Trap(target)
     wrong: list[str] = []
