@@ -48,6 +48,8 @@ class Seen(NamedTuple):
 @contextlib.contextmanager
 def served(recording: Path, *options: str) -> Iterator[tuple[str, set[str]]]:
     """`tupli-mcap replay --web` while it runs: the URL it tells, and the addresses on which anybody can reach it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a shell
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     command = [
         sys.executable,
         "-c",
