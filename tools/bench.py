@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from benchmarks import catalog, reading, recording, viewing, watching
+from benchmarks import catalog, reading, recording, startup, viewing, watching
 from benchmarks.measure import Line, Run
 from rich.console import Console
 from rich.markup import escape
@@ -30,6 +30,7 @@ CASES: dict[str, Callable[[Run], Iterator[Line]]] = {
     "window": reading.window,
     "list": reading.listing,
     "filter": catalog.filter_catalog,
+    "startup": startup.startup,
     "replay": viewing.replay_cartpole,
 }
 

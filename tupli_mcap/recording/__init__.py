@@ -1,13 +1,32 @@
 """One recording, one `.mcap` file: written, appended to, read, recovered, rewritten."""
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from tupli_mcap.recording.columns import Columns
 from tupli_mcap.recording.episode import Episode, Episodes, Step
-from tupli_mcap.recording.handmade import EpisodeData, write_recording
 from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.recording.reader import RecordedBenchmark, Recording
-from tupli_mcap.recording.repair import RecoveryReport, recover_recording
-from tupli_mcap.recording.rewrite import rewrite_recording
-from tupli_mcap.recording.verify import Problem, VerifyReport, verify_recording
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording.handmade import EpisodeData, write_recording
+    from tupli_mcap.recording.repair import RecoveryReport, recover_recording
+    from tupli_mcap.recording.rewrite import rewrite_recording
+    from tupli_mcap.recording.verify import Problem, VerifyReport, verify_recording
+
+# Imported on first use: who records or reads needs none of them.
+_HOMES = {
+    "EpisodeData": "handmade",
+    "Problem": "verify",
+    "RecoveryReport": "repair",
+    "VerifyReport": "verify",
+    "recover_recording": "repair",
+    "rewrite_recording": "rewrite",
+    "verify_recording": "verify",
+    "write_recording": "handmade",
+}
 
 __all__ = [
     "Columns",
@@ -26,3 +45,11 @@ __all__ = [
     "verify_recording",
     "write_recording",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value

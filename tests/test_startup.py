@@ -1,0 +1,55 @@
+"""What importing must not import: what is not needed yet, each looked at in a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+# Extras, and what of the standard library or of the dependencies takes long.
+EXTRAS = (
+    "pandas", "pyarrow", "rerun", "foxglove", "torch", "torchrl", "tensordict", "torchdata", "tensorflow",
+    "matplotlib", "d3rlpy", "fsspec", "requests", "aiohttp", "cryptography", "PIL", "ale_py", "h5py", "IPython",
+)  # fmt: skip
+HEAVY = (*EXTRAS, "gymnasium", "numpy", "pydantic", "sqlalchemy", "sqlite3", "mcap", "zstandard", "rich")
+DATABASE = ("sqlalchemy", "sqlite3", "asyncio", "ssl")
+
+
+def imported(code: str) -> set[str]:
+    """The modules that are there after `code` has run in a new process."""
+    script = f"import sys\n{code}\nprint('\\n' + '\\n'.join(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def run(*arguments: str) -> str:
+    """Code that runs the command line."""
+    return f"from tupli_mcap.cli import app\ntry: app({list(arguments)!r})\nexcept SystemExit: pass"
+
+
+@pytest.mark.parametrize(
+    ("code", "left_out"),
+    [
+        ("import tupli_mcap", (*HEAVY, "typer", "dataclasses")),
+        ("import tupli_mcap; dir(tupli_mcap); tupli_mcap.__all__", HEAVY),
+        ("from tupli_mcap import TupliError", HEAVY),
+        ("import tupli_mcap.cli", HEAVY),
+        (run("--help"), [name for name in HEAVY if name != "rich"]),  # draws the help
+        (run("record", "--help"), [name for name in HEAVY if name not in ("rich", "pydantic")]),  # typer's
+        ("from tupli_mcap import F, FilterEQ", (*EXTRAS, *DATABASE, "gymnasium", "mcap")),
+        ("from tupli_mcap import Recording", (*EXTRAS, *DATABASE, "tupli_mcap.recording.writer")),
+        ("from tupli_mcap import Recording, verify_recording", (*EXTRAS, *DATABASE)),
+        (
+            "from tupli_mcap import RecordEpisodes; from tupli_mcap.vector import RecordEpisodes",
+            (*EXTRAS, *DATABASE, "tupli_mcap.live", "tupli_mcap.recording.repair"),
+        ),
+        ("from tupli_mcap import FileStorage, TupliDataset, TupliEnvWrapper", EXTRAS),
+    ],
+)
+def test_left_out(code: str, left_out: tuple[str, ...]) -> None:
+    assert imported(code) & set(left_out) == set()
+
+
+def test_the_look_sees_what_is_imported() -> None:
+    assert {"sqlite3", "numpy"} <= imported("import sqlite3, numpy")
