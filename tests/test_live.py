@@ -31,6 +31,7 @@ from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.cli.app import app
 from tupli_mcap.errors import MissingExtraError, RecordingError
 from tupli_mcap.live import LiveSession
+from tupli_mcap.live.session import _Meter
 from tupli_mcap.live.target import parse_target
 from tupli_mcap.recording.options import WriterOptions
 from tupli_mcap.recording.watching import Watcher
@@ -615,3 +616,20 @@ def test_a_writer_is_watched_from_its_first_step_on(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "r.mcap", WriterOptions())
     assert Watcher(writer).layout is None
     writer.close()
+
+
+def test_meter_counts_other_threads_only() -> None:
+    meter = _Meter()
+
+    def burn() -> None:
+        began = time.thread_time()
+        while time.thread_time() - began < 0.2:
+            pass
+
+    began = meter.busy()
+    burn()
+    mine = meter.busy() - began
+    other = threading.Thread(target=burn)
+    other.start()
+    other.join()
+    assert mine < 0.1 < 0.2 <= meter.busy() - began
