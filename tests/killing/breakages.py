@@ -52,14 +52,14 @@ def _events_taken_off_first() -> None:
 
 def _chunks_late() -> None:
     """Every chunk is written only when the next one is due: halves are used again before they are in the file."""
-    add, kept = Container.add_chunk, []
+    place, kept = Container.place, []
 
-    def late(self: Any, chunk: Any) -> None:
-        kept.append((self, chunk._replace(data=bytes(chunk.data))))
+    def late(self: Any, chunk: Any, packed: bytes) -> None:
+        kept.append((self, chunk, packed))
         if len(kept) > 3:
-            add(*kept.pop(0))
+            place(*kept.pop(0))
 
-    Container.add_chunk = late  # type: ignore[method-assign]
+    Container.place = late  # type: ignore[method-assign]
 
 
 BREAKAGES: dict[str, Callable[[], None]] = {

@@ -66,11 +66,11 @@ MOMENTS = {
             times=4,
         ),
         Moment("flush", ("RecordingWriter._flush",), times=3, flushes=True),
-        Moment("chunk", ("Container.add_chunk",), times=8, flushes=True),
-        Moment("after chunk", ("Container.add_chunk",), after=True, times=8, flushes=True),
+        Moment("chunk", ("Container.place",), times=8, flushes=True),
+        Moment("after chunk", ("Container.place",), after=True, times=8, flushes=True),
         Moment("compression", times=6, flushes=True),
         Moment("torn chunk", call="pwrite", starts=(_CHUNK,), times=6, flushes=True),
-        Moment("chunk thread", ("ChunkWorker.submit.<locals>.write",), times=4, threaded=True),
+        Moment("chunk thread", ("ChunkWorker.submit.<locals>.run",), times=4, threaded=True),
         Moment("sync", call="fdatasync", times=12, syncs=True),
         Moment("opening", ("RecordingWriter._open",)),
         Moment("torn opening", call="pwrite", starts=(b"\x89", b"\x0c", b"\x03"), times=3),
@@ -230,19 +230,22 @@ def _trap_call(name: str, occurrence: int, rng: random.Random) -> None:
 def _trap_compression(occurrence: int, rng: random.Random) -> None:
     """Somewhere in the compressor: after a part of the time that the chunk took when it was compressed before."""
     left = occurrence
-    compress = Container._pack
 
-    def pack(container: Container, data: Any) -> bytes:
-        nonlocal left
-        left -= 1
-        if left == 0:
-            begin = time.perf_counter_ns()
-            compress(container, data)
-            took = time.perf_counter_ns() - begin
-            kill_after(rng.randint(1, max(2, took)))
-        return compress(container, data)
+    def trapped(compress: Callable[[Container, Any], Any]) -> Callable[[Container, Any], Any]:
+        def pack(container: Container, data: Any) -> Any:
+            nonlocal left
+            left -= 1
+            if left == 0:
+                begin = time.perf_counter_ns()
+                compress(container, data)
+                took = time.perf_counter_ns() - begin
+                kill_after(rng.randint(1, max(2, took)))
+            return compress(container, data)
 
-    Container._pack = pack  # type: ignore[method-assign]
+        return pack
+
+    Container.pack = trapped(Container.pack)  # type: ignore[method-assign]
+    Container.pack_all = trapped(Container.pack_all)  # type: ignore[method-assign]
 
 
 class _Event(ctypes.Structure):

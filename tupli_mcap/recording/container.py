@@ -10,7 +10,7 @@ import contextlib
 import os
 import threading
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import lz4.frame
@@ -68,10 +68,19 @@ class Rows(NamedTuple):
     times: np.ndarray[Any, np.dtype[np.uint64]]
 
 
+class Prepared(NamedTuple):
+    """A chunk before compression: `skip` bytes of Schema and Channel records come before the rows in `data`."""
+
+    rows: Rows
+    skip: int
+    data: Any
+    crc: int
+
+
 class Container:
     """Writes records to a file descriptor and remembers what the summary needs.
 
-    `add_chunk` may be called from two threads, for different channels; nothing else.
+    `add_chunk` may be called from two threads, for different channels, and `pack_all` from any; nothing else.
     """
 
     def __init__(self, fd: int, name: str, compression: Compression) -> None:
@@ -166,19 +175,54 @@ class Container:
 
         The channel's first chunk starts with its Schema and Channel records.
         """
-        if not len(rows.offsets):
-            return
+        if len(rows.offsets):
+            chunk = self.prepare(rows)
+            self.place(chunk, self.pack(chunk.data))
+
+    def prepare(self, rows: Rows) -> Prepared:
+        """The records of a chunk and their CRC. The channel's chunk before it must be in the file."""
         head = b"" if rows.channel in self._announced else self.definitions(rows.channel)
         data = rows.data if not head else head + bytes(rows.data)
-        size, crc = len(data), zlib.crc32(data)
-        packed = self._pack(data)
-        start, end = int(rows.times[0]), int(rows.times[-1])
+        return Prepared(rows, len(head), data, zlib.crc32(data))
+
+    def pack(self, data: Any) -> bytes:
+        """Compresses the records of a chunk."""
+        if self._compression == "zstd":
+            packed: bytes = self._zstd().compress(data)
+            return packed
+        if self._compression == "lz4":
+            framed: bytes = lz4.frame.compress(data)
+            return framed
+        return bytes(data)
+
+    @property
+    def packs_together(self) -> bool:
+        """True if `pack_all` lets go of the interpreter lock once for all chunks, so that a thread is worth it."""
+        return self._compression == "zstd" and hasattr(self._zstd(), "multi_compress_to_buffer")
+
+    def pack_all(self, data: Sequence[Any]) -> list[bytes]:
+        """`pack` of several chunks; may be called from any thread."""
+        if data and self.packs_together:
+            parts = self._zstd().multi_compress_to_buffer(list(data))
+            return [parts[i].tobytes() for i in range(len(parts))]
+        return [self.pack(part) for part in data]
+
+    def _zstd(self) -> zstandard.ZstdCompressor:
+        if not hasattr(self._local, "zstd"):
+            self._local.zstd = zstandard.ZstdCompressor(level=1)
+        found: zstandard.ZstdCompressor = self._local.zstd
+        return found
+
+    def place(self, prepared: Prepared, packed: bytes) -> None:
+        """Writes a prepared chunk and its message index."""
+        rows, skip, data, crc = prepared
         name = "" if self._compression == "none" else self._compression
+        start, end = int(rows.times[0]), int(rows.times[-1])
         builder = RecordBuilder()
-        Chunk(name, packed, end, start, crc, size).write(builder)
-        index = _message_index(rows, len(head))
+        Chunk(name, packed, end, start, crc, len(data)).write(builder)
+        index = _message_index(rows, skip)
         with self._lock:
-            self._place_chunk(rows, _built(builder), index, (start, end, size, len(head), crc, len(packed)))
+            self._place_chunk(rows, _built(builder), index, (start, end, len(data), skip, crc, len(packed)))
 
     def _place_chunk(
         self, rows: Rows, chunk: bytes, index: bytes, facts: tuple[int, int, int, int, int, int]
@@ -212,17 +256,6 @@ class Container:
         if self.start_time is None or index.message_start_time < self.start_time:
             self.start_time = index.message_start_time
         self.end_time = max(self.end_time, index.message_end_time)
-
-    def _pack(self, data: Any) -> bytes:
-        if self._compression == "zstd":
-            if not hasattr(self._local, "zstd"):
-                self._local.zstd = zstandard.ZstdCompressor(level=1)
-            packed: bytes = self._local.zstd.compress(data)
-            return packed
-        if self._compression == "lz4":
-            framed: bytes = lz4.frame.compress(data)
-            return framed
-        return bytes(data)
 
     def finish(self) -> None:
         """DataEnd, summary, footer, magic, in one write."""

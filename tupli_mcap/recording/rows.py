@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -301,4 +302,4 @@ class ImageRows:
         if worker is None:
             self._sink(rows)
         else:
-            self._jobs[half] = worker.submit(rows)
+            self._jobs[half] = worker.submit(partial(self._sink, rows))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -29,8 +29,9 @@ class Stores:
         journal: has the areas of `plan_areas`.
         worker: writes the chunks of large images.
         add_chunk: writes a chunk, durably where that is asked for.
-        write_chunk: writes one of several chunks; `settle`, if given, makes them durable.
+        start_chunks: begins to compress several chunks; what it returns writes them, durably where that is asked for.
         vector: steps of sub-environments.
+        durable: chunks are on the disk before their rows are used again.
         sealed: rows in the journal carry checksums.
         grow: called with the size of a step that is larger than the journal.
 
@@ -51,11 +52,11 @@ class Stores:
         journal: Journal,
         worker: ChunkWorker,
         add_chunk: Callable[[Rows], None],
-        write_chunk: Callable[[Rows], None],
+        start_chunks: Callable[[Sequence[Rows]], Callable[[], None]],
         *,
         vector: bool,
         sealed: bool,
-        settle: Callable[[], None] | None,
+        durable: bool,
         grow: Callable[[int], None],
     ) -> None:
         counts, before_ns = container.counts, container.end_time
@@ -99,10 +100,9 @@ class Stores:
                 self.rows = logs[0]
         elif vector:
             before = np.array([counts[c] for c in channels.steps], dtype=np.int64)
-            derivers = [RowDeriver(time_ns=before_ns) for _ in channels.steps]
             self.vector = VectorRows(
-                layout, rows_area("steps"), buffer("steps"), channels.steps, write_chunk, before, derivers,
-                settle=settle, sealed=sealed,
+                layout, rows_area("steps"), buffer("steps"), channels.steps, start_chunks, before, before_ns,
+                durable=durable, sealed=sealed,
             )  # fmt: skip
         else:
             (channel,) = channels.steps

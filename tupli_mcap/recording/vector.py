@@ -58,8 +58,10 @@ class VectorRecorder:
         self._fresh = False  # some sub-environments have no episode:
         self._waiting = set(range(num_envs))
         self._episodes: list[StartedEpisode | None] = [None] * num_envs
-        self._numbers = np.zeros(num_envs, dtype=np.uint32)
-        self._lengths = np.zeros(num_envs, dtype=np.int64)
+        self._numbers = np.zeros(
+            (num_envs, 2), dtype=np.uint32
+        )  # of the running episodes: number, steps so far
+        self._lengths = self._numbers[:, 1]
         self._totals: Array = np.zeros(num_envs)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._any_ended = False
@@ -290,8 +292,7 @@ class VectorRecorder:
             episode = self._writer.start_episode(i, self._count(i), facts)
             self._episodes[i] = episode
             self._facts[i] = None
-            self._numbers[i] = episode.number
-            self._lengths[i] = 0
+            self._numbers[i] = episode.number, 0
             self._totals[i] = 0.0
             if isinstance(self._writer.vector, list):
                 self._writer.vector[i].begin_episode(episode.number)

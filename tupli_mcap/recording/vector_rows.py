@@ -1,7 +1,8 @@
 """Step rows of a vector environment: a batch is written by whole-array assignment, one block of rows a sub-environment.
 
 A sub-environment that took no step in a batch (the ignored step of next-step autoreset) leaves a hole, recognised by
-its sequence; holes are squeezed out when the rows go to the file.
+its sequence; holes are squeezed out when the rows go to the file. The chunks of a full half are compressed while the
+other half fills, and written before it is needed again.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.journal import RowArea
-from tupli_mcap.recording.rows import HOLE, Array, RowDeriver, Sink, even_rows
+from tupli_mcap.recording.rows import HOLE, Array
 
 __all__ = ["HOLE", "VectorRows"]
+
+StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]
 
 
 class VectorRows:
@@ -32,20 +36,20 @@ class VectorRows:
         area: RowArea,
         buffer: memoryview,
         channels: Sequence[int],
-        sink: Sink,
+        start_chunks: StartChunks,
         counts: Array,
-        derivers: Sequence[RowDeriver] | None = None,
+        time_ns: int = 0,
         *,
-        settle: Callable[[], None] | None = None,
+        durable: bool = False,
         sealed: bool = False,
     ) -> None:
-        self._settle = settle
+        self._durable = durable
         self._sealed = sealed
         self._buffer = buffer
         message = layout.step_message
         self._layout = layout
         self._area = area
-        self._sink = sink
+        self._start_chunks = start_chunks
         self._channels = list(channels)
         n = len(channels)
         self._rows: Array = np.frombuffer(buffer, message.dtype).reshape(2, n, area.rows + 1)
@@ -54,18 +58,28 @@ class VectorRows:
             {"names": ["head"], "formats": [f"V{BODY}"], "offsets": [0], "itemsize": area.row_size}
         )
         self._rows.view(heads)["head"] = np.frombuffer(headers, f"V{BODY}")[None, :, None]
-        self._derivers = list(derivers) if derivers else [RowDeriver() for _ in channels]
         self.counts = counts  # rows of each channel so far
         self._half = 0
         self._row = 0
         self._flushed = 0
+        self._now = time_ns
+        self._times = np.zeros((2, area.rows), np.uint64)  # of the rows in the journal, the same for a batch
+        self._offsets = np.arange(area.rows, dtype=np.uint64) * np.uint64(area.row_size)
+        self._write_chunks: Callable[[], None] | None = None  # of the half that is not running
         self._state = [self._writer(leaf) for leaf in layout.state if leaf.kind != "image"]
         self._action = [self._writer(leaf) for leaf in layout.action]
         self._reward = [self._writer(leaf) for leaf in layout.reward]
         self._nested = any(leaf.keys for leaf in layout.leaves)
         self._flags = (self._rows["terminal"], self._rows["timeout"])
-        self._episode = self._rows["episode"]
-        self._time = self._rows["#log_time"]
+        pairs = np.dtype(
+            {
+                "names": ["times", "numbers"],
+                "formats": [("<u8", 2), ("<u4", 2)],  # log_time and publish_time, episode and step
+                "offsets": [15, BODY],
+                "itemsize": area.row_size,
+            }
+        )
+        self._pair, self._numbers = self._rows.view(pairs)["times"], self._rows.view(pairs)["numbers"]
         self._sequence = self._rows["#sequence"]
         self._state_bytes: Array = np.frombuffer(buffer, np.uint8).reshape(2, n, area.rows + 1, area.row_size)
         self._state_end = layout.state_end
@@ -105,8 +119,11 @@ class VectorRows:
             else:
                 view[self._half, mask, self._row] = value[mask]
 
-    def put(self, batch: Any, terminal: Array, timeout: Array, episodes: Array, active: Array | None) -> None:
-        """Writes a checked batch; `active` None: every sub-environment took a step, `episodes` numbers theirs."""
+    def put(self, batch: Any, terminal: Array, timeout: Array, numbers: Array, active: Array | None) -> None:
+        """Writes a checked batch; `active` None: every sub-environment took a step.
+
+        `numbers` are the episode and the step (uint32, `(channels, 2)`).
+        """
         half, row = self._half, self._row
         actions, rewards, states = batch
         for view, value in (*actions, *rewards):
@@ -117,8 +134,10 @@ class VectorRows:
         for view, value in states:
             if view is not None:
                 view[half, :, row + 1] = value
-        self._episode[half, :, row] = episodes
-        self._time[half, :, row] = time.time_ns()
+        self._numbers[half, :, row] = numbers
+        self._now = now = max(time.time_ns(), self._now)
+        self._times[half, row] = now
+        self._pair[half, :, row] = now
         if active is None:
             self._sequence[half, :, row] = self.counts
             self.counts += 1
@@ -148,33 +167,45 @@ class VectorRows:
             seal(self._buffer, start, end, self._buffer[end + STATE : end + self._state_end])
 
     def _switch(self) -> None:
+        self._finish_chunks()  # a half is used again only when its chunks are in the file
         half, rows, flushed = self._half, self._area.rows, self._flushed
         self._half = 1 - half
         self._sequence[self._half] = HOLE  # see SingleRows
         end = self._state_end
         self._state_bytes[self._half, :, 0, BODY:end] = self._state_bytes[half, :, rows, BODY:end]
         self._row = self._flushed = 0
-        self._emit(half, flushed, rows)
+        self._write_chunks = self._start_chunks(self._chunks(half, flushed, rows))
+        if self._durable:
+            self._finish_chunks()
 
     def flush(self) -> None:
-        """Writes the rows of the running half that are not in the file yet."""
+        """Writes the rows that are not in the file yet."""
+        self._finish_chunks()
         flushed, self._flushed = self._flushed, self._row
-        self._emit(self._half, flushed, self._row)
+        self._write_chunks = self._start_chunks(self._chunks(self._half, flushed, self._row))
+        self._finish_chunks()
 
-    def _emit(self, half: int, begin: int, end: int) -> None:
-        if begin == end:
-            return
+    def _finish_chunks(self) -> None:
+        write, self._write_chunks = self._write_chunks, None
+        if write is not None:
+            write()
+
+    def _chunks(self, half: int, begin: int, end: int) -> list[Rows]:
+        """The rows of a half as chunks, without holes; whole ones are not copied."""
         kept = self._sequence[half, :, begin:end] != HOLE
-        whole = kept.all(axis=1)
+        whole = kept.all(axis=1).tolist()
+        chunks = []
         for i, channel in enumerate(self._channels):
-            rows = self._rows[half, i, begin:end]
+            rows, times = self._rows[half, i, begin:end], self._times[half, begin:end]
             if not whole[i]:
                 rows = rows.view(f"V{rows.dtype.itemsize}")[kept[i]].view(rows.dtype)  # padding stays zero
+                times = times[kept[i]]
             elif self._sealed:  # until the chunk is on the disk, the rows in the journal stay as sealed
                 rows = np.frombuffer(bytearray(rows.view(np.uint8)), rows.dtype)
-            if len(rows):
-                self._derivers[i].fill(rows)
-                data = np.ascontiguousarray(rows).view(np.uint8)
-                self._sink(even_rows(channel, int(rows["#sequence"][0]), data, rows))
-        if self._settle is not None:
-            self._settle()
+            if not len(rows):
+                continue
+            if self._sealed:
+                rows["#publish_time"] = times
+            first = int(rows["#sequence"][0])
+            chunks.append(Rows(channel, first, rows.view(np.uint8), self._offsets[: len(rows)], times))
+        return chunks

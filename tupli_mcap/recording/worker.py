@@ -1,7 +1,7 @@
-"""A thread that writes chunks of large rows while the next rows are recorded.
+"""A thread that compresses, or writes, chunks while the next rows are recorded.
 
-For small rows it would cost more than it saves: the interpreter lock starves it. A chunk of images spends its time in
-the compressor, which lets go of that lock.
+For a single small chunk it would cost more than it saves: the interpreter lock starves it. Images, and the chunks of
+many sub-environments in one call, spend their time in the compressor, which lets go of that lock.
 """
 
 from __future__ import annotations
@@ -9,35 +9,34 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-
-from tupli_mcap.recording.container import Rows
+from typing import TypeVar
 
 __all__ = ["ChunkWorker"]
 
+T = TypeVar("T")
+
 
 class ChunkWorker:
-    """Calls `sink` with chunks on a thread of its own, one after another. The thread is started at the first chunk."""
+    """Runs jobs on a thread of its own, one after another. The thread is started at the first one."""
 
-    def __init__(self, sink: Callable[[Rows], None]) -> None:
-        self._sink = sink
+    def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
 
-    def submit(self, rows: Rows) -> Future[None]:
-        """Hands a chunk over; returns once the thread has taken it up. Its memory must stay until the result comes."""
+    def submit(self, job: Callable[[], T]) -> Future[T]:
+        """Hands a job over; returns once the thread has taken it up. Its memory must stay until the result comes."""
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, thread_name_prefix="tupli-mcap-chunks")
         started = threading.Event()
 
-        def write() -> None:
+        def run() -> T:
             started.set()
-            self._sink(rows)
+            return job()
 
         try:
-            future = self._pool.submit(write)
+            future = self._pool.submit(run)
         except RuntimeError:  # the interpreter is about to end, and starts nothing new
             future = Future()
-            self._sink(rows)
-            future.set_result(None)
+            future.set_result(job())
             return future
         # without the handshake the recording thread keeps the interpreter lock until its next half is full, too
         started.wait(1.0)

@@ -14,6 +14,7 @@ import uuid
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -75,7 +76,7 @@ class RecordingWriter:
         self._durable = options.durability != "os"
         self.syncs_steps = self._sealed = options.durability == "step"
         self.images: list[list[ImageRows]] = []
-        self.worker = ChunkWorker(self.add_chunk)
+        self.worker = ChunkWorker()
         self.events: EventLog | None = None
         self.infos: EventLog | None = None
         self.frames: list[EventLog] = []
@@ -204,8 +205,8 @@ class RecordingWriter:
         self.journal = self._new_journal(areas)
         self.journal.publish(durable=self._durable)
         self._stores = stores = Stores(
-            layout, channels, self.container, self.journal, self.worker, self.add_chunk, self._write_chunk,
-            vector=self.is_vector, sealed=self._sealed, settle=self._settle if self._durable else None, grow=self._grow,
+            layout, channels, self.container, self.journal, self.worker, self.add_chunk, self._start_chunks,
+            vector=self.is_vector, sealed=self._sealed, durable=self._durable, grow=self._grow,
         )  # fmt: skip
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
         self.events, self.infos, self.frames = stores.events, stores.infos, stores.frames
@@ -307,15 +308,44 @@ class RecordingWriter:
 
     def _write_chunk(self, rows: Rows) -> None:
         """After a failure nothing more is accepted, and the journal keeps what it holds."""
+        self._check_room(rows)
+        with self.whole:
+            self.container.add_chunk(rows)
+        self._warn_if_deleted()
+
+    def _start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], None]:
+        """Begins to compress chunks, on the worker's thread; the result waits for that and writes them.
+
+        Until then their memory must stay, and no other chunk of their channels be written.
+        """
+        for rows in chunks:
+            self._check_room(rows)
+        container = self.container
+        with self.whole:
+            prepared = [container.prepare(rows) for rows in chunks]
+            job = partial(container.pack_all, [chunk.data for chunk in prepared])
+            # a thread that needs the interpreter lock for every chunk would wait for it again and again
+            result = self.worker.submit(job).result if container.packs_together else job
+
+        def finish() -> None:
+            if self.failed is not None:
+                raise self.failed
+            with self.whole:
+                for chunk, packed in zip(prepared, result(), strict=True):
+                    container.place(chunk, packed)
+                if self._durable:
+                    self._settle()
+            self._warn_if_deleted()
+
+        return finish
+
+    def _check_room(self, rows: Rows) -> None:
         if self.failed is not None:
             raise self.failed
         if rows.first + len(rows.offsets) > LAST_ROW:
             raise RecordingError(
                 f"{self.path}: a channel holds at most {LAST_ROW} messages; go on in a new recording"
             )
-        with self.whole:
-            self.container.add_chunk(rows)
-        self._warn_if_deleted()
 
     def _warn_if_deleted(self) -> None:
         """Once: what is written to a file without a name is lost when it is closed."""
