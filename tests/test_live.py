@@ -240,6 +240,24 @@ def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:
         assert np.array(value[0], np.uint8).tobytes() == cams[row].tobytes()
 
 
+def test_the_newest_steps_are_a_heat_map_in_rerun(tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    inner = Sampler(spaces.Box(-1, 1, (60,)), spaces.Discrete(3))
+    with receiver(port, tmp_path / "r.rrd"), RecordEpisodes(inner, path, live=url(port)) as env:
+        roll(env, 600, 0.002)
+    rows, tensors = shown(tmp_path / "r.rrd", "/state/heat_map", "Tensor:data")
+    with Recording(path) as recording:
+        states = recording.read().states[200:]
+    assert rows[-1] == 599
+    (tensor,) = tensors[-1]
+    assert tensor["shape"] == [60, 400]
+    found = np.array(tensor["buffer"]).reshape(60, 400).T
+    # colours only stretch, by as much as earlier states went further
+    for dimension in range(60):
+        assert np.corrcoef(found[:, dimension], states[:, dimension])[0, 1] > 0.999999
+    assert 0 <= found.min() < 0.1 < 0.9 < found.max() <= 1
+
+
 def test_frames_come_to_rerun(tmp_path: Path) -> None:
     path, port = tmp_path / "r.mcap", free_port()
     with receiver(port, tmp_path / "r.rrd"):

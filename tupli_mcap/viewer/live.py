@@ -7,7 +7,7 @@ import itertools
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ _DECODED = 200  # where each message is decoded on its own
 _IMAGES = 3
 _SAMPLE, _PATIENCE = 100, 1.0  # steps, and seconds to wait for them, before it is decided what shares an axis
 _BARS = 500
+_MAP_STEPS = 400
 _EVERY = 1.0  # seconds between two overviews
 _CDR = BODY - RECORD_HEADER.size
 _TERMINAL, _TIMEOUT, _INTERRUPTED = range(3)
@@ -75,6 +76,27 @@ class _Ends:
     index: dict[str, Array]
 
 
+class _NewestMap:
+    """The heat map of the newest steps, whatever their episodes: those of a replay are of whole episodes."""
+
+    def __init__(self, panel: HeatMap) -> None:
+        self._panel = panel
+        self._values = np.empty((0, panel.leaf.size), np.float32)
+
+    def take(self, columns: _Columns) -> None:
+        values = self._panel.leaf.get(getattr(columns, self._panel.column))
+        new = values.reshape(len(values), -1)[-_MAP_STEPS:].astype(np.float32)
+        self._values = np.concatenate([self._values, new])[-_MAP_STEPS:]
+        finite = np.isfinite(new)
+        panel = self._panel
+        low = np.minimum(panel.low, np.where(finite, new, np.inf).min(axis=0, initial=np.inf))
+        high = np.maximum(panel.high, np.where(finite, new, -np.inf).max(axis=0, initial=-np.inf))
+        self._panel = replace(panel, low=low, high=high)
+
+    def send(self, stream: Any, times: Times) -> None:
+        self._panel.send_map(Place(stream), self._values, times)
+
+
 class LivePicture:
     """The steps of the first sub-environment, numbered through all episodes, and the episodes of all of them."""
 
@@ -91,9 +113,10 @@ class LivePicture:
         self._next_overview = 0.0
         sample = [self._columns(steps.newest(_DECODED)) for steps in first]
         self._scene = live_scene(layout, watcher.labels, sample, watcher.camera(0))
-        # a heat map is of a whole episode, and frames come by themselves
+        # these two come by themselves
         self._panels = [panel for panel in self._scene.panels if not isinstance(panel, HeatMap | Camera)]
         self._cameras = [panel for panel in self._scene.beside if isinstance(panel, Camera)]
+        self._maps = [_NewestMap(panel) for panel in self._scene.panels if isinstance(panel, HeatMap)]
         looks = hashlib.sha256(repr(layout.to_metadata()).encode()).hexdigest()[:6]
         self.application = f"{re.sub(r'[^0-9A-Za-z_-]+', '-', title)[:40]} live {looks}"
         self.blueprint = blueprint_of(self._scene)
@@ -108,6 +131,7 @@ class LivePicture:
         """Sends what is new."""
         steps, ended = watcher.look(1)
         waiting, self._waiting = self._waiting, []
+        newest: Times | None = None
         for new in (*waiting, *steps):
             shown = new.newest(_STEPS if self._decoder is None else _DECODED)
             if shown.first != self._next_row:
@@ -115,6 +139,10 @@ class LivePicture:
             self._next_row = shown.first + len(shown)
             self._send_steps(stream, shown)
             self._send_images(stream, watcher, shown)
+            newest = self._times(np.array([self._next_row - 1]), shown.times[-1:])
+        if newest is not None:
+            for heat_map in self._maps:
+                heat_map.send(stream, newest)
         self._send_frames(stream, watcher)
         self._episodes += len(ended)
         self._returns = [*self._returns, *ended["return"].tolist()][-_BARS:]
@@ -133,6 +161,8 @@ class LivePicture:
 
     def _send_steps(self, stream: Any, steps: NewSteps) -> None:
         columns = self._columns(steps)
+        for heat_map in self._maps:
+            heat_map.take(columns)
         bounds = [0, *(np.flatnonzero(np.diff(steps.episodes)) + 1).tolist(), len(steps)]
         ends = _ends_of(columns, self._flags(steps), bounds)
         # the return goes on from one block to the next only where an episode is alone in its block

@@ -94,13 +94,24 @@ class HeatMap:
         """Nothing: tensors say all themselves."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        values = flat_values(self.leaf, self.column, block).astype(np.float32)
-        span = np.where(self.high > self.low, self.high - self.low, 1.0).astype(np.float32)
-        with np.errstate(invalid="ignore", over="ignore"):
-            scaled = np.clip((values - self.low.astype(np.float32)) / span, 0.0, 1.0)
+        scaled = self._scaled(flat_values(self.leaf, self.column, block))
         maps = [_pooled(scaled[piece.begin : piece.end].T) for piece in block.pieces]
         at = times.at(np.array([piece.begin for piece in block.pieces]))
         send_tensors(place.stream, place.root + self.entity, at, maps, ("dimension", "step"))
+
+    def send_map(self, place: Place, values: Array, times: Times) -> None:
+        """Sends one map of `values` (steps x dimensions) for the one time of `times`."""
+        maps = [_pooled(self._scaled(values).T)]
+        send_tensors(place.stream, place.root + self.entity, times, maps, ("dimension", "step"))
+
+    def _scaled(self, values: Array) -> Array:
+        """From 0 (the lowest value of the dimension) to 1 (the highest)."""
+        span = np.where(self.high > self.low, self.high - self.low, 1.0).astype(np.float32)
+        with np.errstate(invalid="ignore", over="ignore"):
+            scaled: Array = np.clip(
+                (values.astype(np.float32) - self.low.astype(np.float32)) / span, 0.0, 1.0
+            )
+        return scaled
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         return _tensors(self.title, roots, self.entity)
