@@ -165,8 +165,8 @@ def test_images_are_not_read_for_histograms(tmp_path: Path, monkeypatch: pytest.
     with Recording(path) as recording:
         images = set(recording._store.chunks(recording._topics["/image/state"]))
         read: list[int] = []
-        load = recording._store.load
-        monkeypatch.setattr(recording._store, "load", lambda i, **kw: read.append(i) or load(i, **kw))
+        chunk = recording._store.chunk
+        monkeypatch.setattr(recording._store, "chunk", lambda i, **kw: read.append(i) or chunk(i, **kw))
         measure(recording, np.arange(len(recording)))
         assert read and images and not images & set(read)
 
@@ -664,8 +664,8 @@ def test_of_a_long_recording_a_sketch_reads_a_few_chunks(
     )  # ten steps at each of 16 places
     with Recording(path) as recording:
         loaded: set[int] = set()
-        load = recording._store.load
-        monkeypatch.setattr(recording._store, "load", lambda i, **kw: loaded.add(i) or load(i, **kw))
+        chunk = recording._store.chunk
+        monkeypatch.setattr(recording._store, "chunk", lambda i, **kw: loaded.add(i) or chunk(i, **kw))
         found = sketch(recording, 10)
         assert 160 <= found.sampled < 1500
         chunks = recording._store.chunks(recording._topics["/step"])

@@ -84,8 +84,8 @@ def test_images_may_be_left_out(path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with Recording(path) as recording:
         images = recording._topics["/image/state"]
         read: list[int] = []
-        load = recording._store.load
-        monkeypatch.setattr(recording._store, "load", lambda i, **kw: read.append(i) or load(i, **kw))
+        chunk = recording._store.chunk
+        monkeypatch.setattr(recording._store, "chunk", lambda i, **kw: read.append(i) or chunk(i, **kw))
         columns = recording.read(images=False)
         part = recording.read_steps(0, 1, 4, images=False)
         assert not set(read) & set(recording._store.chunks(images)) and read

@@ -299,7 +299,7 @@ def test_a_changed_step_is_found(bundle: Path, tmp_path: Path) -> None:
         (chunk,) = store.chunks(recording._step_channels[0])
         body = bytearray(store.load(chunk))
         body[60] ^= 1
-        store._cache[chunk] = bytes(body)  # what a forger would write, with all CRCs and indexes right
+        store.chunk(chunk).data = bytes(body)  # what a forger would write, with all CRCs and indexes right
         forged = {SIGNATURE_NAME: ("application/json", signature)}
         rewrite_recording(recording, tmp_path / "forged.mcap", attachments=forged)
     with pytest.raises(SignatureError, match="the channel '/step' was changed after signing"):

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import SpaceError
-from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.common import common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 
-__all__ = ["FieldBuilder", "LeafBuilder", "check_layouts", "common_dtype", "field_leaves", "pick"]
+__all__ = ["FieldBuilder", "LeafBuilder", "pick"]
 
 Array = np.ndarray[Any, Any]
 Keep = Array | None  # a bool mask of rows, a slice as None: all
@@ -89,17 +87,6 @@ class FieldBuilder:
         return (self._layout.nest_action if self._field == "actions" else self._layout.nest_state)(values)
 
 
-def field_leaves(field: str, layout: StepLayout) -> Sequence[Leaf] | None:
-    """The leaves of a field; None where it is a plain column (flags, infos)."""
-    groups = {
-        "states": layout.state,
-        "next_states": layout.state,
-        "actions": layout.action,
-        "rewards": layout.reward,
-    }
-    return groups.get(field)
-
-
 def pick(column: Any, rows: Any) -> Any:
     """Rows of a column, as a copy: `rows` is a bool mask, an array of indices or a slice."""
     if isinstance(column, dict):
@@ -111,53 +98,3 @@ def pick(column: Any, rows: Any) -> Any:
             return column[rows]
         return [column[i] for i in (np.flatnonzero(rows) if rows.dtype == np.bool_ else rows)]
     return column[rows].copy() if isinstance(rows, slice) else column[rows]
-
-
-def check_layouts(first: StepLayout, first_name: str, other: StepLayout, other_name: str) -> None:
-    """Whether the columns of two recordings can follow each other in one array.
-
-    Raises:
-        SpaceError: they cannot; the message names the first leaf that differs, and both recordings.
-    """
-    for root, ours, theirs in (
-        ("state", first.state, other.state),
-        ("action", first.action, other.action),
-        ("reward", first.reward, other.reward),
-    ):
-        found = {leaf.keys: leaf for leaf in theirs}
-        if {leaf.keys for leaf in ours} != found.keys():
-            a, b = (", ".join(leaf.path for leaf in leaves) or "nothing" for leaves in (ours, theirs))
-            raise _differ(root, a, first_name, b, other_name)
-        for leaf in ours:
-            a, b = _describe(leaf, first), _describe(found[leaf.keys], other)
-            if a != b and not _compatible(leaf, first, found[leaf.keys], other):
-                raise _differ(leaf.path, a, first_name, b, other_name)
-
-
-def _compatible(a: Leaf, first: StepLayout, b: Leaf, other: StepLayout) -> bool:
-    if "variable" in (a.kind, b.kind):
-        return a.kind == b.kind and type(a.space) is type(b.space)
-    return a.shape == b.shape and common_dtype(first.dtypes[a.name], other.dtypes[b.name]) is not None
-
-
-def _describe(leaf: Leaf, layout: StepLayout) -> str:
-    if leaf.kind == "variable":
-        return type(leaf.space).__name__
-    return f"{layout.dtypes[leaf.name].name} of shape {leaf.shape}"
-
-
-def _differ(path: str, a: str, first: str, b: str, other: str) -> SpaceError:
-    return SpaceError(
-        f"{path}: expected {a} as in {first}, found {b} in {other}, which cannot be put into one array; "
-        "choose recordings of one kind, with_benchmark_filter(...) for example"
-    )
-
-
-def common_dtype(a: np.dtype[Any], b: np.dtype[Any]) -> np.dtype[Any] | None:
-    """A dtype that holds all values of both exactly, without turning numbers of one kind into another."""
-    if a == b:
-        return a
-    if "b" in a.kind + b.kind or (a.kind == "f") != (b.kind == "f"):
-        return None
-    common = np.result_type(a, b)
-    return None if common.kind == "f" and a.kind != "f" else common

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +14,8 @@ from tupli_mcap.dataset.parsers import map_columns
 from tupli_mcap.dataset.selection import TupleFilter, selector_of
 from tupli_mcap.dataset.sources import Source
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.sampling import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
+from tupli_mcap.sampling.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_keys
 
 __all__ = ["Query"]
@@ -45,10 +48,12 @@ class Query:
         self._headers: list[EpisodeHeader] | None = None
         self._selected: Selected | None = None
         self._columns: dict[str, Any] = {}
+        self._recorded: RecordedSteps | None = None
+        self.cache_bytes, self.threads = CACHE_BYTES, THREADS
 
     def __getstate__(self) -> dict[str, Any]:
         # Another process reads the same episodes for itself; a layout cannot be pickled.
-        return {**self.__dict__, "layout": None, "_columns": {}}
+        return {**self.__dict__, "layout": None, "_columns": {}, "_recorded": None}
 
     def with_filters(self, **filters: Any) -> Self:
         """A query that has read nothing, with some filters replaced; named as the constructor's arguments."""
@@ -57,7 +62,9 @@ class Query:
             "episode_filter": self.episode_filter,
             "tuple_filter": self.tuple_filter,
         }
-        return type(self)(self.source, **{**mine, **filters})
+        made = type(self)(self.source, **{**mine, **filters})
+        made.cache_bytes, made.threads = self.cache_bytes, self.threads
+        return made
 
     @property
     def benchmarks(self) -> list[BenchmarkHeader]:
@@ -89,9 +96,24 @@ class Query:
         """Lists the episodes anew; columns stay if the episodes are the same."""
         headers = self.source.episodes(self.benchmark_filter, self.episode_filter)
         if self._headers is None or _identity(headers) != _identity(self._headers):
-            self._selected, self.layout, self._columns = None, None, {}
+            self._selected, self.layout, self._columns, self._recorded = None, None, {}, None
         self._headers, self._benchmarks = headers, None
         return headers
+
+    def steps(self) -> Steps:
+        """The wanted steps by number: from columns that have been read, else from the recordings as they are asked
+        for."""
+        if self._recorded is None:
+            mask = None if self._selector is None else self.selected.mask
+            self._recorded = RecordedSteps(
+                _listed(self.headers),
+                self.source.open,
+                mask,
+                cache_bytes=self.cache_bytes,
+                threads=self.threads,
+            )
+        loaded = {field: column for field, column in self._columns.items() if field in FIELDS}
+        return MemorySteps(loaded, self._recorded) if loaded else self._recorded
 
     def read(self, fields: Sequence[str]) -> dict[str, Any]:
         """Columns by field, which are kept and cannot be written to."""
@@ -134,6 +156,13 @@ def _check(filter: BaseFilter | None, model: type[BenchmarkHeader] | type[Episod
 def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
     """What the columns of some episodes depend on."""
     return [(header.id, header.n_tuples, header.recording) for header in headers]
+
+
+def _listed(headers: Sequence[EpisodeHeader]) -> Iterator[ListedEpisodes]:
+    for name, group in itertools.groupby(headers, key=lambda header: header.recording):
+        found = [(header.episode, header.n_tuples) for header in group]
+        numbers, lengths = np.array(found, np.int64).reshape(-1, 2).T
+        yield ListedEpisodes(name, numbers, lengths)
 
 
 def _frozen(array: Array) -> Array:

@@ -6,6 +6,7 @@ rows' own headers must agree with the chunk table.
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 import threading
@@ -24,7 +25,7 @@ from tupli_mcap.recording.container import COMPRESSIONS
 from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.source import Source
 
-__all__ = ["IN_MEMORY", "ChunkStore", "Span"]
+__all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Located", "Span"]
 
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
 _CHUNK_HEAD = struct.Struct(
@@ -43,25 +44,87 @@ class Span(NamedTuple):
     end: int
 
 
+class Located(NamedTuple):
+    """Where runs of rows lie, in arrays: `steps[i]` rows of run `run[i]` are in `chunk[i]`, from row `begin[i]` on."""
+
+    run: np.ndarray[Any, Any]
+    chunk: np.ndarray[Any, Any]
+    begin: np.ndarray[Any, Any]
+    steps: np.ndarray[Any, Any]
+
+
+class KeptChunk:
+    """A decompressed chunk, and what has been found out about it."""
+
+    __slots__ = ("data", "rows", "spans")
+
+    def __init__(self, data: Any) -> None:
+        self.data = data
+        self.rows: np.ndarray[Any, Any] | None = None  # their headers checked
+        self.spans: list[tuple[int, int]] | None = None
+
+
+class ChunkCache:
+    """Decompressed chunks, the ones used last, of one or several stores. Safe from several threads, and after a fork.
+
+    Args:
+        budget: bytes to keep; one chunk is kept even if it is larger.
+    """
+
+    def __init__(self, budget: int) -> None:
+        self.budget = budget
+        self._kept: OrderedDict[tuple[int, int], KeptChunk] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+        self._process = os.getpid()
+
+    def _held(self) -> threading.Lock:
+        if self._process != os.getpid():  # forked: the lock may be held by a thread that is not here
+            self._lock, self._process = threading.Lock(), os.getpid()
+        return self._lock
+
+    def get(self, key: tuple[int, int]) -> KeptChunk | None:
+        with self._held():
+            if key in self._kept:
+                self._kept.move_to_end(key)
+            return self._kept.get(key)
+
+    def put(self, key: tuple[int, int], kept: KeptChunk) -> None:
+        with self._held():
+            before = self._kept.pop(key, None)
+            self._kept[key] = kept
+            self._bytes += len(kept.data) - (0 if before is None else len(before.data))
+            while self._bytes > self.budget and len(self._kept) > 1:
+                self._bytes -= len(self._kept.popitem(last=False)[1].data)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"budget": self.budget}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        ChunkCache.__init__(self, state["budget"])
+
+
+_numbers = itertools.count()
+
+
 class ChunkStore:
     """The chunks of a recording. `table` is a CHUNK_ROWS array; `memory` holds rows that are only in the journal.
 
-    `rows(i, dtype)` and `offsets(i)` are safe from several threads.
+    Reading is safe from several threads. A copy in another process (where the source can be copied) starts with an
+    empty cache.
+
+    Args:
+        cache: the budget (bytes) of a cache of its own, or a cache that is shared with other stores.
     """
 
     def __init__(
-        self, source: Source, table: np.ndarray[Any, Any], memory: Sequence[bytes], cache_bytes: int
+        self, source: Source, table: np.ndarray[Any, Any], memory: Sequence[bytes], cache: int | ChunkCache
     ) -> None:
         self._source = source
         self.table = table
         self._memory = memory
-        self._budget = cache_bytes
-        self._cache: OrderedDict[int, Any] = OrderedDict()
-        self._cached = 0
-        self._lock = threading.Lock()
-        self._process = os.getpid()
-        self._offsets: dict[int, list[tuple[int, int]]] = {}
-        self._views: dict[int, np.ndarray[Any, Any]] = {}  # of cached chunks, their headers checked
+        self._cache = ChunkCache(cache) if isinstance(cache, int) else cache
+        self._number = next(_numbers)  # tells the stores apart that share a cache
         self._by_channel: dict[int, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
         self._counts: dict[int, int] = {}
         for channel in np.unique(table["channel"]):
@@ -106,25 +169,48 @@ class ChunkStore:
             first += end - begin
             at += 1
 
+    def elsewhere(self, source: Source, cache: ChunkCache) -> ChunkStore:
+        """The same chunks, read from another source, kept in another cache."""
+        return ChunkStore(source, self.table, self._memory, cache)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._number = next(_numbers)
+
+    def locate(self, channel: int, first: np.ndarray[Any, Any], counts: np.ndarray[Any, Any]) -> Located:
+        """Where the runs `first[i]:first[i] + counts[i]` (int64) of a channel's rows lie, in their order."""
+        taken = np.flatnonzero(counts > 0)
+        first, counts = first[taken], counts[taken]
+        if not len(first):
+            none = np.empty(0, np.int64)
+            return Located(none, none, none, none)
+        last = first + counts
+        if first.min() < 0 or last.max() > self.count(channel):
+            raise FormatError(
+                f"{self._source.name}: expected rows {first.min()} to {last.max()} in channel {channel}, "
+                f"found {self.count(channel)} rows"
+            )
+        chosen, firsts = self._by_channel[channel]
+        low = np.searchsorted(firsts, first, side="right") - 1
+        pieces = np.searchsorted(firsts, last, side="left") - low
+        run = np.repeat(np.arange(len(first)), pieces)
+        at = low[run] + np.arange(len(run)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        start = np.maximum(first[run], firsts[at])
+        end = np.minimum(last[run], firsts[at] + self.table["rows"][chosen[at]])
+        return Located(taken[run], chosen[at], start - firsts[at], end - start)
+
     def load(self, i: int, *, keep: bool = True) -> Any:
         """The message records of chunk `i`; cached unless `keep` is False."""
-        if self._process != os.getpid():  # forked: the lock may be held by a thread that is not here
-            self._lock, self._process = threading.Lock(), os.getpid()
-        with self._lock:
-            if i in self._cache:
-                self._cache.move_to_end(i)
-                return self._cache[i]
-        data = self._read(i)
-        if keep:
-            with self._lock:
-                self._cache[i] = data
-                self._cached += len(data)
-                while self._cached > self._budget and len(self._cache) > 1:
-                    old, dropped = self._cache.popitem(last=False)
-                    self._offsets.pop(old, None)
-                    self._views.pop(old, None)
-                    self._cached -= len(dropped)
-        return data
+        return self.chunk(i, keep=keep).data
+
+    def chunk(self, i: int, *, keep: bool = True) -> KeptChunk:
+        """A chunk and what is known of it; cached unless `keep` is False."""
+        kept = self._cache.get((self._number, i))
+        if kept is None:
+            kept = KeptChunk(self._read(i))
+            if keep:
+                self._cache.put((self._number, i), kept)
+        return kept
 
     def _read(self, i: int) -> Any:
         row = self.table[i]
@@ -158,10 +244,10 @@ class ChunkStore:
 
     def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> np.ndarray[Any, Any]:
         """The rows of a chunk of constant layout as one structured array; their headers are checked."""
-        view = self._views.get(i)
-        if view is not None:
-            return view
-        data = self.load(i, keep=keep)
+        kept = self.chunk(i, keep=keep)
+        if kept.rows is not None:
+            return kept.rows
+        data = kept.data
         row = self.table[i]
         n = int(row["rows"])
         if len(data) != n * dtype.itemsize:
@@ -172,14 +258,14 @@ class ChunkStore:
         good = (rows["#opcode"] == 5).all() and (rows["#length"] == dtype.itemsize - 9).all()
         if not (good and (rows["#channel"] == row["channel"]).all()):
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
-        if i in self._cache:
-            self._views[i] = rows
+        kept.rows = rows
         return rows
 
     def messages(self, i: int) -> list[tuple[int, int]]:
         """(start, end) of each message record of a chunk of variable layout."""
-        if i not in self._offsets:
-            data = memoryview(self.load(i))
+        kept = self.chunk(i)
+        if kept.spans is None:
+            data = memoryview(kept.data)
             spans = []
             for start, end, channel, _, _ in iter_records(data):
                 if channel != self.table["channel"][i]:
@@ -189,8 +275,8 @@ class ChunkStore:
                 raise FormatError(
                     f"{self._source.name}: chunk {i} expected {self.table['rows'][i]} messages, found {len(spans)}"
                 )
-            self._offsets[i] = spans
-        return self._offsets[i]
+            kept.spans = spans
+        return kept.spans
 
     def bodies(self, channel: int, first: int, count: int) -> Iterator[memoryview]:
         """The CDR bodies of messages of a channel of variable layout."""

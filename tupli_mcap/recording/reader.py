@@ -28,6 +28,7 @@ from tupli_mcap.recording.frames import Cameras, Frames
 from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.signed import SIGNATURE_NAME, voucher
 from tupli_mcap.recording.source import open_source
+from tupli_mcap.recording.stored import StoredSteps
 from tupli_mcap.recording.summary import read_attachment
 from tupli_mcap.trust import TrustedKey, is_trusted
 
@@ -113,6 +114,7 @@ class Recording:
         self._layout: StepLayout | None = None
         self._columns: ColumnReader | None = None
         self._topics = {topic: channel.id for topic, channel in topics.items()}
+        self._images: dict[str, dict[int, int]] = {}  # leaf -> step channel -> image channel
         self._infos: dict[int, dict[int, dict[str, Any]]] | None = None
         counts = {topic: self._store.count(self._topics.get(topic, 0)) for topic in EPISODE_TOPICS}
         check_episodes(self.index, [self._store.count(c) for c in self._step_channels], counts, self.name)
@@ -128,7 +130,7 @@ class Recording:
                     )
             if "/final_state" in topics:
                 self._check_schema(topics["/final_state"], FINAL_STATE_SCHEMA, self._layout.final_schema)
-            images = {
+            self._images = {
                 leaf.name: {
                     channel.id: self._topics.get(
                         f"{channel.topic.removesuffix('/step')}/image/{leaf.name}", 0
@@ -137,7 +139,7 @@ class Recording:
                 }
                 for leaf in self._layout.images
             }
-            self._columns = ColumnReader(self._layout, self._store, images)
+            self._columns = ColumnReader(self._layout, self._store, self._images)
 
     def _check_schema(self, channel: Channel, name: str, text: str) -> None:
         schema = self._contents.schemas.get(channel.schema_id)
@@ -473,6 +475,13 @@ class Recording:
                     shifted[ends[known]] = finals[i]
             columns.append(shifted)
         return layout.nest_state(columns)
+
+    @property
+    def stored(self) -> StoredSteps:
+        """Where the steps lie; RecordingError if there is none yet."""
+        finals = self._topics.get("/final_state")
+        where, source = self._reopen, self._source
+        return StoredSteps(self.layout, self._store, self._step_channels, self._images, finals, where, source)
 
     def replay(
         self,

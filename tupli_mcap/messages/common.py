@@ -1,0 +1,75 @@
+"""What the steps of several recordings have in common: whether one array can hold them, and of which dtype."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import SpaceError
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
+
+__all__ = ["check_layouts", "common_dtype", "field_leaves"]
+
+
+def field_leaves(field: str, layout: StepLayout) -> Sequence[Leaf] | None:
+    """The leaves of a field; None where it is a plain column (flags, infos)."""
+    groups = {
+        "states": layout.state,
+        "next_states": layout.state,
+        "actions": layout.action,
+        "rewards": layout.reward,
+    }
+    return groups.get(field)
+
+
+def check_layouts(first: StepLayout, first_name: str, other: StepLayout, other_name: str) -> None:
+    """Whether the columns of two recordings can follow each other in one array.
+
+    Raises:
+        SpaceError: they cannot; the message names the first leaf that differs, and both recordings.
+    """
+    for root, ours, theirs in (
+        ("state", first.state, other.state),
+        ("action", first.action, other.action),
+        ("reward", first.reward, other.reward),
+    ):
+        found = {leaf.keys: leaf for leaf in theirs}
+        if {leaf.keys for leaf in ours} != found.keys():
+            a, b = (", ".join(leaf.path for leaf in leaves) or "nothing" for leaves in (ours, theirs))
+            raise _differ(root, a, first_name, b, other_name)
+        for leaf in ours:
+            a, b = _describe(leaf, first), _describe(found[leaf.keys], other)
+            if a != b and not _compatible(leaf, first, found[leaf.keys], other):
+                raise _differ(leaf.path, a, first_name, b, other_name)
+
+
+def _compatible(a: Leaf, first: StepLayout, b: Leaf, other: StepLayout) -> bool:
+    if "variable" in (a.kind, b.kind):
+        return a.kind == b.kind and type(a.space) is type(b.space)
+    return a.shape == b.shape and common_dtype(first.dtypes[a.name], other.dtypes[b.name]) is not None
+
+
+def _describe(leaf: Leaf, layout: StepLayout) -> str:
+    if leaf.kind == "variable":
+        return type(leaf.space).__name__
+    return f"{layout.dtypes[leaf.name].name} of shape {leaf.shape}"
+
+
+def _differ(path: str, a: str, first: str, b: str, other: str) -> SpaceError:
+    return SpaceError(
+        f"{path}: expected {a} as in {first}, found {b} in {other}, which cannot be put into one array; "
+        "choose recordings of one kind, with_benchmark_filter(...) for example"
+    )
+
+
+def common_dtype(a: np.dtype[Any], b: np.dtype[Any]) -> np.dtype[Any] | None:
+    """A dtype that holds all values of both exactly, without turning numbers of one kind into another."""
+    if a == b:
+        return a
+    if "b" in a.kind + b.kind or (a.kind == "f") != (b.kind == "f"):
+        return None
+    common = np.result_type(a, b)
+    return None if common.kind == "f" and a.kind != "f" else common

@@ -1,0 +1,213 @@
+"""Where the steps of listed episodes lie: found once, from the indexes of their recordings."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import NotFoundError
+from tupli_mcap.messages.common import check_layouts
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.chunks import ChunkCache, ChunkStore
+from tupli_mcap.recording.stored import StoredSteps
+from tupli_mcap.sampling.files import FileOfMany, OpenFiles
+from tupli_mcap.sampling.segments import Segments, SegmentsBuilder
+
+__all__ = ["ListedEpisodes", "StepIndex", "positions_of"]
+
+Array = np.ndarray[Any, Any]
+
+
+class ListedEpisodes(NamedTuple):
+    """Episodes of one recording: the name that opens it, their numbers, and how many steps of each are meant."""
+
+    recording: str
+    numbers: Array
+    lengths: Array
+
+
+def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
+    """Where the episodes are in the recording's index.
+
+    Raises:
+        NotFoundError: one of them is not there any more, or is shorter.
+    """
+    numbers = recording.index["episode"].astype(np.int64)
+    order = np.argsort(numbers, kind="stable")
+    places = np.searchsorted(numbers, listed.numbers, sorter=order)
+    positions: Array = order[np.minimum(places, len(order) - 1)] if len(order) else places
+    gone = numbers[positions] != listed.numbers if len(order) else np.ones(len(places), np.bool_)
+    if not gone.any():
+        gone = recording.index["length"][positions] < listed.lengths
+    if gone.any():
+        raise NotFoundError(
+            f"{recording.name}: episode {listed.numbers[int(np.argmax(gone))]} was listed, but is not there as it "
+            "was: the file has been changed since; call load() to list the episodes anew"
+        )
+    return positions
+
+
+@dataclass
+class StepIndex:
+    """Where the steps of listed episodes lie, in rows 0 to n - 1, episode after episode.
+
+    `after` (int64) says for each episode what comes after its last step: `-1 - k` is row k of `finals`; the number of
+    its last step where that is not known (`unknown`). `finals` are of the episodes `final_numbers`.
+    """
+
+    layouts: list[StepLayout]
+    layout_of: list[int]  # of each file
+    stores: list[ChunkStore]
+    steps: Segments
+    images: dict[str, Segments]  # by name of the leaf in the first layout
+    finals: Segments
+    final_numbers: Array
+    lengths: Array
+    after: Array
+    unknown: Array
+    digest: str
+
+    @classmethod
+    def of(
+        cls,
+        listed: Iterable[ListedEpisodes],
+        open_recording: Callable[[str], Recording],
+        files: OpenFiles,
+        cache: ChunkCache,
+    ) -> StepIndex:
+        """Opens one recording after the other.
+
+        Raises:
+            SpaceError: two recordings do not fit into one array.
+            NotFoundError: an episode is not in its recording any more.
+        """
+        builder = _Builder(files, cache)
+        for part in listed:
+            recording = open_recording(part.recording)
+            try:
+                builder.add(recording, part)
+            finally:
+                if recording.stored.where is not None:  # else nobody could open it again
+                    recording.close()
+        return builder.finish()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "layouts": [layout.to_metadata() for layout in self.layouts]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.layouts = [StepLayout.from_metadata(metadata) for metadata in state["layouts"]]
+
+
+class _Part(NamedTuple):
+    """The episodes of one file: rows of its index, and how many steps of each are meant."""
+
+    stored: StoredSteps
+    store: ChunkStore
+    rows: Array
+    lengths: Array
+
+    @property
+    def known(self) -> Array:
+        """Which of the episodes end with a final state that is known; not those that went on since they were listed."""
+        found: Array = (self.rows["final_row"] >= 0) & (self.rows["length"] == self.lengths)
+        return found if self.stored.final_channel is not None else np.zeros_like(found)
+
+    def locate(self, channels: Array, first: Array, counts: Array) -> tuple[Array, Array, Array]:
+        """Chunks, places in them and numbers of rows, run after run; each run is of the channel of its place."""
+        runs, found = [], []
+        for channel in np.unique(channels):
+            chosen = np.flatnonzero(channels == channel)
+            located = self.store.locate(int(channel), first[chosen], counts[chosen])
+            runs.append(chosen[located.run])
+            found.append(np.stack([located.chunk, located.begin, located.steps]))
+        if not runs:
+            none = np.empty(0, np.int64)
+            return none, none, none
+        order = np.argsort(np.concatenate(runs), kind="stable")
+        chunks, begins, steps = np.concatenate(found, axis=1)[:, order]
+        return chunks, begins, steps
+
+
+class _Builder:
+    """Collects the episodes of one recording after the other."""
+
+    def __init__(self, files: OpenFiles, cache: ChunkCache) -> None:
+        self._files, self._cache = files, cache
+        self._layouts: list[StepLayout] = []
+        self._known: dict[tuple[str, ...], int] = {}
+        self._layout_of: list[int] = []
+        self._parts: list[_Part] = []
+        self._first_name = ""
+        self._digest = hashlib.sha256()
+
+    def add(self, recording: Recording, listed: ListedEpisodes) -> None:
+        stored = recording.stored
+        source = stored.source
+        if stored.where is not None:
+            source = FileOfMany(self._files, stored.where, source.size)
+        rows = recording.index[positions_of(recording, listed)]
+        self._layout_of.append(self._layout(recording.name, stored.layout))
+        self._parts.append(_Part(stored, stored.store.elsewhere(source, self._cache), rows, listed.lengths))
+        self._digest.update(f"{recording.uuid} {len(rows)} ".encode())
+        self._digest.update(rows["episode"].tobytes() + listed.lengths.tobytes())
+
+    def _layout(self, name: str, layout: StepLayout) -> int:
+        key = tuple(layout.to_metadata().values())
+        if key not in self._known:
+            if self._layouts:
+                check_layouts(self._layouts[0], self._first_name, layout, name)
+            else:
+                self._first_name = name
+            self._known[key] = len(self._layouts)
+            self._layouts.append(layout)
+        return self._known[key]
+
+    def finish(self) -> StepIndex:
+        parts = self._parts
+        lengths = _joined([part.lengths for part in parts], np.int64)
+        known = _joined([part.known for part in parts], np.bool_)
+        numbers = _joined([part.rows["episode"][part.known] for part in parts], np.uint32)
+        after = np.cumsum(lengths) - 1
+        after[known] = -1 - np.arange(len(numbers))
+        images = dict.fromkeys(leaf.path for layout in self._layouts for leaf in layout.images)
+        names = {leaf.path: leaf.name for leaf in self._layouts[0].state} if parts else {}
+        return StepIndex(
+            self._layouts,
+            self._layout_of,
+            [part.store for part in parts],
+            self._steps(None),
+            {names[path]: self._steps(path) for path in images},
+            self._finals(),
+            numbers,
+            lengths,
+            after,
+            ~known,
+            self._digest.hexdigest(),
+        )
+
+    def _steps(self, path: str | None) -> Segments:
+        """Where the steps lie, or the images of a leaf of the state."""
+        builder = SegmentsBuilder()
+        for file, (stored, part) in enumerate((part.stored, part) for part in self._parts):
+            image = next((leaf.name for leaf in stored.layout.images if leaf.path == path), None)
+            channels = stored.channels_of(part.rows["env"].astype(np.int64), image)
+            builder.add(file, *part.locate(channels, part.rows["first_row"].astype(np.int64), part.lengths))
+        return builder.build()
+
+    def _finals(self) -> Segments:
+        builder = SegmentsBuilder()
+        for file, part in enumerate(self._parts):
+            rows = part.rows["final_row"][part.known].astype(np.int64)
+            channels = np.full(len(rows), part.stored.final_channel or 0)
+            builder.add(file, *part.locate(channels, rows, np.ones_like(rows)))
+        return builder.build()
+
+
+def _joined(parts: list[Array], dtype: Any) -> Array:
+    return np.concatenate([np.empty(0, dtype), *parts]).astype(dtype)

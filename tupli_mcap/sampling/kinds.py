@@ -1,0 +1,122 @@
+"""The rows of recordings by kind: steps, images of a leaf, final states; for recordings of one or several layouts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.messages.common import common_dtype
+from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.sampling.gather import TIME, Column, ConstantRows, DecodedRows, RowFormat, Rows
+from tupli_mcap.sampling.index import StepIndex
+from tupli_mcap.sampling.segments import Segments
+
+__all__ = ["EPISODE", "final_rows", "image_rows", "step_rows"]
+
+EPISODE = "episode"  # the column of the number that a final state says its episode has
+_BOOL, _U32, _U64 = np.dtype(np.bool_), np.dtype(np.uint32), np.dtype(np.uint64)
+Decode = Callable[[memoryview], dict[str, Any]]
+
+
+def step_rows(index: StepIndex) -> Rows:
+    """The leaves of steps that are no images, "terminal", "timeout" and `TIME`."""
+    columns = {leaf.name: _column(index, leaf) for leaf in index.layouts[0].leaves}
+    columns = {name: column for name, column in columns.items() if name not in index.images}
+    columns |= {"terminal": Column((), _BOOL), "timeout": Column((), _BOOL), TIME: Column((), _U64)}
+    if not index.layouts[0].constant:
+        return _decoded(index, lambda layout: MessageDecoder(layout).step, columns, index.steps)
+    return _constant(
+        index, lambda layout: (layout.step_message.dtype, _fields(index, layout)), columns, index.steps
+    )
+
+
+def image_rows(index: StepIndex, name: str) -> Rows:
+    """A leaf of the state (ROS name in the first layout) that is an image in one of the layouts."""
+    (leaf,) = (leaf for leaf in index.layouts[0].state if leaf.name == name)
+
+    def of_layout(layout: StepLayout) -> tuple[Any, dict[str, str]]:
+        own = _fields(index, layout)[name]
+        if own in layout.image_messages:
+            return layout.image_messages[own].dtype, {name: "data"}
+        return layout.step_message.dtype, {name: own}
+
+    return _constant(index, of_layout, {name: _column(index, leaf)}, index.images[name])
+
+
+def final_rows(index: StepIndex) -> Rows:
+    """The leaves of final states, and `EPISODE`."""
+
+    def decode(layout: StepLayout) -> Decode:
+        final = MessageDecoder(layout).final
+
+        def values(body: memoryview) -> dict[str, Any]:
+            number, found = final(body)
+            return {**found, EPISODE: number}
+
+        return values
+
+    columns = {leaf.name: _column(index, leaf) for leaf in index.layouts[0].state} | {
+        EPISODE: Column((), _U32)
+    }
+    if not index.layouts[0].constant:
+        return _decoded(index, decode, columns, index.finals)
+    return _constant(
+        index, lambda layout: (layout.final_message.dtype, _fields(index, layout)), columns, index.finals
+    )
+
+
+def _column(index: StepIndex, leaf: Leaf) -> Column:
+    """A leaf of the first layout, in a dtype that holds the values of all layouts."""
+    if leaf.kind == "variable":
+        return Column((), None)
+    dtype = index.layouts[0].dtypes[leaf.name]
+    for layout in index.layouts[1:]:
+        (other,) = (other for other in layout.leaves if other.path == leaf.path)
+        dtype = common_dtype(dtype, layout.dtypes[other.name]) or dtype
+    return Column(leaf.shape, dtype)
+
+
+def _fields(index: StepIndex, layout: StepLayout) -> dict[str, str]:
+    """ROS names in the first layout, and in another."""
+    names = {leaf.path: leaf.name for leaf in layout.leaves}
+    return {leaf.name: names[leaf.path] for leaf in index.layouts[0].leaves}
+
+
+def _constant(
+    index: StepIndex,
+    of_layout: Callable[[StepLayout], tuple[Any, dict[str, str]]],
+    columns: dict[str, Column],
+    segments: Segments,
+) -> Rows:
+    """Rows of constant size; `of_layout` gives the dtype of a record, and the field of a column."""
+    found = [of_layout(layout) for layout in index.layouts]
+    files = zip(index.stores, index.layout_of, strict=True)
+    return ConstantRows(segments, [RowFormat(store, *found[i]) for store, i in files], columns)
+
+
+def _decoded(
+    index: StepIndex,
+    of_layout: Callable[[StepLayout], Decode],
+    columns: dict[str, Column],
+    segments: Segments,
+) -> Rows:
+    """Rows of variable size; `of_layout` gives what decodes the body of a message."""
+
+    def renamed(layout: StepLayout) -> Decode:
+        decode, fields = of_layout(layout), _fields(index, layout)
+        if all(mine == own for mine, own in fields.items()):
+            return decode
+        return lambda body: _renamed(decode(body), fields)
+
+    found = [renamed(layout) for layout in index.layouts]
+    return DecodedRows(segments, index.stores, [found[i] for i in index.layout_of], columns)
+
+
+def _renamed(values: dict[str, Any], fields: dict[str, str]) -> dict[str, Any]:
+    renamed = {mine: values[own] for mine, own in fields.items() if own in values}
+    others = {name: value for name, value in values.items() if name not in fields.values()}
+    return others | renamed

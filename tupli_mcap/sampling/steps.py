@@ -1,0 +1,113 @@
+"""The steps of a query by number: what windows, transitions and samplers read from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from tupli_mcap.errors import TupliError
+from tupli_mcap.messages.step import StepLayout
+
+__all__ = ["FIELDS", "MemorySteps", "SamplingError", "Steps", "checked_fields", "map_arrays", "pick"]
+
+FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
+Array = np.ndarray[Any, Any]
+_BLOCK = 4096  # steps in memory that are close to each other
+
+
+class SamplingError(TupliError, ValueError):
+    """Steps were asked for in a way that has no meaning: a window longer than every episode, negative weights."""
+
+
+class Steps(Protocol):
+    """The wanted steps of a query, numbered 0 to n - 1, episode after episode in the query's order.
+
+    Attributes:
+        layout: says how columns nest, and of which leaves they are; None where there is no step.
+        episode_lengths: int64, the wanted steps of each episode; may be 0.
+        breaks: int64, ascending: the steps that are not followed by their own episode's next step, that is the last
+            one of each episode, and the one before steps that a tuple filter left out.
+        open_ends: int64, ascending: the steps the state after which was not recorded; `next_states` repeats theirs.
+        identity: a digest of which steps these are; the same for the same steps, however they are read.
+    """
+
+    layout: StepLayout | None
+    episode_lengths: Array
+    breaks: Array
+    open_ends: Array
+    identity: str
+
+    def __len__(self) -> int: ...
+
+    def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
+        """Columns of the steps `rows` (int64, any order, repeats allowed), by field.
+
+        A column has the shape (len(rows), ...), is a list where values differ in size, and is nested as the space
+        is; arrays are the caller's own. Fields are those of `Recording.read`.
+
+        Raises:
+            SamplingError: there is no such field.
+        """
+        ...
+
+    def blocks(self, rows: Array) -> Array:
+        """int64: the block of the storage that each of `rows` lies in; rows of one block are cheap to read together."""
+        ...
+
+
+class MemorySteps:
+    """Steps whose columns are in memory, at least some of them; the other fields are read from `rest`."""
+
+    def __init__(self, columns: Mapping[str, Any], rest: Steps) -> None:
+        self._columns = dict(columns)
+        self._rest = rest
+        self.layout = rest.layout
+        self.episode_lengths, self.breaks = rest.episode_lengths, rest.breaks
+        self.open_ends, self.identity = rest.open_ends, rest.identity
+
+    def __len__(self) -> int:
+        return len(self._rest)
+
+    def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
+        checked_fields(fields)
+        missing = [field for field in fields if field not in self._columns]
+        found = self._rest.read(missing, rows) if missing else {}
+        return {
+            field: found[field] if field in found else pick(self._columns[field], rows) for field in fields
+        }
+
+    def blocks(self, rows: Array) -> Array:
+        return rows // _BLOCK
+
+
+def checked_fields(fields: Sequence[str], known: Sequence[str] = FIELDS) -> list[str]:
+    """The fields, one name as a list of one.
+
+    Raises:
+        SamplingError: one of them is unknown.
+    """
+    names = [fields] if isinstance(fields, str) else list(fields)
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise SamplingError(f"expected fields from {', '.join(known)}, found {', '.join(map(repr, unknown))}")
+    return list(dict.fromkeys(names))
+
+
+def pick(column: Any, rows: Array) -> Any:
+    """Rows of a column, as a copy."""
+    if isinstance(column, list):
+        return [column[row] for row in rows.tolist()]
+    return map_arrays(lambda part: part.take(rows, axis=0), column, lambda part: pick(part, rows))
+
+
+def map_arrays(
+    function: Callable[[Array], Any], column: Any, of_list: Callable[[list[Any]], Any] = lambda part: part
+) -> Any:
+    """The column with `function` applied to each array in it, and `of_list` to each list."""
+    if isinstance(column, dict):
+        return {key: map_arrays(function, part, of_list) for key, part in column.items()}
+    if isinstance(column, tuple):
+        return tuple(map_arrays(function, part, of_list) for part in column)
+    return of_list(column) if isinstance(column, list) else function(column)
