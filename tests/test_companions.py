@@ -265,6 +265,28 @@ def test_the_command_writes_a_copy_and_a_layout(tmp_path: Path) -> None:
     assert done.exit_code == 1 and not (tmp_path / "no.mcap").exists()
 
 
+@pytest.mark.parametrize(
+    ("target", "layout", "told"),
+    [
+        ("r.mcap", None, "is the recording, which is never written over"),
+        ("new.mcap", "r.mcap", "is the recording, which is never written over"),
+        ("new.txt", None, "expected a name that ends in .mcap"),
+        ("no/new.mcap", None, "there is no directory"),
+        ("new.mcap", "no/layout.json", "there is no directory"),
+    ],
+)
+def test_a_copy_that_cannot_be_leaves_everything(
+    tmp_path: Path, target: str, layout: str | None, told: str
+) -> None:
+    source = record(tmp_path / "r.mcap", spaces.Box(-1, 1, (2,)))
+    before = source.read_bytes()
+    words = ["--to-mcap", str(tmp_path / target), "--force", "--episode", "first"]
+    words += [] if layout is None else ["--layout", str(tmp_path / layout)]
+    done = CliRunner().invoke(app, ["replay", str(source), *words])
+    assert done.exit_code == 1 and told in done.output
+    assert source.read_bytes() == before and list(tmp_path.iterdir()) == [source]
+
+
 @pytest.mark.filterwarnings("ignore:.*is declared float32:UserWarning")
 def test_rewriting_a_vector_recording_keeps_the_order_of_ends(tmp_path: Path) -> None:
     """Episodes of sub-environments end in another order than they begin in."""

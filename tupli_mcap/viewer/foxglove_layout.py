@@ -14,6 +14,7 @@ from gymnasium import spaces
 from tupli_mcap.messages.labels import Labels
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.viewer.companions import WIDEST, companion_topics
 from tupli_mcap.viewer.names import dimension_names
 
@@ -33,11 +34,15 @@ _PLOT = {
 
 
 def write_layout(recording: Recording, target: str | os.PathLike[str]) -> Path:
-    """Writes the layout of a recording as JSON, which Foxglove imports ("Import from file" in its layouts)."""
+    """Writes the layout of a recording as JSON, which Foxglove imports ("Import from file" in its layouts).
+
+    Raises:
+        RecordingError: the system refuses.
+    """
     path = Path(target)
-    path.write_text(
-        json.dumps(foxglove_layout(recording), indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
+    text = json.dumps(foxglove_layout(recording), indent=2, ensure_ascii=False) + "\n"
+    with replacing(path) as (_, temporary):
+        temporary.write_text(text, encoding="utf-8")
     return path
 
 
