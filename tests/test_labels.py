@@ -165,6 +165,26 @@ def test_of_sub_environments(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("mode", ["vector_entry_point", "async"])
+def test_of_sub_environments_that_are_not_at_hand(mode: str, tmp_path: Path) -> None:
+    envs = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode=mode)
+    with RecordVector(envs, tmp_path / "r.mcap") as recorder:
+        recorder.reset(seed=1)
+        recorder.step(recorder.action_space.sample())
+    labels = Recording(tmp_path / "r.mcap").labels
+    assert labels.dimensions == {"state": CART_POLE} and labels.values == {"action": PUSHES}
+
+
+def test_what_a_wrapper_of_sub_environments_changed_has_no_name(tmp_path: Path) -> None:
+    stack = [lambda env: gym.wrappers.FrameStackObservation(env, 2)]
+    envs = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="async", wrappers=stack)
+    with RecordVector(envs, tmp_path / "r.mcap") as recorder:
+        recorder.reset(seed=1)
+        recorder.step(recorder.action_space.sample())
+    labels = Recording(tmp_path / "r.mcap").labels
+    assert labels.dimensions == {} and labels.values == {"action": PUSHES}
+
+
 @pytest.mark.parametrize(
     "data",
     [

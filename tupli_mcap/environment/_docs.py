@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium import spaces
+from gymnasium.envs.registration import load_env_creator
 
 from tupli_mcap.messages.labels import Labels
 
@@ -28,17 +29,23 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
     Gymnasium documents its environments this way: https://gymnasium.farama.org/environments/classic_control/cart_pole.
     """
     inner: Any = env.unwrapped
+    told = type(inner).__mro__  # a subclass need not say it again
+    kind = ""
     if isinstance(env, gym.vector.VectorEnv):
         state, action = env.single_observation_space, env.single_action_space
         envs = getattr(inner, "envs", None)
-        inner = envs[0].unwrapped if envs and isinstance(envs[0], gym.Env) else inner
+        if envs and isinstance(envs[0], gym.Env):
+            inner = envs[0].unwrapped
+            told = type(inner).__mro__
+        else:  # in other processes, or all in one
+            kind, told = "single_", (*told, *_registered(inner))
     else:
         state, action = env.observation_space, env.action_space
-    texts = [cls.__doc__ or "" for cls in type(inner).__mro__]  # a subclass need not say it again
+    texts = [cls.__doc__ or "" for cls in told]
     found = Labels({}, {}, _step_seconds(inner))
     for name, space, unwrapped in (
-        ("state", state, getattr(inner, "observation_space", None)),
-        ("action", action, getattr(inner, "action_space", None)),
+        ("state", state, getattr(inner, f"{kind}observation_space", None)),
+        ("action", action, getattr(inner, f"{kind}action_space", None)),
     ):
         if not _same_dimensions(space, unwrapped):
             continue  # a wrapper has made something else of it
@@ -53,6 +60,15 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
             if names:
                 found.dimensions[name] = names
     return found
+
+
+def _registered(envs: Any) -> tuple[type, ...]:
+    """The classes of the single environment that a vector environment was made as, by `gym.make_vec`."""
+    with contextlib.suppress(Exception):  # a module that cannot be imported any more, say
+        made: Any = gym.spec(envs.spec.id).entry_point
+        made = load_env_creator(made) if isinstance(made, str) else made
+        return made.__mro__ if isinstance(made, type) else ()
+    return ()
 
 
 def _same_dimensions(space: Any, unwrapped: Any) -> bool:
