@@ -119,6 +119,16 @@ def test_recordings_of_other_spaces_are_other_rerun_recordings(folder: Path, tmp
     assert len(found.recordings) == 2 and len(found.blueprints) == 2
 
 
+@pytest.mark.parametrize(("words", "opens"), [(["--split"], "rerun - < "), ([], "rerun ")])
+def test_what_opens_the_file_opens_all_that_is_in_it(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], words: list[str], opens: str
+) -> None:
+    goal = tmp_path / "out of it.rrd"
+    assert replay(folder / "runs" / "one.mcap", "-e", "0,1,2", "--save", goal, *words) == 0
+    command = capfd.readouterr().out.partition("open it with: ")[2].strip()
+    assert command == f"{opens}'{goal}'"
+
+
 BAD = [
     (["{one}", "-e", "99"], r"one\.mcap has no episode 99; choose from 0 to \d+", 1),
     (["{one}", "-e", "beste"], r"expected numbers of episodes such as '3,7,9', or best, .* found 'beste'", 2),

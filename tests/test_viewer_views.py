@@ -8,7 +8,7 @@ import pytest
 import viewed
 from rerun.experimental import ViewerState
 from typer.testing import CliRunner
-from viewing import HeadlessViewer
+from viewing import HeadlessViewer, patiently
 
 from tupli_mcap.cli import app
 
@@ -56,6 +56,17 @@ def test_one_of_several_episodes_apart(viewer: HeadlessViewer, cart_pole: Path) 
     assert views(state) == {"state": PLOT, "action": LANES, **REWARDS, **ABOUT}
     (start, end), (first, last) = ranges(state)["step"], ranges(state)["episode_time"]
     assert (start, first) == (0, 0) and end < 300 and last == end * 20_000_000
+
+
+def test_all_episodes_apart_are_opened_from_the_standard_input(
+    viewer: HeadlessViewer, cart_pole: Path, tmp_path: Path
+) -> None:
+    shown(viewer, cart_pole, "--split")
+    with HeadlessViewer(tmp_path, piped=cart_pole.with_suffix(".rrd")) as window:
+        for _ in patiently(20.0):
+            if len(window.settled().recordings) == 3:
+                break
+        assert len(window.client.get_state().recordings) == 3 and window.problems() == []
 
 
 def test_compared_episodes(viewer: HeadlessViewer, cart_pole: Path) -> None:

@@ -39,18 +39,20 @@ class HeadlessViewer:
     Args:
         folder: where the process may leave its log and its settings.
         size: of the window, in pixels.
+        piped: a file that it reads from its standard input, as `rerun - < FILE`.
     """
 
-    def __init__(self, folder: Path, size: tuple[int, int] = SIZE) -> None:
+    def __init__(self, folder: Path, size: tuple[int, int] = SIZE, piped: Path | None = None) -> None:
         self._log = folder / "viewer.log"
         self._size = size
         home = {name: str(folder) for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME")}
-        with self._log.open("wb") as log:
+        words = ["--headless", "--window-size", f"{size[0]}x{size[1]}", *_OPTIONS, *(["-"] if piped else [])]
+        with self._log.open("wb") as log, (piped or Path(os.devnull)).open("rb") as source:
             self._process = subprocess.Popen(
-                [VIEWER, "--headless", "--window-size", f"{size[0]}x{size[1]}", *_OPTIONS],
+                [VIEWER, *words],
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL,
+                stdin=source,
                 env=os.environ | home | _ENVIRONMENT,
                 start_new_session=True,  # so that ending the group ends all it started
             )

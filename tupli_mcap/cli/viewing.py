@@ -96,8 +96,11 @@ def _replay(
         raise typer.BadParameter("--force replaces the file of --save; give that too")
     wanted = filter_of(filter_text)
     if save is not None:
-        path = viewer.save(sources, save, episode, filter=wanted, form=form, force=force)
-        print(f"{path}: {bytes_of(path.stat().st_size)}; open it with: rerun {shlex.quote(str(path))}")
+        commands: list[str] = []
+        path = viewer.save(
+            sources, save, episode, filter=wanted, form=form, force=force, tell=commands.append
+        )
+        print(f"{path}: {bytes_of(path.stat().st_size)}; open it with: {commands[0]}")
     elif web:
         viewer.serve(sources, episode, filter=wanted, form=form, tell=_tell)
     else:

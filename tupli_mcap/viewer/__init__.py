@@ -25,8 +25,12 @@ def save(
     filter: Any = None,
     form: Form = "joined",
     force: bool = False,
+    tell: Callable[[str], None] | None = None,
 ) -> Path:
     """Writes episodes and their blueprint into a `.rrd` file, which `rerun FILE` opens.
+
+    Of a file with several Rerun recordings ("split", or recordings of different spaces) it opens one; `rerun - < FILE`
+    opens them all.
 
     Args:
         sources: a recording, its path or URL, a storage's directory, or several of them.
@@ -34,6 +38,7 @@ def save(
         filter: only episodes that it is true of.
         form: "joined" on one timeline, "split" into a Rerun recording each, or "compare" in the same plots.
         force: replace a file that exists.
+        tell: given the command that opens the file.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.
@@ -42,7 +47,7 @@ def save(
     """
     rerun_sdk()
     with chosen_from(sources, episodes, filter) as chosen:
-        return to_file(plans_of(chosen, form), target, force=force)
+        return to_file(plans_of(chosen, form), target, force=force, tell=tell)
 
 
 def show(

@@ -128,7 +128,8 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
         alike: dict[str, list[Chosen]] = {}
         for item in chosen:
             alike.setdefault(_spaces_of(item.recording), []).append(item)
-        yield from map(_joined, alike.values())  # what has other spaces has other plots
+        for group in alike.values():  # what has other spaces has other plots
+            yield _joined(group)._replace(listed=len(alike) > 1)
 
 
 def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
@@ -138,7 +139,7 @@ def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
         scene.rows = int(item.recording.index["length"][list(item.positions)].max())
         for position in item.positions:
             number = item.recording.episodes[position].number
-            name = f"{Path(item.recording.name).stem} · episode {number}"
+            name = f"episode {number} · {Path(item.recording.name).stem}"  # a list has room for its beginning
             part = Part(Chosen(item.recording, [position]), scene)
             told = _episode_told(item.recording, position)
             yield Plan(name, f"{item.recording.uuid}-{number}", [part], told, listed=several)

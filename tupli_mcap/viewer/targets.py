@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -31,8 +32,14 @@ __all__ = ["to_browser", "to_file", "to_viewer", "to_window"]
 _FLUSH_SECONDS = 600.0  # a viewer takes some millions of steps a second
 
 
-def to_file(plans: Iterable[Plan], target: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Writes a `.rrd` with its blueprint; it is there as a whole or not at all.
+def to_file(
+    plans: Iterable[Plan],
+    target: str | os.PathLike[str],
+    *,
+    force: bool = False,
+    tell: Callable[[str], None] | None = None,
+) -> Path:
+    """Writes a `.rrd` with its blueprint; it is there as a whole or not at all. `tell` is given what opens it.
 
     Raises:
         RecordingError: its name does not end in .rrd, it exists and `force` is False, or the system refuses.
@@ -54,6 +61,9 @@ def to_file(plans: Iterable[Plan], target: str | os.PathLike[str], *, force: boo
             _write(several[0], temporary, several[0].blueprint)
         else:
             _write_all(several, temporary)
+    if tell is not None:
+        # of a file on disk the viewer opens one recording only, whichever is registered first
+        tell(f"rerun {'- < ' if len(several) > 1 else ''}{shlex.quote(str(goal))}")
     return goal
 
 
