@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -153,6 +154,34 @@ class TupliDataset:
             self._query.read(FIVE)
 
         anew(attempt)  # episodes that are deleted while they are read are listed no more the next time
+
+    def materialize(self, directory: str | os.PathLike[str], *, verify: bool = False) -> Self:
+        """List the episodes anew and write their columns to a directory, as plain arrays that everything is read from
+        then, mapped into memory; where they are there and fresh, they are used as they are.
+
+        The directory has a `.npy` file a leaf (`np.load(file, mmap_mode="r")` reads it), and `manifest.json`.
+        Columns are fresh if the query gives the same episodes, of the same lengths, in the same order, with an
+        equal tuple filter, and no recording's size or time of change differs; a change that keeps both is not
+        noticed. Anything else is written anew: no half of it is ever used, and a killed process leaves the old
+        columns or none. Of two processes at once, one waits for the other. Infos stay in the recordings.
+
+        Nobody can compare functions: with a function as the tuple filter, only the dataset that wrote the columns uses
+        them, and another one writes them anew.
+
+        Args:
+            directory: an empty one, one of columns, or none yet.
+            verify: also compare all columns with their digests; damaged ones are written anew, with a warning.
+
+        Raises:
+            DatasetError: there is no episode.
+            SpaceError: the steps of two recordings do not fit into one array; the message says which.
+            StorageError: the directory holds something else, the disk is full, ...
+
+        Returns:
+            the dataset itself.
+        """
+        anew(lambda: self._query.materialize(Path(directory), verify=verify))
+        return self
 
     # --- what is in it ---
 

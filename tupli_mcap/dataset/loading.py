@@ -19,7 +19,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import EpisodeHeader
 
-__all__ = ["Selected", "empty_column", "read_columns"]
+__all__ = ["Selected", "empty_column", "positions_of", "read_columns"]
 
 _BLOCK_BYTES = 64 << 20
 _VARIABLE_STEP_BYTES = 4096  # a guess, for steps of variable size
@@ -99,7 +99,7 @@ class _Reader:
             self._builders = {field: FieldBuilder(field, self._capacity, layout) for field in self._fields}
         else:
             check_layouts(self._layout, self._first_name, layout, recording.name)
-        positions, lengths = _positions(recording, headers)
+        positions, lengths = positions_of(recording, headers)
         for block in _blocks(lengths, _step_bytes(layout)):
             columns = _read_block(recording, positions[block], lengths[block], self._needed)
             steps = int(lengths[block].sum())
@@ -141,7 +141,7 @@ def empty_column(field: str) -> Any:
     return np.empty(0, dtypes.get(field, np.float64))
 
 
-def _positions(recording: Recording, headers: Sequence[EpisodeHeader]) -> tuple[Array, Array]:
+def positions_of(recording: Recording, headers: Sequence[EpisodeHeader]) -> tuple[Array, Array]:
     """Where the episodes are in the recording, and how many steps of each are listed (int64)."""
     places = {number: i for i, number in enumerate(recording.index["episode"].tolist())}
     positions = np.array([places.get(header.episode, -1) for header in headers], np.int64)

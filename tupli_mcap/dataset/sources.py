@@ -24,9 +24,10 @@ from tupli_mcap.schema import (
     FilterIN,
     compile_predicate,
 )
-from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage import FileStorage, TupliStorage
 from tupli_mcap.storage.document import restored
 from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.system import refused
 
 __all__ = ["DatasetError", "FilesSource", "Source", "StorageSource", "episode_headers"]
 
@@ -54,6 +55,10 @@ class Source(Protocol):
 
     def open(self, recording: str) -> Recording:
         """The recording that a header names; the caller closes it."""
+        ...
+
+    def stamp(self, recording: str) -> tuple[int, int]:
+        """Size and time of change (ns; 0 where nobody knows it) of the recording that a header names."""
         ...
 
 
@@ -89,6 +94,12 @@ class StorageSource:
 
     def open(self, recording: str) -> Recording:
         return self.storage.open_recording(recording)
+
+    def stamp(self, recording: str) -> tuple[int, int]:
+        if isinstance(self.storage, FileStorage):
+            return _stamp(self.storage.root / recording)
+        with self.open(recording) as opened:
+            return _stamp_of(opened)
 
     def __repr__(self) -> str:
         return repr(self.storage)
@@ -160,8 +171,26 @@ class FilesSource:
     def open(self, recording: str) -> Recording:
         return Recording(recording, cache_bytes=_CACHE_BYTES)
 
+    def stamp(self, recording: str) -> tuple[int, int]:
+        if "://" not in recording:
+            return _stamp(Path(recording))
+        with self.open(recording) as opened:
+            return _stamp_of(opened)
+
     def __repr__(self) -> str:
         return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} files"
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    try:
+        status = path.stat()
+    except OSError as err:
+        raise RecordingError(f"{path} cannot be looked at: {refused(err)}") from err
+    return status.st_size, status.st_mtime_ns
+
+
+def _stamp_of(recording: Recording) -> tuple[int, int]:
+    return (recording.size, 0) if recording.path is None else _stamp(recording.path)
 
 
 def _expand(item: str | os.PathLike[str]) -> Sequence[str]:

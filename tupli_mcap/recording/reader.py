@@ -154,6 +154,11 @@ class Recording:
         return self.metadata["uuid"]
 
     @property
+    def size(self) -> int:
+        """Bytes of the file, as it was opened."""
+        return self._source.size
+
+    @property
     def benchmark_id(self) -> str:
         """The id of the benchmark; empty if there is none."""
         return self.metadata.get("benchmark_id", "")
