@@ -6,6 +6,7 @@ import random
 import shutil
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,11 +14,12 @@ import gymnasium as gym
 import numpy as np
 from environments import same
 
-from killing.check import Found, check_recording, found_in
+from killing.check import Found, check_recording, found_in, joined
 from killing.child import Job, Told, record_and_die
 from killing.kinds import KINDS, open_recorder
 from killing.moments import MOMENTS
 from tupli_mcap import FileStorage, Recording, TupliEnvWrapper, TupliError, journal_path
+from tupli_mcap.recording.rotation import series
 
 __all__ = ["Death", "lives", "moments_of"]
 
@@ -48,6 +50,8 @@ def moments_of(kind: str, *, appends: bool) -> list[str]:
             continue
         if moment.grows and not about.large:
             continue
+        if moment.rotates and not about.rotates:
+            continue
         names.append(moment.name)
     return names
 
@@ -56,7 +60,7 @@ def lives(kind: str, moments: Sequence[str], seed: int, directory: Path, breakag
     """A recording whose process dies at each of the moments, one after another."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # killed before its first step, it has no journal
-        chain = _StorageChain if KINDS[kind].storage else _Chain
+        chain = _StorageChain if KINDS[kind].storage else _RotatingChain if KINDS[kind].rotates else _Chain
         return chain(kind, seed, directory, breakage).run(moments)
 
 
@@ -180,6 +184,46 @@ class _Chain:
         if self._kind.elsewhere:  # of this recording, that is; one that was replaced may have left its own
             left = [name for name in left if recording.uuid in name]
         return problems + [f"{name} stays behind" for name in left]
+
+
+class _RotatingChain(_Chain):
+    """A recording that goes on in other files: all of them are one, and an episode that was cut is whole again."""
+
+    def _read(self, path: Path) -> tuple[list[Found], np.ndarray]:
+        found: list[Found] = []
+        indexes = []
+        for number, file in enumerate(_files(path)):
+            new, index = super()._read(file)
+            indexes.append(index)
+            found = joined(found, [replace(one, number=one.number + 1_000_000 * number) for one in new])
+        return found, np.concatenate(indexes)
+
+    def _finish_copy(self) -> list[str]:
+        directory = self._path.parent / "copy"
+        directory.mkdir()
+        try:
+            for file in _files(self._path):
+                for path in (file, journal_path(file)):
+                    if path.exists():
+                        shutil.copy(path, directory)
+            return self._finish_at(directory / self._path.name)
+        finally:
+            shutil.rmtree(directory)
+
+    def _finished(self, path: Path, known: list[Found]) -> list[str]:
+        problems = [] if _same(self._read(path)[0], known) else ["what was there before has changed"]
+        for file in _files(path):
+            with Recording(file) as recording:
+                if recording.num_steps and not recording.complete:
+                    problems.append(f"{file.name} is not complete")
+                if recording.num_steps and journal_path(file).exists():
+                    problems.append(f"the journal of {file.name} stays behind")
+        return problems
+
+
+def _files(path: Path) -> list[Path]:
+    base, later = series(path)
+    return [base, *later.values()]
 
 
 class _StorageChain(_Chain):

@@ -35,6 +35,7 @@ class Kind:
     reuse: bool = False  # the environment returns the same array, with other values, again and again
     reward: gym.Space[Any] | None = None
     plain: bool = False  # states of one value each, for they are large
+    rotates: bool = False  # goes on in other files
     large: int = 0  # every episode's texts are longer than the last one's, up to here
 
 
@@ -87,6 +88,11 @@ KINDS = {
     "synced images": Kind(_IMAGE, (700, 2000), options={"durability": "chunk", "record_info": True}),
     "synced texts": Kind(_TEXT, _SMALL, options={"durability": "step"}),
     "storage": Kind(_BOX, storage=True),
+    "rotating": Kind(_BOX, (700,), options={"max_bytes": 8000}, reuse=True, rotates=True),
+    "rotating vector": Kind(_WIDE, vector=_NEXT, options={"max_bytes": 300_000}, rotates=True),
+    "rotating text": Kind(
+        _LONG, vector=_SAME, options={"max_bytes": 250_000, "record_info": True}, rotates=True
+    ),
     "vector": Kind(_WIDE, vector=_NEXT, reuse=True, threaded=True),
     "vector same": Kind(_WIDE, vector=_SAME, threaded=True),
     "vector disabled": Kind(_WIDE, vector=_DISABLED),

@@ -47,6 +47,7 @@ class Moment:
     grows: bool = False  # only where steps become larger than the journal
     threaded: bool = False  # only where a thread writes the chunks
     syncs: bool = False  # only where file and journal are synced
+    rotates: bool = False  # only where a recording goes on in other files
     flushes: bool = False  # the process flushes now and then
 
 
@@ -79,6 +80,8 @@ MOMENTS = {
         Moment("rename", call="replace"),
         Moment("growth", ("RecordingWriter._grow",), times=3, grows=True),
         Moment("renamed growth", call="replace", times=3, grows=True),
+        Moment("rotation", ("RecordEpisodes._rotate",), times=2, rotates=True),
+        Moment("after rotation", ("RecordEpisodes._rotate",), after=True, times=2, rotates=True),
         Moment("close", ("RecordingWriter.close",), closes=True),
         Moment("torn index", call="pwrite", starts=(_ATTACHMENT,), closes=True),
         Moment("torn summary", call="pwrite", starts=(_DATA_END,), closes=True),

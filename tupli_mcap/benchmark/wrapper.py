@@ -36,6 +36,8 @@ _RECORDING_OPTIONS = (
     "durability",
     "frames",
     "frame_format",
+    "max_bytes",
+    "max_seconds",
 )
 
 
@@ -66,7 +68,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         metadata_callback: called with every recorded step; its last result becomes the episode's metadata.
         rl_tuple_cls: the class of the tuples that the callback is given. Recorded are the values themselves.
         recording_options: for `RecordEpisodes`: record_info, step_callback, reward_space, compression,
-            chunk_size, flush_seconds, durability.
+            chunk_size, flush_seconds, durability, frames, frame_format, max_bytes, max_seconds.
 
     Subclasses that keep data outside of the environment override `_serialize` and `_deserialize`.
     Not thread-safe.
@@ -181,7 +183,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     @property
     def recording_path(self) -> Path | None:
         """The file that is, or was last, recorded to; None before the first step."""
-        return self._path
+        return self._path if self._recorder is None else self._recorder.path
 
     def close(self) -> None:
         """Finish the recording, then close the environment. Calling it twice is fine."""
@@ -203,7 +205,17 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         if self.id is None:
             raise StorageError("this environment is not stored yet: call store(name=...) first")
         with self.storage.beginning_recording():
-            return self._begin(self.id)
+            recorder = self._begin(self.id)
+        recorder.rotation.beginning = self.storage.beginning_recording
+        recorder.rotation.finished = self._ingest
+        return recorder
+
+    def _ingest(self, path: Path) -> None:
+        """Lists the episodes of a file that was left; the rollout goes on where that cannot be done now."""
+        try:
+            self.storage.ingest(path)
+        except TupliError as err:
+            warnings.warn(f"{path} will be listed by the next query: {err}", RuntimeWarning, stacklevel=2)
 
     def _begin(self, benchmark_id: str) -> RecordEpisodes:
         callback = self.metadata_callback
@@ -236,6 +248,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         if recorder is None or self._path is None:
             return
         recorder.close()
+        self._path = recorder.path
         self.storage.ingest(self._path)
 
     # --- the benchmark ---

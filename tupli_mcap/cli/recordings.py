@@ -104,6 +104,12 @@ def _record(
         bool, typer.Option("--frames", help="Record what the environment renders (rgb_array) too.")
     ] = False,
     every: Annotated[int, typer.Option(min=1, help="With --frames: of every so many steps.")] = 1,
+    max_bytes: Annotated[
+        int | None, typer.Option(min=1, help="Go on in FILE_0001.mcap, … when so much is in a file.")
+    ] = None,
+    max_seconds: Annotated[
+        float | None, typer.Option(min=0.001, help="Go on in another file after so many seconds.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Record rollouts of an environment.
@@ -135,13 +141,17 @@ def _record(
             durability=durability.value,
             live=live,
             frames=every if frames else False,
+            max_bytes=max_bytes,
+            max_seconds=max_seconds,
             progress=progress,
         )
     if as_json:
-        print_json({**summary._asdict(), "path": str(summary.path)})
+        paths = [str(path) for path in summary.paths]
+        print_json({**summary._asdict(), "path": str(summary.path), "paths": paths})
         return
+    last = "" if len(summary.paths) == 1 else f" to {summary.path.name}"
     print(
-        f"{summary.path}: {counted(summary.episodes, 'episode')}, {counted(summary.steps, 'step')}, "
+        f"{summary.paths[0]}{last}: {counted(summary.episodes, 'episode')}, {counted(summary.steps, 'step')}, "
         f"mean return {number(summary.return_mean)}, {bytes_of(summary.size)} in {summary.seconds:.1f} s"
     )
 

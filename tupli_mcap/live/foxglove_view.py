@@ -83,7 +83,15 @@ class FoxgloveView:
             for row in sorted(found):
                 out.log(found[row].tobytes()[RECORD_HEADER.size :], log_time=int(found[row]["#log_time"]))
 
-    def close(self) -> None:
+    def go_on(self, writer: RecordingWriter) -> None:
+        self._close_channels()
+        self._writer = writer
+
+    def _close_channels(self) -> None:
         for channel in self._channels.values():
             channel.close()
+        self._channels = {}
+
+    def close(self) -> None:
+        self._close_channels()
         self._server.stop()

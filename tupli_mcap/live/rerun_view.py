@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from tupli_mcap.live.target import Target
 from tupli_mcap.recording.watching import Watcher
+from tupli_mcap.recording.writer import RecordingWriter
 
 __all__ = ["Picture", "RerunView"]
 
@@ -41,7 +42,7 @@ class RerunView:
     """Connects to a Rerun viewer, or starts one and connects to it.
 
     Args:
-        draw: makes the picture; None as long as too little is known for it.
+        sketch: given a title, what makes the picture; None as long as too little is known for it.
         warn: told once, if there is no viewer or no longer one.
 
     Raises:
@@ -52,7 +53,7 @@ class RerunView:
         self,
         target: Target,
         title: str,
-        draw: Callable[[Watcher], Picture | None],
+        sketch: Callable[[str], Callable[[Watcher], Picture | None]],
         warn: Callable[[str], None],
     ) -> None:
         # a layer above this one has the error that names the extra
@@ -61,8 +62,9 @@ class RerunView:
         rerun.Scalars.columns(scalars=[0.0])  # imports now what would hold the rollout up later
         self._sdk = rerun
         self._target = target
-        self._title = title
-        self._draw = draw
+        self._title = self._first_title = title
+        self._sketch = sketch
+        self._draw = sketch(title)
         self._warn: Callable[[str], None] | None = warn
         self._identity = uuid.uuid4().hex
         self._url = target.url or f"rerun+http://{target.host}:{target.port}/proxy"
@@ -112,6 +114,15 @@ class RerunView:
             return
         self._picture.send(self._stream, watcher)
         self._caught_up(patience)
+
+    def go_on(self, writer: RecordingWriter) -> None:
+        """Another recording in the viewer: rows, episodes and steps count from 0 again."""
+        if self._stream is not None and not self._caught_up(_PATIENCE):
+            self._lose()
+        self._stream = self._picture = None
+        self._identity = uuid.uuid4().hex
+        self._title = f"{self._first_title} ({writer.path.stem})"
+        self._draw = self._sketch(self._title)
 
     def _is_there(self) -> bool:
         """True if a viewer answers: without one the SDK would keep what it is sent, and wait for it at the end."""

@@ -39,6 +39,10 @@ class LiveView(Protocol):
         """
         ...
 
+    def go_on(self, writer: RecordingWriter) -> None:
+        """The next watcher's steps go to another file of the same rollout."""
+        ...
+
     def close(self) -> None:
         """Lets go of the viewer, which stays as it is."""
         ...
@@ -71,6 +75,7 @@ class LiveSession:
     def __init__(self, writer: RecordingWriter, view: LiveView) -> None:
         self._view = view
         self._watcher = Watcher(writer)
+        self._next: list[Watcher] = []
         self._stopping = threading.Event()
         self._meter = _Meter()
         self._thread: threading.Thread | None = threading.Thread(
@@ -85,14 +90,26 @@ class LiveSession:
             while not last:
                 last = self._stopping.wait(rest)  # what came in the meantime is shown before the end
                 began = self._meter.busy()
-                if self._watcher.layout is not None:
-                    self._view.show(self._watcher)
+                following, self._next = self._next, []  # before the look: what came until then is shown
+                self._show()
+                for watcher in following:
+                    self._watcher = watcher
+                    self._view.go_on(watcher.writer)
+                    self._show()
                 rest = min(max(_SHORTEST_REST, _REST * (self._meter.busy() - began)), _LONGEST_REST)
         except Exception as err:  # noqa: BLE001 - the rollout must not notice
             _warn(f"the live view has ended ({type(err).__name__}: {err}); the recording goes on")
         finally:
             with contextlib.suppress(Exception):
                 self._view.close()
+
+    def _show(self) -> None:
+        if self._watcher.layout is not None:
+            self._view.show(self._watcher)
+
+    def go_on(self, writer: RecordingWriter) -> None:
+        """Shows the rest of the recording, then what `writer` records."""
+        self._next = [*self._next, Watcher(writer)]
 
     def close(self) -> None:
         """Shows the rest and ends the thread. Waits for a viewer that does not take it for a few seconds at most."""
@@ -137,7 +154,7 @@ def open_session(writer: RecordingWriter, live: str, title: str) -> LiveSession 
 
             # a layer above this one: it shows recordings in the same panels
             sketch = importlib.import_module("tupli_mcap.viewer.live").Sketch
-            view = RerunView(target, title, sketch(title), _warn)
+            view = RerunView(target, title, sketch, _warn)
         else:
             from tupli_mcap.live.foxglove_view import FoxgloveView
 

@@ -68,6 +68,10 @@ class FrameRecorder:
         """The picture of a reset's state; it is recorded if a step follows."""
         self._first[env] = self._encoded(picture)
 
+    def go_on(self, writer: RecordingWriter) -> None:
+        """The next frames go to another file."""
+        self._writer = writer
+
     def forget(self, env: int) -> None:
         """After a reset that failed: nothing is known of the state."""
         self._first[env] = None
@@ -110,6 +114,10 @@ class VectorFrames:
     def __init__(self, writer: RecordingWriter, num_envs: int, every: int, form: FrameFormat) -> None:
         self._frames = FrameRecorder(writer, num_envs, every, form)
         self._n = num_envs
+
+    def go_on(self, writer: RecordingWriter) -> None:
+        """The next frames go to another file."""
+        self._frames.go_on(writer)
 
     def start(self, chosen: Array, render: Callable[[], Any]) -> None:
         """After a reset of the `chosen` sub-environments (bool)."""

@@ -191,17 +191,32 @@ class SingleRecorder:
 
     def _continue(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """A step after an end, without a reset: another episode, which starts at the last one's final state."""
-        rows = self._writer.rows
-        if rows is None:
-            raise StepError("expected a reset before the first step; call env.reset()")
         if self.resets_itself:
             self.reset(state, ResetFacts(None, None, "", "{}", time.time_ns()))
             return
+        rows = self._writer.rows
+        if rows is None:
+            raise StepError("expected a reset before the first step; call env.reset()")
         rows.begin_episode(self._writer.next_episode)
         facts = ResetFacts(None, None, "", "{}", 0, continued=True)
         self._episode = self._writer.start_episode(0, rows.count, facts)
         self.put = rows.put
         rows.put(action, state, reward, terminal, timeout)
+
+    def go_on_from(self, before: SingleRecorder, state: Any) -> None:
+        """Takes over from the recorder of another file, with the environment at `state`.
+
+        An episode that runs there goes on here, `continued`; close `before` afterwards.
+        """
+        self._writer.layout = before._writer.layout
+        self._writer.lost_streams = {0}
+        self.resets_itself = before.resets_itself
+        if self.resets_itself and before._episode is None:
+            self.put = self._continue
+            return
+        facts = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
+        self._reset = (copy.deepcopy(state), facts)
+        self.put = self._first
 
     def _unreset(self, *_: Any) -> None:
         raise StepError("expected a reset before the first step; call env.reset()")

@@ -80,6 +80,11 @@ class Watcher:
         self._places: dict[str, tuple[int, int]] = {}  # log -> half and position
 
     @property
+    def writer(self) -> RecordingWriter:
+        """What is looked at."""
+        return self._writer
+
+    @property
     def layout(self) -> StepLayout | None:
         """None until the first step."""
         writer = self._writer

@@ -33,9 +33,13 @@ _REPORTS = 200  # progress is told about so often in a rollout
 
 
 class RolloutSummary(NamedTuple):
-    """What one call recorded; interrupted episodes count too. `size` is the whole file's (bytes)."""
+    """What one call recorded; interrupted episodes count too. `size` is that of whole files (bytes).
+
+    `path` is the last of the files, `paths` are all of them.
+    """
 
     path: Path
+    paths: list[Path]
     episodes: int
     steps: int
     return_mean: float
@@ -57,6 +61,8 @@ def record_rollouts(
     durability: Durability = "os",
     live: str | None = None,
     frames: bool | int = False,
+    max_bytes: int | None = None,
+    max_seconds: float | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> RolloutSummary:
     """Records `steps` steps of a registered environment into the MCAP file `path`.
@@ -68,7 +74,7 @@ def record_rollouts(
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
-        mode, compression, record_info, durability, live: as `RecordEpisodes` has them.
+        mode, compression, record_info, durability, live, max_bytes, max_seconds: as `RecordEpisodes` has them.
         frames: as `RecordEpisodes` has it; the environment is made with render_mode="rgb_array".
         progress: called with the number of steps so far, a few hundred times.
 
@@ -80,8 +86,8 @@ def record_rollouts(
     if steps < 1 or num_envs < 1:
         raise RecordingError(f"expected at least 1 step and 1 environment, found {steps} and {num_envs}")
     began = time.perf_counter()
-    known = _episodes_in(Path(path)) if mode == "a" else 0
     report = _every(max(1, steps // _REPORTS), progress)
+    wrapped: RecordEpisodes | RecordVectorEpisodes
     with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if frames else None)) as made:
         if isinstance(made, gym.vector.VectorEnv):
             attachments = benchmark_attachments(made.envs[0]) if hasattr(made, "envs") else {}
@@ -95,7 +101,10 @@ def record_rollouts(
                 live=live,
                 frames=frames,
                 attachments=attachments,
+                max_bytes=max_bytes,
+                max_seconds=max_seconds,
             )
+            wrapped, known = vector, vector._writer.index.count
             with _closing(vector, mode):
                 done = _run_vector(vector, steps, seed, policy, report)
         else:
@@ -108,15 +117,21 @@ def record_rollouts(
                 durability=durability,
                 live=live,
                 frames=frames,
+                max_bytes=max_bytes,
+                max_seconds=max_seconds,
             )
+            wrapped, known = single, single._writer.index.count
             with _closing(single, mode):
                 done = _run(single, steps, seed, policy, report)
+        paths = wrapped.paths
+    returns = np.concatenate([_returns(path) for path in paths])[known:]
+    seconds, size = time.perf_counter() - began, sum(path.stat().st_size for path in paths)
+    return RolloutSummary(paths[-1], paths, len(returns), done, float(returns.mean()), seconds, size)
+
+
+def _returns(path: Path) -> np.ndarray[Any, Any]:
     with Recording(path) as recording:
-        rows = recording.index[known:]
-        mean = float(rows["return"].mean())
-    return RolloutSummary(
-        Path(path), len(rows), done, mean, time.perf_counter() - began, Path(path).stat().st_size
-    )
+        return np.asarray(recording.index["return"])
 
 
 def load_policy(name: str) -> Policy:

@@ -23,6 +23,7 @@ from tupli_mcap.recording.framing import CAMERA, FrameRecorder, check_every, che
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
 from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.pictures import FrameFormat, check_format
+from tupli_mcap.recording.rotation import Rotation
 from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
@@ -69,6 +70,10 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         live: shows the rollout while it is recorded: "rerun" (starts the viewer if none listens at 127.0.0.1:9876),
             "rerun+http://host:port/proxy" (one that is running), "foxglove" or "foxglove://127.0.0.1:8765" (a server
             to connect Foxglove to). A viewer that is missing, slow or closed changes nothing about the recording.
+        max_bytes, max_seconds: goes on in another file (run_0001.mcap, run_0002.mcap, … after run.mcap) when that much
+            is in the file, or it has been open so long, as soon as an episode has ended; an episode that still runs
+            when the file is a quarter beyond that is cut in two, "interrupted" and `continued`. `path` is the file
+            that is recorded to, `paths` are all of them. With mode "a" the last one is gone on with.
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
@@ -99,9 +104,10 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         frames: bool | int = False,
         frame_format: FrameFormat = "png",
         live: str | None = None,
+        max_bytes: int | None = None,
+        max_seconds: float | None = None,
     ) -> None:
         super().__init__(env)
-        self.path = Path(path)
         every = check_every(frames)
         if every:
             check_render_mode(env.render_mode)
@@ -112,11 +118,12 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             attachments = benchmark_attachments(env)
         wanted = record_info is not False or step_callback is not None
         self._infos = InfoRecorder(record_info) if wanted else None
-        spaces = StepLayout(
+        self._spaces = spaces = StepLayout(
             env.observation_space, env.action_space, reward_space
         )  # refused before a file is made
         spaces.to_metadata()
-        options = WriterOptions(
+        self.rotation = Rotation(path, mode, max_bytes, max_seconds)
+        self._options = WriterOptions(
             compression,
             mode,
             benchmark_id,
@@ -127,7 +134,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             durability=durability,
             cameras=(CAMERA,) if every else (),
         )
-        self._writer = RecordingWriter(path, options)
+        self._writer = self.rotation.open_first(self._options)
         try:
             self._writer.check_spaces(spaces, 1, vector=False)
         except SpaceError:
@@ -135,15 +142,28 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             raise
         self._recorder = SingleRecorder(self._writer, spaces, self._infos)
         self._recorder.resets_itself = _resets_itself(env)
+        self._newest = [self._recorder]
         self._frames = FrameRecorder(self._writer, 1, every, frame_format) if every else None
         self._watches = metadata_callback is not None or wanted or bool(every)
         # shared with the finalizer, which must not hold the wrapper
         self._episode_metadata: list[str] = ["{}"]
-        self._plain = not self._watches and flush_seconds is None and durability != "step"
+        self._plain = (
+            not self._watches and flush_seconds is None and durability != "step" and not self.rotation.limited
+        )
         self._stepped = False
         self._state: Any = None
         self._live = live_session(self._writer, live, env)
-        self._finalizer = weakref.finalize(self, _close, self._recorder, self._episode_metadata, self._live)
+        self._finalizer = weakref.finalize(self, _close, self._newest, self._episode_metadata, self._live)
+
+    @property
+    def path(self) -> Path:
+        """The file that is recorded to."""
+        return self.rotation.path
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that this wrapper has recorded to, in their order."""
+        return self.rotation.paths
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
@@ -187,10 +207,34 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         finally:  # a callback that raises changes nothing about what the environment did
             if terminal or timeout:
                 self._end(TERMINAL if terminal else TIMEOUT)
+                if self.rotation.is_due(self._writer):
+                    self._rotate(state)
         if not self._plain:
             self._writer.flush_if_due()
             self._writer.sync_step()
+            if self.rotation.is_overdue(self._writer):
+                self._rotate(state)
+                self._start_frames()
         return result
+
+    def _rotate(self, state: Any) -> None:
+        """Goes on in the next file, with the environment at `state`; an episode that runs is cut in two."""
+        before = self._recorder
+        writer = self.rotation.open_next(self._options)
+        try:
+            recorder = SingleRecorder(writer, self._spaces, self._infos)
+            recorder.go_on_from(before, state)
+        except BaseException:
+            writer.close()
+            raise
+        self._newest[0], left = recorder, self._writer
+        self._writer, self._recorder = writer, recorder
+        if self._live is not None:
+            self._live.go_on(writer)
+        if self._frames is not None:
+            self._frames.go_on(writer)
+        before.close(self._taken_metadata())
+        self.rotation.finished(left.path)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -208,6 +252,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             )
             if self._watches:
                 self._state = copy.deepcopy(state)
+            if self.rotation.is_due(self._writer):
+                self._rotate(state)
             self._recorder.reset(state, facts, self._taken_metadata())
             self._start_frames()
         except BaseException:  # wherever the environment is now: the running episode is over
@@ -287,9 +333,9 @@ def metadata_text(metadata: Any) -> str:
         raise RecordingError(f"metadata_callback: {err}") from err
 
 
-def _close(recorder: SingleRecorder, metadata: list[str], live: LiveSession | None) -> None:
+def _close(newest: list[SingleRecorder], metadata: list[str], live: LiveSession | None) -> None:
     try:
-        recorder.close(metadata[0])
+        newest[0].close(metadata[0])
     finally:
         if live is not None:
             live.close()

@@ -23,9 +23,10 @@ from tupli_mcap.recording.framing import CAMERA, VectorFrames, check_every, chec
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
 from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.pictures import FrameFormat, check_format
+from tupli_mcap.recording.rotation import Rotation
 from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.vector_infos import final_info_of, info_of
-from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
+from tupli_mcap.recording.writer import ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
 from tupli_mcap.wrappers.labels import with_labels
@@ -70,9 +71,10 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         live: str | None = None,
         frames: bool | int = False,
         frame_format: FrameFormat = "png",
+        max_bytes: int | None = None,
+        max_seconds: float | None = None,
     ) -> None:
         super().__init__(env)
-        self.path = Path(path)
         every = check_every(frames)
         if every:
             check_render_mode(getattr(env, "render_mode", None))
@@ -91,9 +93,12 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             raise SpaceError(
                 f"reward: expected a space of arrays for a vector environment, found {reward_space}"
             )
-        spaces = StepLayout(env.single_observation_space, env.single_action_space, reward_space)
+        self._spaces = spaces = StepLayout(
+            env.single_observation_space, env.single_action_space, reward_space
+        )
         spaces.to_metadata()
-        options = WriterOptions(
+        self.rotation = Rotation(path, mode, max_bytes, max_seconds)
+        self._options = WriterOptions(
             compression,
             mode,
             benchmark_id,
@@ -104,19 +109,30 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             durability=durability,
             cameras=(CAMERA,) if every else (),
         )
-        self._writer = RecordingWriter(path, options)
+        self._writer = self.rotation.open_first(self._options)
         try:
             self._writer.check_spaces(spaces, n, vector=True)
         except SpaceError:
             self._writer.close()
             raise
         self._recorder = VectorRecorder(self._writer, spaces, n, self._autoreset, self._infos)
+        self._newest = [self._recorder]
         self._frames = VectorFrames(self._writer, n, every, frame_format) if every else None
         self._texts = ["{}"] * n
         self._states: list[Any] = []
         self._watches = wanted or metadata_callback is not None
         self._live = live_session(self._writer, live, env)
-        self._finalizer = weakref.finalize(self, _close, self._recorder, self._live)
+        self._finalizer = weakref.finalize(self, _close, self._newest, self._live)
+
+    @property
+    def path(self) -> Path:
+        """The file that is recorded to."""
+        return self.rotation.path
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that this wrapper has recorded to, in their order."""
+        return self.rotation.paths
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         try:
@@ -142,7 +158,32 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             self._recorder.finish(terminals, infos)
         self._writer.flush_if_due()
         self._writer.sync_step()
+        if self.rotation.is_due(self._writer):
+            running = self._recorder.is_running
+            if not running or self.rotation.is_overdue(self._writer):
+                self._rotate(states)
+                if running and self._frames is not None:
+                    self._frames.start(np.ones(self.num_envs, np.bool_), self.env.render)
         return result
+
+    def _rotate(self, states: Any) -> None:
+        """Goes on in the next file, with the environments at `states`; episodes that run are cut in two."""
+        before = self._recorder
+        writer = self.rotation.open_next(self._options)
+        try:
+            recorder = VectorRecorder(writer, self._spaces, self.num_envs, self._autoreset, self._infos)
+            recorder.go_on_from(before, states)
+        except BaseException:
+            writer.close()
+            raise
+        self._newest[0], left = recorder, self._writer
+        self._writer, self._recorder = writer, recorder
+        if self._live is not None:
+            self._live.go_on(writer)
+        if self._frames is not None:
+            self._frames.go_on(writer)
+        before.close()
+        self.rotation.finished(left.path)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -157,6 +198,8 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             facts = self._facts(seed, unseeded, told, infos)
             if self._watches:
                 self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
+            if mask is None and self.rotation.is_due(self._writer):
+                self._rotate(states)
             self._recorder.reset(states, facts, mask)
             if self._frames is not None:
                 self._frames.start(
@@ -260,9 +303,9 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         raise RecordingError(f"a wrapper that records to {self.path} cannot be pickled or copied; wrap there")
 
 
-def _close(recorder: VectorRecorder, live: LiveSession | None) -> None:
+def _close(newest: list[VectorRecorder], live: LiveSession | None) -> None:
     try:
-        recorder.close()
+        newest[0].close()
     finally:
         if live is not None:
             live.close()

@@ -12,8 +12,12 @@ __all__ = ["final_state_is_reset", "missing_reset"]
 
 
 def missing_reset(chart: Chart) -> Iterator[Finding]:
-    """Episodes that began with a step after an end: nobody reset the environment, and it does as it likes."""
-    count = int(chart.continued.sum())
+    """Episodes that began with a step after an end: nobody reset the environment, and it does as it likes.
+
+    The first one of a file goes on from another file, in which it was cut when that was full.
+    """
+    found = chart.continued & (chart.rows["first_row"] > 0)
+    count = int(found.sum())
     if count:
         yield Finding(
             "missing-reset",
@@ -24,7 +28,7 @@ def missing_reset(chart: Chart) -> Iterator[Finding]:
             "call reset when terminated or truncated is true; leave these episodes out",
             count=count,
             total=len(chart.rows),
-            places=chart.episodes(chart.continued),
+            places=chart.episodes(found),
         )
 
 

@@ -1,0 +1,153 @@
+"""A rollout in several files: what the next one is called, and when it is time for it.
+
+`run.mcap` is followed by `run_0001.mcap`, `run_0002.mcap`, …, an order that sorting by name keeps. Each is a recording
+of its own, with its benchmark and attachments.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.options import Mode, WriterOptions
+from tupli_mcap.recording.writer import LAST_ROW, RecordingWriter
+
+__all__ = ["Rotation", "series"]
+
+_PATIENCE = 1.25  # a running episode is cut when the limit is exceeded by a quarter
+_MOST_ROWS = LAST_ROW - (1 << 26)
+_CUT_ROWS = LAST_ROW - (1 << 25)
+_NUMBERED = re.compile(r"(.+)_([0-9]{4,})\Z")
+
+
+def series(path: Path) -> tuple[Path, dict[int, Path]]:
+    """The first file of the series that a path belongs to, and those that follow it and exist, by number."""
+    match = _NUMBERED.match(path.stem)
+    base = path if match is None else path.with_stem(match[1])
+    if match is not None and not base.exists():
+        base = path
+    pattern = re.compile(re.escape(base.stem) + r"_([0-9]{4,})" + re.escape(base.suffix) + r"\Z")
+    found = {}
+    with contextlib.suppress(OSError):
+        for name in os.listdir(base.parent):  # noqa: PTH208 - names are all it takes
+            if number := pattern.match(name):
+                found[int(number[1])] = base.with_name(name)
+    return base, dict(sorted(found.items()))
+
+
+class Rotation:
+    """When a recording goes on in another file, and in which one.
+
+    A file is full when whole chunks of `max_bytes` are written to it (attachments left out), when it has been open for
+    `max_seconds`, or when a channel nears the most rows it may have. It is left as soon as no episode is running; where
+    one still runs when the file is a quarter beyond its limit, the episode is cut in two.
+
+    With limits, mode "a" goes on in the last file of a series, and finishes one before it that a killed process left.
+
+    Attributes:
+        limited: whether there is a limit other than the number of rows.
+        beginning: a context in which the next file is made.
+        finished: called with each file that is left.
+
+    Raises:
+        RecordingError: a limit is no positive number, or files of an earlier series would follow a new one.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], mode: Mode, max_bytes: int | None, max_seconds: float | None
+    ) -> None:
+        for name, limit in (("max_bytes", max_bytes), ("max_seconds", max_seconds)):
+            if limit is not None and not (isinstance(limit, int | float) and limit > 0):
+                raise RecordingError(f"{name}: expected a positive number or None, found {limit!r:.40}")
+        self._max_bytes, self._max_seconds = max_bytes, max_seconds
+        self.limited = max_bytes is not None or max_seconds is not None
+        self._paths = [Path(path)]
+        if self.limited:
+            self._join(mode)
+        self._opened = 0.0
+        self._head = 0  # bytes of attachments
+        self.beginning: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
+        self.finished: Callable[[Path], object] = lambda path: None
+
+    def _join(self, mode: Mode) -> None:
+        path = self._paths[0]
+        base, later = series(path)
+        if mode != "a":
+            if later:
+                names = ", ".join(one.name for one in list(later.values())[:3])
+                raise RecordingError(
+                    f"{path}: {names}{' …' if len(later) > 3 else ''} of an earlier series would follow it; "
+                    'delete them, record to another path, or go on with mode="a"'
+                )
+            return
+        files = [base, *later.values()]
+        for left in files[-2:-1]:  # changes nothing about a finished one
+            with contextlib.suppress(RecordingError, FormatError):  # it is read as it is
+                RecordingWriter(left, WriterOptions(mode="a")).close()
+        self._paths = [files[-1]]
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files so far; one that no step came into is gone once it is closed."""
+        return [path for path in self._paths[:-1] if path.exists()] + self._last()
+
+    def _last(self) -> list[Path]:
+        return self._paths[-1:] if len(self._paths) == 1 or self._paths[-1].exists() else []
+
+    @property
+    def path(self) -> Path:
+        """The newest of them."""
+        return self.paths[-1]
+
+    def open_first(self, options: WriterOptions) -> RecordingWriter:
+        """A writer of the first file, or of the one to go on with.
+
+        Raises:
+            RecordingError: as `RecordingWriter`.
+        """
+        return self._open(self._paths[0], options)
+
+    def _open(self, path: Path, options: WriterOptions) -> RecordingWriter:
+        writer = RecordingWriter(path, options)
+        attachments = writer.container.attachment_indexes
+        self._head = sum(index.length for index in attachments if index.name != INDEX_NAME)
+        self._opened = time.monotonic()
+        return writer
+
+    def is_due(self, writer: RecordingWriter) -> bool:
+        """Whether the file is to be left once no episode is running."""
+        return self._is_beyond(writer, 1.0, _MOST_ROWS) and (
+            writer.journal is not None or writer.index.count > 0
+        )
+
+    def is_overdue(self, writer: RecordingWriter) -> bool:
+        """Whether the file is to be left now."""
+        return self._is_beyond(writer, _PATIENCE, _CUT_ROWS)
+
+    def _is_beyond(self, writer: RecordingWriter, share: float, most_rows: int) -> bool:
+        container = writer.container
+        if self._max_bytes is not None and container.position - self._head >= share * self._max_bytes:
+            return True
+        if self._max_seconds is not None and time.monotonic() - self._opened >= share * self._max_seconds:
+            return True
+        return max(container.counts.values(), default=0) >= most_rows
+
+    def open_next(self, options: WriterOptions) -> RecordingWriter:
+        """A writer of the next file; the caller closes the one before.
+
+        Raises:
+            RecordingError: it cannot be made; the one before can be recorded to as before.
+        """
+        base, later = series(self._paths[-1])
+        path = base.with_name(f"{base.stem}_{max(later, default=0) + 1:04}{base.suffix}")
+        with self.beginning():
+            writer = self._open(path, options._replace(mode="x"))
+        self._paths.append(path)
+        return writer
