@@ -45,16 +45,19 @@ def send_about(stream: Any, recordings: Sequence[Recording], shown: str, unseen:
         stream.send_columns(
             f"/overview/{name}", [number], [column_of(rr.Scalars.descriptor_scalars(), pa.array(values))]
         )
-        stream.log(f"/overview/{name}", rr.BarChart(_binned(values)), static=True)
+        stream.log(f"/overview/{name}", _bars(values), static=True)
 
 
-def _binned(values: Any) -> Any:
+def _bars(values: Any) -> Any:
     """At most a thousand bars: means of neighbours where there are more; what is not finite is 0."""
+    import rerun as rr
+
     finite = np.where(np.isfinite(values), values, 0.0)
     if len(finite) <= _MOST_BARS:
-        return finite
+        return rr.BarChart(finite)
     edges = np.linspace(0, len(finite), _MOST_BARS + 1).astype(int)
-    return np.add.reduceat(finite, edges[:-1]) / np.diff(edges)
+    counts = np.diff(edges)  # a bar is as wide as the episodes it stands for
+    return rr.BarChart(np.add.reduceat(finite, edges[:-1]) / counts, abscissa=edges[:-1], widths=counts)
 
 
 def card(recording: Recording) -> str:
