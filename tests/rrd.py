@@ -28,6 +28,10 @@ class Rrd:
     def entities(self, recording: int = 0) -> set[str]:
         return set(self._batches[recording])
 
+    def columns(self, entity: str, recording: int = 0) -> set[str]:
+        """The names of an entity's components and timelines."""
+        return {name for batch in self._batches[recording][entity] for name in batch.schema.names}
+
     def rows(self, entity: str, component: str, recording: int = 0) -> list[Any]:
         """Of a component or a timeline, in the order they were sent."""
         batches = [b for b in self._batches[recording][entity] if component in b.schema.names]

@@ -171,6 +171,22 @@ def test_what_is_not_finite_stays_in_its_step(tmp_path: Path) -> None:
     assert np.array_equal(found.scalars("/state")[:, 0], odd * 2, equal_nan=True)
     nan = np.nan
     assert np.array_equal(found.scalars("/return")[:, 0], [1, nan, nan, nan] * 2, equal_nan=True)
+    # a marker at no height would not be seen
+    assert found.scalars("/end/terminal").tolist() == [[0], [0]] and found.rows("/end/terminal", "step") == [
+        3,
+        7,
+    ]
+
+
+def test_a_single_step_is_a_point_since_it_makes_no_line(tmp_path: Path) -> None:
+    space = Box(-1, 1, (1,))
+    single = replayed(tmp_path, Sampled(space, info=lambda _: {"speed": 1.0}), steps=1, record_info=True)
+    for entity in ("/state", "/reward", "/return", "/info/speed"):
+        assert single.rows(entity, "SeriesPoints:markers") and "SeriesLines:names" not in single.columns(
+            entity
+        )
+    (tmp_path / "two").mkdir()
+    assert "SeriesPoints:markers" not in replayed(tmp_path / "two", Sampled(space), steps=2).columns("/state")
 
 
 def test_actions_are_lanes_or_steps(tmp_path: Path) -> None:
@@ -242,4 +258,9 @@ def test_the_overview_is_of_all_episodes(tmp_path: Path) -> None:
     assert found.rows("/overview/return", "episode") == list(range(n))
     (bars,) = found.rows("/overview/length", "BarChart:values")
     assert bars[0]["shape"] == [1000]  # no window shows more
+    (places,) = found.rows("/overview/length", "BarChart:abscissa")
+    (widths,) = found.rows("/overview/length", "BarChart:widths")
+    begins = np.array(places[0]["buffer"])
+    assert begins[0] == 0 and np.array_equal(begins[:-1] + widths[:-1], begins[1:])
+    assert begins[-1] + widths[-1] == n  # the axis counts episodes, not bars
     assert len(found.scalars("/reward")) == 1

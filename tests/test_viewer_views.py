@@ -77,6 +77,20 @@ def test_compared_episodes(viewer: HeadlessViewer, cart_pole: Path) -> None:
     assert ranges(state)["step"] == (0, 299)
 
 
+def test_compared_texts_say_whose_they_are(viewer: HeadlessViewer, tmp_path: Path) -> None:
+    state = shown(viewer, viewed.courier(tmp_path / "courier.mcap", episodes=2), "--compare")
+    wanted = {f"episode_{number}: state · task": TEXT for number in range(2)}
+    assert views(state).items() >= wanted.items()
+
+
+def test_lanes_of_all_compared_episodes_are_in_sight(viewer: HeadlessViewer, cart_pole: Path) -> None:
+    def height(*options: str) -> int:
+        (lanes,) = (v for v in shown(viewer, cart_pole, *options).views if v.view_class == LANES)
+        return len(viewer.screenshot(lanes))
+
+    assert height("--compare") > 1.15 * height("--compare", "--episode", "best")
+
+
 def test_pixels(viewer: HeadlessViewer, tmp_path: Path) -> None:
     state = shown(viewer, viewed.atari(tmp_path / "atari.mcap", episodes=1, steps=60))
     assert views(state) == {"state": PICTURE, "action": LANES, **REWARDS, **ABOUT}

@@ -16,8 +16,8 @@ _STACKED, _A_PAGE = 4, 12
 _MOST_LINKED = 1000  # rows
 _WINDOW = 500  # rows that are shown of a rollout that goes on
 _SHARE = 3.0  # of a column's height, a panel like any other
+_LANES, _LANE, _MOST_LANES = 1.2, 0.8, 6.0  # of a panel of lanes: itself, each of its lanes, at most
 _SHARES: dict[type, float] = {
-    Lanes: 2.0,
     Words: 2.0,
     Infos: 2.0,
     Picture: 4.0,
@@ -36,9 +36,11 @@ def blueprint_of(scene: Scene, roots: Sequence[str] = ("",), *, listed: bool = F
     axis = _newest() if scene.grows else _time_axis(scene.rows)
     groups = ((main, "state"), (scene.actions, "action"))
     left = [
-        (_stack(group, roots, axis, name), _share(group, group is main)) for group, name in groups if group
+        (_stack(group, roots, axis, name), _share(group, len(roots), group is main))
+        for group, name in groups
+        if group
     ]
-    right = [(_stack(beside, roots, axis, "beside"), _share(beside, False))] if beside else []
+    right = [(_stack(beside, roots, axis, "beside"), _share(beside, len(roots), False))] if beside else []
     right += [(panel.view(roots, axis), 4.0) for panel in scene.rewards]
     about = rrb.Tabs(
         rrb.TextDocumentView(name="recording", origin="/card"),
@@ -91,7 +93,7 @@ def _below(panels: Sequence[Panel], roots: Sequence[str], axis: Any) -> list[tup
 
     views = [panel.view(roots, axis) for panel in panels]
     if len(views) <= _STACKED:
-        return [(view, _SHARES.get(type(panel), _SHARE)) for view, panel in zip(views, panels, strict=True)]
+        return [(view, _height(panel, len(roots))) for view, panel in zip(views, panels, strict=True)]
     return [(rrb.Grid(*views, grid_columns=2), _SHARE * ((len(views) + 1) // 2))]
 
 
@@ -99,11 +101,18 @@ def _unzipped(page: tuple[list[tuple[Any, float]], str]) -> tuple[list[Any], lis
     return [view for view, _ in page[0]], [share for _, share in page[0]], page[1]
 
 
-def _share(panels: Sequence[Panel], main: bool) -> float:
+def _height(panel: Panel, episodes: int) -> float:
+    """A panel's share of the height of its column."""
+    if isinstance(panel, Lanes):
+        return min(_LANES + _LANE * episodes, _MOST_LANES)
+    return _SHARES.get(type(panel), _SHARE)
+
+
+def _share(panels: Sequence[Panel], episodes: int, main: bool) -> float:
     """How much of a column's height some panels need; what was seen takes what there is."""
     return min(
         12.0 if main else 8.0,
-        max(6.0 if main else 0.0, sum(_SHARES.get(type(panel), _SHARE) for panel in panels)),
+        max(6.0 if main else 0.0, sum(_height(panel, episodes) for panel in panels)),
     )
 
 

@@ -12,7 +12,7 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.viewer.blocks import Array, Block
 from tupli_mcap.viewer.sending import Times, send_scalars
 
-__all__ = ["ENDS", "PALETTE", "Panel", "Place", "Rewards", "Series", "flat_values", "plot"]
+__all__ = ["ENDS", "PALETTE", "Panel", "Place", "Rewards", "Series", "flat_values", "named", "plot"]
 
 ENDS: Mapping[str, int] = {"terminal": 0xE4572EFF, "timeout": 0xF3A712FF, "interrupted": 0x9A9A9AFF}
 """How an episode may end, by code, and the colour of its marker (RGBA)."""
@@ -26,12 +26,13 @@ PALETTE: Final = (
 
 class Place(NamedTuple):
     """Where a panel's entities go: below `root` in a stream. `title` and `color` tell several episodes in one view
-    apart; they are empty where there is only one."""
+    apart; they are empty where there is only one. `single`: one step is all that comes, which makes no line."""
 
     stream: Any
     root: str = ""
     title: str = ""
     color: int | None = None
+    single: bool = False
 
     def told(self, name: str, *, alone: bool) -> str:
         """The name of a series: of the episode where the view shows only this one of each."""
@@ -44,6 +45,28 @@ class Place(NamedTuple):
         if self.color is not None:
             return np.full(count, self.color, np.uint32)
         return np.resize(np.roll(np.array(PALETTE, np.uint32), -first), count)
+
+    def declare_series(
+        self, entity: str, names: Sequence[str], colors: Array, *, stepped: bool = False
+    ) -> None:
+        """How the scalars of an entity are drawn: as lines, or a single row as points."""
+        import rerun as rr
+        from rerun.components import AggregationPolicy, InterpolationMode, MarkerShape
+
+        style: Any
+        if self.single:
+            shapes = [MarkerShape.Circle] * len(names)
+            style = rr.SeriesPoints(
+                names=names, colors=colors, markers=shapes, marker_sizes=[4.0] * len(names)
+            )
+        else:
+            style = rr.SeriesLines(
+                names=names,
+                colors=colors,
+                interpolation_mode=InterpolationMode.StepAfter if stepped else None,
+                aggregation_policy=AggregationPolicy.MinMax,
+            )
+        self.stream.log(self.root + entity, style, static=True)
 
 
 class Panel(Protocol):
@@ -81,16 +104,8 @@ class Series:
     stepped: bool = False
 
     def declare(self, place: Place) -> None:
-        import rerun as rr
-        from rerun.components import AggregationPolicy, InterpolationMode
-
-        lines = rr.SeriesLines(
-            names=[place.told(name, alone=len(self.names) == 1) for name in self.names],
-            colors=place.colors(len(self.names)),
-            interpolation_mode=InterpolationMode.StepAfter if self.stepped else None,
-            aggregation_policy=AggregationPolicy.MinMax,
-        )
-        place.stream.log(place.root + self.entity, lines, static=True)
+        names = [place.told(name, alone=len(self.names) == 1) for name in self.names]
+        place.declare_series(self.entity, names, place.colors(len(names)), stepped=self.stepped)
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         values = flat_values(self.leaf, self.column, block)
@@ -113,14 +128,10 @@ class Rewards:
 
     def declare(self, place: Place) -> None:
         import rerun as rr
-        from rerun.components import AggregationPolicy, MarkerShape
+        from rerun.components import MarkerShape
 
         for name, color in (("reward", 6), ("return", 2)):
-            told = [place.told(name, alone=True)]
-            lines = rr.SeriesLines(
-                names=told, colors=place.colors(1, color), aggregation_policy=AggregationPolicy.MinMax
-            )
-            place.stream.log(f"{place.root}/{name}", lines, static=True)
+            place.declare_series(f"/{name}", [place.told(name, alone=True)], place.colors(1, color))
         shapes = (MarkerShape.Cross, MarkerShape.Diamond, MarkerShape.Square)
         for (name, color), shape in zip(ENDS.items(), shapes, strict=True):
             points = rr.SeriesPoints(
@@ -138,10 +149,11 @@ class Rewards:
             return
         how = block.recording.index["end"][[piece.position for piece in ends]]
         rows = np.array([piece.end - 1 for piece in ends], np.int64)
+        heights = np.where(np.isfinite(returns), returns, 0.0)  # a marker has to be somewhere
         for code, name in enumerate(ENDS):
             at = rows[how == code]
             if len(at):
-                send_scalars(place.stream, f"{place.root}/end/{name}", times.at(at), returns[at][:, None])
+                send_scalars(place.stream, f"{place.root}/end/{name}", times.at(at), heights[at][:, None])
 
     def miss(self) -> None:
         """Steps are left out before the next block: a return that goes on is not known until its episode ends."""
@@ -186,6 +198,11 @@ def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
     """A leaf's values in a block: rows x dimensions."""
     values: Array = leaf.get(getattr(block.columns, column))
     return values.reshape(len(block), -1)
+
+
+def named(title: str, root: str) -> str:
+    """A view's title: of several episodes, which one it is comes first."""
+    return f"{root.rpartition('/')[2]}: {title}" if root else title
 
 
 def plot(title: str, entities: Sequence[str], axis: Any, *, legend: bool = True) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.viewer.blocks import Array, Block
-from tupli_mcap.viewer.panels import Place, flat_values
+from tupli_mcap.viewer.panels import Place, flat_values, named
 from tupli_mcap.viewer.sending import Times, blob_array, column_of, send_blobs, send_tensors
 
 __all__ = ["Camera", "Grid", "HeatMap", "Picture"]
@@ -168,7 +168,7 @@ class Camera:
 def _side_by_side(title: str, roots: Sequence[str], entity: str) -> Any:
     import rerun.blueprint as rrb
 
-    views = [rrb.Spatial2DView(name=_named(title, root), origin=root + entity) for root in roots]
+    views = [rrb.Spatial2DView(name=named(title, root), origin=root + entity) for root in roots]
     return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)
 
 
@@ -177,12 +177,7 @@ def _tensors(title: str, roots: Sequence[str], entity: str) -> Any:
 
     colors = rrb.TensorScalarMapping(colormap="viridis", mag_filter="nearest")
     views = [
-        rrb.TensorView(name=_named(title, root), origin=root + entity, scalar_mapping=colors, view_fit="fill")
+        rrb.TensorView(name=named(title, root), origin=root + entity, scalar_mapping=colors, view_fit="fill")
         for root in roots
     ]
     return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)
-
-
-def _named(title: str, root: str) -> str:
-    """A view's title: of several episodes, which one it is comes first."""
-    return f"{root.rpartition('/')[2]}: {title}" if root else title

@@ -44,6 +44,11 @@ class Part(NamedTuple):
     color: int | None = None
     first: int = 0
 
+    @property
+    def rows(self) -> int:
+        """How many steps its episodes have."""
+        return int(self.chosen.recording.index["length"][list(self.chosen.positions)].sum())
+
 
 class Plan(NamedTuple):
     """One Rerun recording: its name, its parts, its blueprint."""
@@ -81,8 +86,11 @@ class Plan(NamedTuple):
         stream.send_recording_name(self.name)
         recordings = list({id(part.chosen.recording): part.chosen.recording for part in self.parts}.values())
         send_about(stream, recordings, self.shown, self.parts[0].scene.unseen)
+        rows: dict[str, int] = {}
         for part in self.parts:
-            place = Place(stream, part.root, part.title, part.color)
+            rows[part.root] = rows.get(part.root, 0) + part.rows
+        for part in self.parts:
+            place = Place(stream, part.root, part.title, part.color, single=rows[part.root] == 1)
             for panel in part.scene.panels:
                 panel.declare(place)
             for block in blocks_of(*part.chosen, part.first):
@@ -151,7 +159,7 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
     first = 0
     for item in chosen:
         parts.append(Part(item, scene, first=first))
-        first += int(item.recording.index["length"][list(item.positions)].sum())
+        first += parts[-1].rows
     total = sum(len(item.positions) for item in chosen)
     name = Path(chosen[0].recording.name).stem
     if total == 1:
@@ -166,7 +174,8 @@ def _episode_told(recording: Recording, position: int) -> str:
     """An episode's facts in Markdown."""
     episode = recording.episodes[position]
     seed = "" if episode.seed is None else f", seed {episode.seed}"
-    facts = f"**Episode {episode.number}**: {len(episode):,} steps, return {episode.return_:.6g}, {episode.end}{seed}"
+    steps = "1 step" if len(episode) == 1 else f"{len(episode):,} steps"
+    facts = f"**Episode {episode.number}**: {steps}, return {episode.return_:.6g}, {episode.end}{seed}"
     metadata = "".join(
         f"\n- {plain(key)}: {plain(repr(value))}" for key, value in list(episode.metadata.items())[:20]
     )

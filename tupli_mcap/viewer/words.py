@@ -12,7 +12,7 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
-from tupli_mcap.viewer.panels import PALETTE, Place, plot
+from tupli_mcap.viewer.panels import PALETTE, Place, named, plot
 from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
 
 __all__ = ["Infos", "Lanes", "Words", "infos_of"]
@@ -88,15 +88,15 @@ class Words:
         send_texts(place.stream, entity, times, rr.TextLog.descriptor_text(), texts)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        return _texts(self.title, [root + self.entity for root in roots])
+        return _texts(self.title, roots, self.entity)
 
 
-def _texts(title: str, entities: Sequence[str]) -> Any:
-    """The text of the moment for each entity, and all of them in a log."""
+def _texts(title: str, roots: Sequence[str], entity: str) -> Any:
+    """The text of the moment below each root, and all of them in a log."""
     import rerun.blueprint as rrb
 
-    moments = [rrb.TextDocumentView(name=title, origin=entity) for entity in entities]
-    log = rrb.TextLogView(name=f"{title}: log", origin="/", contents=list(entities))
+    moments = [rrb.TextDocumentView(name=named(title, root), origin=root + entity) for root in roots]
+    log = rrb.TextLogView(name=f"{title}: log", origin="/", contents=[root + entity for root in roots])
     return rrb.Tabs(*moments, log, name=title)
 
 
@@ -115,11 +115,8 @@ class Infos:
     title: str = "infos"
 
     def declare(self, place: Place) -> None:
-        import rerun as rr
-
         for i, (key, entity) in enumerate(self.numbers.items()):
-            lines = rr.SeriesLines(names=[place.told(key, alone=False)], colors=place.colors(1, i))
-            place.stream.log(place.root + entity, lines, static=True)
+            place.declare_series(entity, [place.told(key, alone=False)], place.colors(1, i))
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         import rerun as rr
