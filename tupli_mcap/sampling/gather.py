@@ -13,6 +13,7 @@ import numpy as np
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.sampling.segments import Piece, Segments
+from tupli_mcap.sampling.steps import pick_runs, rows_of_runs
 
 __all__ = ["TIME", "Column", "ConstantRows", "DecodedRows", "RowFormat", "Rows"]
 
@@ -56,6 +57,10 @@ class Rows(Protocol):
         """Columns of the rows (int64, any order), by name."""
         ...
 
+    def read_runs(self, names: Sequence[str], starts: Array, length: int, threads: int) -> dict[str, Any]:
+        """Columns of the rows `start` to `start + length - 1` for each of `starts`, one run after the other."""
+        ...
+
 
 class ConstantRows:
     """Rows of constant size, in chunks of several files.
@@ -94,6 +99,16 @@ class ConstantRows:
         if self._held:
             self._decode(names, rows, threads)
             return {name: self._decoded[name].take(rows, axis=0) for name in names}
+        return self._read_chunks(names, rows, threads)
+
+    def read_runs(self, names: Sequence[str], starts: Array, length: int, threads: int) -> dict[str, Any]:
+        if not self._held:
+            return self._read_chunks(names, rows_of_runs(starts, length), threads)
+        if not self._whole.issuperset(names):
+            self._decode(names, rows_of_runs(starts, length), threads)
+        return {name: pick_runs(self._decoded[name], starts, length) for name in names}
+
+    def _read_chunks(self, names: Sequence[str], rows: Array, threads: int) -> dict[str, Any]:
         out = {name: self.columns[name].empty(len(rows)) for name in names}
         filled = [name for name in names if out[name].size]
         pieces = self.segments.pieces(rows) if filled else []
@@ -115,14 +130,8 @@ class ConstantRows:
     def _decode(self, names: Sequence[str], rows: Array, threads: int) -> None:
         """Sees to it that the columns hold the rows."""
         missing = [name for name in names if name not in self._whole]
-        if not missing:
-            return
         for name in missing:
-            if name not in self._decoded:
-                self._there[name] = np.zeros(len(self.segments.chunk_of), np.bool_)
-                self._decoded[name] = self.columns[name].empty(self.segments.total)
-            if not self._decoded[name].size:
-                self._whole.add(name)
+            self._prepare(name)
         missing = [name for name in missing if name not in self._whole]
         if not missing:
             return
@@ -135,6 +144,13 @@ class ConstantRows:
         run(tasks, threads)
         if tasks:
             self._whole.update(name for name in missing if self._there[name].all())
+
+    def _prepare(self, name: str) -> None:
+        if name not in self._decoded:
+            self._there[name] = np.zeros(len(self.segments.chunk_of), np.bool_)
+            self._decoded[name] = self.columns[name].empty(self.segments.total)
+        if not self._decoded[name].size:
+            self._whole.add(name)
 
     def _fill(self, unit: int, names: Sequence[str]) -> None:
         chunk, fields = self._open(unit, keep=False)
@@ -191,6 +207,9 @@ class DecodedRows:
         for piece in self.segments.pieces(rows):
             self._copy(piece, [name for name in names if name != TIME], out)
         return out
+
+    def read_runs(self, names: Sequence[str], starts: Array, length: int, threads: int) -> dict[str, Any]:
+        return self.read(names, rows_of_runs(starts, length), threads)
 
     def _copy(self, piece: Piece, names: Sequence[str], out: dict[str, Any]) -> None:
         file, chunk = int(self.segments.file_of[piece.unit]), int(self.segments.chunk_of[piece.unit])

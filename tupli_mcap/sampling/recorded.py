@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from tupli_mcap.sampling.files import OpenFiles
 from tupli_mcap.sampling.gather import TIME, ConstantRows, Rows
 from tupli_mcap.sampling.index import ListedEpisodes, StepIndex
 from tupli_mcap.sampling.kinds import EPISODE, final_rows, image_rows, step_rows
-from tupli_mcap.sampling.steps import checked_fields
+from tupli_mcap.sampling.steps import checked_fields, rows_of_runs
 
 __all__ = ["CACHE_BYTES", "THREADS", "RecordedSteps"]
 
@@ -26,6 +26,13 @@ CACHE_BYTES = 512 << 20
 THREADS = min(4, os.cpu_count() or 1)
 _PLAIN = {"terminals": "terminal", "timeouts": "timeout", "times": TIME}
 Array = np.ndarray[Any, Any]
+
+
+class _Plan(NamedTuple):
+    """How to read some fields: the leaves to read of each kind of rows, then how the fields are made of them."""
+
+    sources: list[tuple[Rows, list[str]]]
+    fields: list[tuple[str, Callable[[list[Any]], Any], list[str]]]
 
 
 class RecordedSteps:
@@ -92,11 +99,11 @@ class RecordedSteps:
                 *(image_rows(index, name) for name in index.images),
                 final_rows(index),
             ]
-        self._rows_of = {name: rows for rows in self._rows[:-1] for name in rows.columns}
-        self._used: dict[int, set[str]] = {}
+        self._used: list[set[str]] = [set() for _ in self._rows]
+        self._plans: dict[tuple[str, ...], _Plan] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        rest = ("layout", "_rows", "_rows_of", "_used")
+        rest = ("layout", "_rows", "_used", "_plans")
         return {key: value for key, value in self.__dict__.items() if key not in rest}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -113,77 +120,108 @@ class RecordedSteps:
         return where.units[where.of(listed)]
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
-        fields = checked_fields(fields)
-        layout = self.layout
-        if layout is None:
-            return {field: np.empty(0) for field in fields}
         listed = rows if self._wanted is None else self._wanted[rows]
-        nest = {"states": layout.nest_state, "actions": layout.nest_action, "rewards": layout.nest_reward}
-        groups = {field: field_leaves(field, layout) or () for field in nest if field in fields}
-        names = [leaf.name for group in groups.values() for leaf in group]
-        found = self._read([*names, *(_PLAIN[field] for field in fields if field in _PLAIN)], listed)
+        return self._columns(
+            fields,
+            lambda source, names: source.read(names, listed, self.threads),
+            lambda: listed,
+        )
+
+    def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
+        if self._wanted is not None:  # what follows a step is not always in the next row
+            return self.read(fields, rows_of_runs(starts, length))
+        return self._columns(
+            fields,
+            lambda source, names: source.read_runs(names, starts, length, self.threads),
+            lambda: rows_of_runs(starts, length),
+        )
+
+    def _columns(
+        self,
+        fields: Sequence[str],
+        read: Callable[[Rows, Sequence[str]], dict[str, Any]],
+        listed: Callable[[], Array],
+    ) -> dict[str, Any]:
+        """The columns of some listed steps, whose leaves `read` gives."""
+        plan = self._plans.get(tuple(fields)) or self._plan(fields)
+        found: dict[str, Any] = {}
+        for source, names in plan.sources:
+            found.update(read(source, names))
         columns: dict[str, Any] = {}
-        for field in fields:
+        for field, nest, names in plan.fields:
             if field == "next_states":
-                columns[field] = self._next_states(layout, listed)
-            elif field in _PLAIN:
-                columns[field] = found[_PLAIN[field]]
+                columns[field] = self._next_states(nest, names, listed())
             else:
-                columns[field] = nest[field]([found[leaf.name] for leaf in groups[field]])
-        if "times" in columns:
-            columns["times"] = _signed(columns["times"])
+                columns[field] = nest([found[name] for name in names])
         return columns
 
-    def _read(self, names: Sequence[str], listed: Array) -> dict[str, Any]:
-        """Columns of listed steps, by name of the leaf."""
-        by_rows: dict[int, tuple[Rows, list[str]]] = {}
-        for name in names:
-            rows = self._rows_of[name]
-            by_rows.setdefault(id(rows), (rows, []))[1].append(name)
-        found: dict[str, Any] = {}
-        for rows, chosen in by_rows.values():
-            found.update(self._read_of(rows, chosen, listed))
-        return found
+    def _plan(self, fields: Sequence[str]) -> _Plan:
+        """What has to be read for some fields; from now on, the budget is shared with it."""
+        names = checked_fields(fields)
+        layout = self.layout
+        plan = _Plan([], [])
+        if layout is None:
+            plan.fields.extend((field, lambda _: np.empty(0), []) for field in names)
+            return plan
+        nests = {"actions": layout.nest_action, "rewards": layout.nest_reward, "times": _times}
+        for field in names:
+            leaves = field_leaves(field, layout)
+            own = [_PLAIN[field]] if leaves is None else [leaf.name for leaf in leaves]
+            nest = nests.get(field, _only if leaves is None else layout.nest_state)
+            plan.fields.append((field, nest, own))
+        needed = [name for field, _, own in plan.fields if field != "next_states" for name in own]
+        for source in self._rows[:-1]:
+            chosen = [name for name in needed if name in source.columns]
+            if chosen:
+                plan.sources.append((source, chosen))
+        self._use(plan)
+        self._plans[tuple(fields)] = plan
+        return plan
 
-    def _read_of(self, rows: Rows, names: Sequence[str], wanted: Array) -> dict[str, Any]:
-        used = self._used.setdefault(id(rows), set())
-        if not used.issuperset(names):
-            used.update(names)
-            self._share_budget()
-        return rows.read(names, wanted, self.threads)
+    def _use(self, plan: _Plan) -> None:
+        wanted = list(plan.sources)
+        for field, _, names in plan.fields:
+            if field == "next_states":
+                wanted += [(source, [n for n in names if n in source.columns]) for source in self._rows[:-1]]
+                wanted.append((self._rows[-1], [*names, EPISODE]))
+        for source, names in wanted:
+            self._used[self._rows.index(source)].update(names)
+        self._share_budget()
 
     def _share_budget(self) -> None:
         """Decides which columns are kept decoded, out of those that were asked for so far."""
         sizes = {
-            id(rows): rows.nbytes(self._used[id(rows)])
-            for rows in self._rows
-            if isinstance(rows, ConstantRows) and id(rows) in self._used
+            i: rows.nbytes(self._used[i])
+            for i, rows in enumerate(self._rows)
+            if isinstance(rows, ConstantRows)
         }
-        images = {id(rows) for rows in self._rows[1:-1]}
         if sum(sizes.values()) > self.cache_bytes:
-            sizes = {key: size for key, size in sizes.items() if key not in images}
+            sizes = {i: size for i, size in sizes.items() if i in (0, len(self._rows) - 1)}  # without images
             if sum(sizes.values()) > self.cache_bytes // 2:
                 sizes = {}
-        for rows in self._rows:
+        for i, rows in enumerate(self._rows):
             if isinstance(rows, ConstantRows):
-                rows.hold(id(rows) in sizes)
+                rows.hold(i in sizes)
         self._cache.budget = self.cache_bytes - sum(sizes.values())
 
-    def _next_states(self, layout: StepLayout, listed: Array) -> Any:
+    def _next_states(self, nest: Callable[[list[Any]], Any], names: Sequence[str], listed: Array) -> Any:
         index = self._index
         episodes = np.searchsorted(self._ends, listed, side="right")
         after = np.where(listed == self._ends[episodes] - 1, index.after[episodes], listed + 1)
-        names = [leaf.name for leaf in layout.state]
         at_end = np.flatnonzero(after < 0)
-        found = self._read(names, np.where(after < 0, listed, after))
+        rows = np.where(after < 0, listed, after)
+        found: dict[str, Any] = {}
+        for source in self._rows[:-1]:
+            chosen = [name for name in names if name in source.columns]
+            found.update(source.read(chosen, rows, self.threads) if chosen else {})
         if len(at_end):
             finals = self._finals(names, -1 - after[at_end])
             for name in names:
                 _put(found[name], at_end, finals[name])
-        return layout.nest_state([found[name] for name in names])
+        return nest([found[name] for name in names])
 
     def _finals(self, names: Sequence[str], rows: Array) -> dict[str, Any]:
-        found = self._read_of(self._rows[-1], [*names, EPISODE], rows)
+        found = self._rows[-1].read([*names, EPISODE], rows, self.threads)
         expected = self._index.final_numbers[rows]
         wrong = np.flatnonzero(found[EPISODE] != expected)
         if len(wrong):
@@ -203,8 +241,12 @@ def _put(column: Any, places: Array, values: Any) -> None:
         column[places] = values
 
 
-def _signed(times: Array) -> Array:
-    signed = times.view(np.int64)
+def _only(values: list[Any]) -> Any:
+    return values[0]
+
+
+def _times(values: list[Any]) -> Array:
+    signed: Array = values[0].view(np.int64)
     if (signed < 0).any():
-        raise FormatError(f"expected times of steps below 2**63 ns, found {times.max()}")
+        raise FormatError(f"expected times of steps below 2**63 ns, found {values[0].max()}")
     return signed

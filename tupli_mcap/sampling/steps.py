@@ -10,10 +10,21 @@ import numpy as np
 from tupli_mcap.errors import TupliError
 from tupli_mcap.messages.step import StepLayout
 
-__all__ = ["FIELDS", "MemorySteps", "SamplingError", "Steps", "checked_fields", "map_arrays", "pick"]
+__all__ = [
+    "FIELDS",
+    "MemorySteps",
+    "SamplingError",
+    "Steps",
+    "checked_fields",
+    "map_arrays",
+    "pick",
+    "pick_runs",
+    "rows_of_runs",
+]
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
 Array = np.ndarray[Any, Any]
+_MAX_ITEM = 1 << 30  # bytes of an item of an array
 _BLOCK = 4096  # steps in memory that are close to each other
 
 
@@ -52,6 +63,13 @@ class Steps(Protocol):
         """
         ...
 
+    def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
+        """Columns of the steps `start` to `start + length - 1` for each of `starts` (int64), one run after the other.
+
+        As `read` gives them for all those rows, with len(starts) * length rows; `length` is at least 1.
+        """
+        ...
+
     def blocks(self, rows: Array) -> Array:
         """int64: the block of the storage that each of `rows` lies in; rows of one block are cheap to read together."""
         ...
@@ -78,6 +96,15 @@ class MemorySteps:
             field: found[field] if field in found else pick(self._columns[field], rows) for field in fields
         }
 
+    def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
+        checked_fields(fields)
+        missing = [field for field in fields if field not in self._columns]
+        found = self._rest.read_runs(missing, starts, length) if missing else {}
+        return {
+            field: found[field] if field in found else pick_runs(self._columns[field], starts, length)
+            for field in fields
+        }
+
     def blocks(self, rows: Array) -> Array:
         return rows // _BLOCK
 
@@ -100,6 +127,30 @@ def pick(column: Any, rows: Array) -> Any:
     if isinstance(column, list):
         return [column[row] for row in rows.tolist()]
     return map_arrays(lambda part: part.take(rows, axis=0), column, lambda part: pick(part, rows))
+
+
+def pick_runs(column: Any, starts: Array, length: int) -> Any:
+    """The rows `start` to `start + length - 1` of a column for each of `starts`, one run after the other, as a copy."""
+    return map_arrays(
+        lambda part: _copy_runs(part, starts, length),
+        column,
+        lambda part: pick(part, rows_of_runs(starts, length)),
+    )
+
+
+def rows_of_runs(starts: Array, length: int) -> Array:
+    """The rows of all runs, one run after the other."""
+    rows: Array = starts[:, None] + np.arange(length)
+    return rows.reshape(-1)
+
+
+def _copy_runs(array: Array, starts: Array, length: int) -> Array:
+    width = array.strides[0] * length if array.flags.c_contiguous else 0
+    if not 0 < width < _MAX_ITEM:
+        return array.take(rows_of_runs(starts, length), axis=0)
+    # each run as one item: NumPy copies it at once, an order of magnitude faster than row by row
+    runs = np.ndarray(len(array) - length + 1, f"V{width}", array, 0, array.strides[:1])
+    return runs[starts].view(array.dtype).reshape(-1, *array.shape[1:])
 
 
 def map_arrays(

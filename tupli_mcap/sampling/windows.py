@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tupli_mcap.sampling.steps import SamplingError, Steps, checked_fields, map_arrays
+from tupli_mcap.sampling.steps import FIELDS, SamplingError, Steps, checked_fields, map_arrays
 
 __all__ = ["Pad", "Window", "Windows"]
 
@@ -66,7 +66,7 @@ class Windows:
     ) -> None:
         self.source = steps
         self.length, self.stride, self.pad, self.history = length, stride, pad, history
-        self.fields = checked_fields(fields)
+        self.fields = tuple(checked_fields(fields))
         ends = steps.breaks + 1
         self._firsts = np.concatenate([[0], ends[:-1]]).astype(np.int64) if len(ends) else ends
         self._lasts = steps.breaks
@@ -74,6 +74,7 @@ class Windows:
         room = sizes - (length + history) + 1 if pad == "none" else sizes
         counts = np.maximum(0, -(-room // stride))
         self._ends = np.cumsum(counts)
+        self._before = self._ends - counts
         self._episode_ends = np.cumsum(steps.episode_lengths)
         if not len(self):
             raise SamplingError(
@@ -85,44 +86,54 @@ class Windows:
         return int(self._ends[-1]) if len(self._ends) else 0
 
     def __getitem__(self, index: int | slice | Sequence[int] | Array) -> Window:
-        single = isinstance(index, int | np.integer)
-        chosen = self._chosen(index)
-        pieces = np.searchsorted(self._ends, chosen, side="right")
-        before = np.where(pieces > 0, self._ends[pieces - 1], 0)
-        starts = self._firsts[pieces] + (chosen - before) * self.stride
-        if self.pad == "none":
-            starts += self.history
-        return self._read(starts, self._firsts[pieces], self._lasts[pieces], single)
+        if isinstance(index, int | np.integer):
+            found = self._read(np.array([self._checked(int(index))]))
+            for name in ("mask", "steps", "episodes"):
+                found[name] = found[name][0]
+            return Window(**found)
+        found = self._read(self._chosen(index))
+        shape = found["mask"].shape
+        return Window(
+            **{name: _shaped(part, shape) if name in FIELDS else part for name, part in found.items()}
+        )
+
+    def _checked(self, index: int) -> int:
+        n = len(self)
+        if not -n <= index < n:
+            raise IndexError(f"expected a window from 0 to {n - 1}, found {index}")
+        return index % n
 
     def _chosen(self, index: Any) -> Array:
         n = len(self)
         if isinstance(index, slice):
             return np.arange(*index.indices(n))
-        chosen = np.atleast_1d(np.asarray(index))
-        if chosen.dtype.kind not in "iu" or chosen.ndim != 1:
+        chosen = np.asarray(index)
+        if chosen.ndim != 1 or (chosen.dtype.kind not in "iu" and len(chosen)):
             raise SamplingError(f"expected numbers of windows, found {index!r:.80}")
         chosen = chosen.astype(np.int64)
-        chosen = np.where(chosen < 0, chosen + n, chosen)
-        if len(chosen) and (chosen.min() < 0 or chosen.max() >= n):
+        if len(chosen) and (chosen.min() < -n or chosen.max() >= n):
             raise IndexError(f"expected windows from 0 to {n - 1}, found {index!r:.80}")
-        return chosen
+        return np.where(chosen < 0, chosen + n, chosen)
 
-    def _read(self, starts: Array, firsts: Array, lasts: Array, single: bool) -> Window:
-        rows = starts[:, None] + np.arange(-self.history, self.length)
-        mask = np.ones(rows.shape, np.bool_)
-        if self.pad != "none":
-            inside = np.clip(rows, firsts[:, None], lasts[:, None])
-            mask, rows = inside == rows, inside
-        columns = self.source.read(self.fields, rows.reshape(-1))
-        if self.pad == "zero" and not mask.all():
-            outside = np.flatnonzero(~mask.reshape(-1))
-            columns = {name: _zeroed(column, outside) for name, column in columns.items()}
-        shape = rows.shape[1:] if single else rows.shape
-        columns = {name: _shaped(column, shape) for name, column in columns.items()}
-        episodes = np.searchsorted(self._episode_ends, starts, side="right")
-        if single:
-            return Window(mask[0], starts[0], episodes[0], **columns)
-        return Window(mask, starts, episodes, **columns)
+    def _read(self, chosen: Array) -> dict[str, Any]:
+        """The parts of a `Window`, of columns whose rows are those of one window after the other."""
+        pieces = self._ends.searchsorted(chosen, side="right")
+        starts = self._firsts[pieces] + (chosen - self._before[pieces]) * self.stride
+        total = self.history + self.length
+        mask = np.ones((len(chosen), total), np.bool_)
+        if self.pad == "none":
+            columns = self.source.read_runs(self.fields, starts, total)
+            starts = starts + self.history
+        else:
+            rows = starts[:, None] + np.arange(-self.history, self.length)
+            inside = np.clip(rows, self._firsts[pieces, None], self._lasts[pieces, None])
+            np.equal(rows, inside, out=mask)
+            columns = self.source.read(self.fields, inside.reshape(-1))
+            if self.pad == "zero":
+                outside = np.flatnonzero(~mask)
+                columns = {name: _zeroed(column, outside) for name, column in columns.items()}
+        episodes = self._episode_ends.searchsorted(starts, side="right")
+        return {"mask": mask, "steps": starts, "episodes": episodes, **columns}
 
     def __iter__(self) -> Iterator[Window]:
         for i in range(len(self)):
@@ -148,11 +159,9 @@ def _zeroed(column: Any, rows: Array) -> Any:
 
 
 def _shaped(column: Any, shape: tuple[int, ...]) -> Any:
-    """The column with its rows in another shape: of one window (T), or of several (B, T)."""
+    """The column with its rows in the shape (B, T)."""
 
     def of_list(part: list[Any]) -> list[Any]:
-        if len(shape) == 1:
-            return part
-        return [part[i : i + shape[1]] for i in range(0, len(part), max(1, shape[1]))]
+        return [part[i : i + shape[1]] for i in range(0, len(part), shape[1])]
 
     return map_arrays(lambda part: part.reshape(*shape, *part.shape[1:]), column, of_list)
