@@ -17,7 +17,8 @@ from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.selection import TupleFilter
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
 from tupli_mcap.dataset.tuples import Tuples
-from tupli_mcap.sampling import Pad, Steps, Windows
+from tupli_mcap.sampling import Pad, Steps, Transitions, Windows
+from tupli_mcap.sampling.transitions import TRANSITION_FIELDS
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.tuples import anew
@@ -403,6 +404,18 @@ class TupliDataset:
             SamplingError: no episode is long enough, or the arguments mean nothing.
         """
         return Windows(self.steps, length, stride, pad, history, fields=fields)
+
+    def transitions(
+        self, n_step: int = 1, discount: float = 1.0, *, fields: Sequence[str] = TRANSITION_FIELDS
+    ) -> Transitions:
+        """The transition (s, a, r, s') that starts at each step, by its number; an array of numbers gives a batch.
+
+        See `Transitions` for several steps, and `Transition` for what to bootstrap with.
+
+        Raises:
+            SamplingError: the dataset is empty, or the arguments mean nothing.
+        """
+        return Transitions(self.steps, n_step, discount, fields=fields)
 
     # --- display ---
 

@@ -1,18 +1,23 @@
 """Random access to steps: windows, transitions and samplers over recordings, materialised columns or memory."""
 
 from tupli_mcap.sampling.index import ListedEpisodes
+from tupli_mcap.sampling.items import Items
 from tupli_mcap.sampling.recorded import RecordedSteps
 from tupli_mcap.sampling.steps import FIELDS, MemorySteps, SamplingError, Steps
+from tupli_mcap.sampling.transitions import Transition, Transitions
 from tupli_mcap.sampling.windows import Pad, Window, Windows
 
 __all__ = [
     "FIELDS",
+    "Items",
     "ListedEpisodes",
     "MemorySteps",
     "Pad",
     "RecordedSteps",
     "SamplingError",
     "Steps",
+    "Transition",
+    "Transitions",
     "Window",
     "Windows",
 ]

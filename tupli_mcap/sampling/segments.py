@@ -69,6 +69,8 @@ class SegmentsBuilder:
 
     def add(self, file: int, chunks: Array, begins: Array, steps: Array) -> None:
         """Appends pieces of a file's chunks, each of `steps` rows, in their order."""
+        if not len(chunks):
+            return
         starts = self.total + np.cumsum(steps) - steps
         self._parts.append((starts, np.full(len(chunks), file), chunks, begins))
         self.total += int(steps.sum())

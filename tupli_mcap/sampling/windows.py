@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
 
+from tupli_mcap.sampling.items import Items, checked_count
 from tupli_mcap.sampling.steps import FIELDS, SamplingError, Steps, checked_fields, map_arrays
 
 __all__ = ["Pad", "Window", "Windows"]
 
 Array = np.ndarray[Any, Any]
 Pad = Literal["none", "repeat", "zero"]
+PADS = ("none", "repeat", "zero")
 FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 
 
@@ -43,15 +45,15 @@ class Window:
         return {name: value for name, value in named if value is not None}
 
 
-class Windows:
+class Windows(Items[Window]):
     """Windows of `length` steps, each after `history` earlier ones, at every `stride`-th step of an episode.
 
     A window lies in one episode, and between the cuts of a tuple filter. With `pad="none"` all its steps exist.
     Otherwise there is a window at every `stride`-th step, whatever is left of the episode: what is missing is the
     nearest step again ("repeat"), or zero ("zero"; None in a list), and `mask` says so.
 
-    An index gives a `Window`; a slice, or an array of numbers, gives one of several, read together. Raises
-    SamplingError: no episode is long enough; arguments that mean nothing; an unknown field.
+    Raises:
+        SamplingError: no episode is long enough, an argument means nothing, or a field is unknown.
     """
 
     def __init__(
@@ -64,66 +66,66 @@ class Windows:
         *,
         fields: Sequence[str] = FIVE,
     ) -> None:
-        self.source = steps
-        self.length, self.stride, self.pad, self.history = length, stride, pad, history
+        super().__init__(steps, (length, stride, pad, history))
+        self.length = checked_count(length, 1, "a length of windows")
+        self.stride = checked_count(stride, 1, "a stride")
+        self.history = checked_count(history, 0, "a number of earlier steps")
+        if pad not in PADS:
+            raise SamplingError(f"expected pad to be one of {', '.join(map(repr, PADS))}, found {pad!r:.80}")
+        self.pad = pad
         self.fields = tuple(checked_fields(fields))
-        ends = steps.breaks + 1
-        self._firsts = np.concatenate([[0], ends[:-1]]).astype(np.int64) if len(ends) else ends
         self._lasts = steps.breaks
+        self._firsts = np.concatenate([[0], self._lasts[:-1] + 1])
         sizes = self._lasts - self._firsts + 1
-        room = sizes - (length + history) + 1 if pad == "none" else sizes
-        counts = np.maximum(0, -(-room // stride))
+        total = self.length + self.history
+        room = np.maximum(0, sizes - total + 1) if pad == "none" else sizes
+        counts = -(-room // self.stride)
         self._ends = np.cumsum(counts)
         self._before = self._ends - counts
         self._episode_ends = np.cumsum(steps.episode_lengths)
         if not len(self):
             raise SamplingError(
-                f"expected an episode of at least {length + history} steps, found at most {sizes.max(initial=0)}; "
-                'take shorter windows, or pad="repeat"'
+                f"expected windows of at most {sizes.max()} steps, which the longest episode has, found {total}; "
+                "take shorter ones, or pad='repeat'"
             )
 
     def __len__(self) -> int:
-        return int(self._ends[-1]) if len(self._ends) else 0
+        return int(self._ends[-1])
 
-    def __getitem__(self, index: int | slice | Sequence[int] | Array) -> Window:
-        if isinstance(index, int | np.integer):
-            found = self._read(np.array([self._checked(int(index))]))
-            for name in ("mask", "steps", "episodes"):
-                found[name] = found[name][0]
-            return Window(**found)
-        found = self._read(self._chosen(index))
+    def steps_of(self, items: Array) -> Array:
+        return self._starts(items)[0]
+
+    def counts(self) -> Array:
+        pieces = self._episode_ends.searchsorted(self._lasts, side="right")
+        counts = np.bincount(pieces, self._ends - self._before, len(self._episode_ends))
+        return counts.astype(np.int64)
+
+    def _starts(self, items: Array) -> tuple[Array, Array]:
+        """The step that each window starts at, and the piece between two breaks that it lies in."""
+        pieces = self._ends.searchsorted(items, side="right")
+        starts = self._firsts[pieces] + (items - self._before[pieces]) * self.stride
+        return starts + self.history if self.pad == "none" else starts, pieces
+
+    def _one(self, item: int) -> Window:
+        found = self._read(np.array([item]))
+        for name in ("mask", "steps", "episodes"):
+            found[name] = found[name][0]
+        return Window(**found)
+
+    def _batch(self, items: Array) -> Window:
+        found = self._read(items)
         shape = found["mask"].shape
         return Window(
             **{name: _shaped(part, shape) if name in FIELDS else part for name, part in found.items()}
         )
 
-    def _checked(self, index: int) -> int:
-        n = len(self)
-        if not -n <= index < n:
-            raise IndexError(f"expected a window from 0 to {n - 1}, found {index}")
-        return index % n
-
-    def _chosen(self, index: Any) -> Array:
-        n = len(self)
-        if isinstance(index, slice):
-            return np.arange(*index.indices(n))
-        chosen = np.asarray(index)
-        if chosen.ndim != 1 or (chosen.dtype.kind not in "iu" and len(chosen)):
-            raise SamplingError(f"expected numbers of windows, found {index!r:.80}")
-        chosen = chosen.astype(np.int64)
-        if len(chosen) and (chosen.min() < -n or chosen.max() >= n):
-            raise IndexError(f"expected windows from 0 to {n - 1}, found {index!r:.80}")
-        return np.where(chosen < 0, chosen + n, chosen)
-
-    def _read(self, chosen: Array) -> dict[str, Any]:
-        """The parts of a `Window`, of columns whose rows are those of one window after the other."""
-        pieces = self._ends.searchsorted(chosen, side="right")
-        starts = self._firsts[pieces] + (chosen - self._before[pieces]) * self.stride
+    def _read(self, items: Array) -> dict[str, Any]:
+        """The parts of a `Window`; the rows of columns are those of one window after the other."""
+        starts, pieces = self._starts(items)
         total = self.history + self.length
-        mask = np.ones((len(chosen), total), np.bool_)
+        mask = np.ones((len(items), total), np.bool_)
         if self.pad == "none":
-            columns = self.source.read_runs(self.fields, starts, total)
-            starts = starts + self.history
+            columns = self.source.read_runs(self.fields, starts - self.history, total)
         else:
             rows = starts[:, None] + np.arange(-self.history, self.length)
             inside = np.clip(rows, self._firsts[pieces, None], self._lasts[pieces, None])
@@ -135,12 +137,8 @@ class Windows:
         episodes = self._episode_ends.searchsorted(starts, side="right")
         return {"mask": mask, "steps": starts, "episodes": episodes, **columns}
 
-    def __iter__(self) -> Iterator[Window]:
-        for i in range(len(self)):
-            yield self[i]
-
     def __repr__(self) -> str:
-        return f"<{len(self)} windows of {self.length + self.history} steps>"
+        return f"<{len(self)} windows of {self.history + self.length} steps>"
 
 
 def _zeroed(column: Any, rows: Array) -> Any:

@@ -1,0 +1,100 @@
+"""What windows, transitions and delta windows have in common: items that start at a step, taken by number."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from tupli_mcap.sampling.steps import SamplingError, Steps
+
+__all__ = ["Items", "checked_count"]
+
+Array = np.ndarray[Any, Any]
+T = TypeVar("T")
+_MANY = 1 << 20
+
+
+class Items(ABC, Generic[T]):
+    """Items by number, each of which belongs to one step of an episode.
+
+    An index gives one item; a slice, or an array of numbers, a batch of them that is read together. Negative numbers
+    count from the end.
+
+    Args:
+        steps: where they are read from.
+        parameters: what makes these items differ from others of the same steps.
+    """
+
+    def __init__(self, steps: Steps, parameters: Sequence[object]) -> None:
+        self.source = steps
+        told = " ".join(map(repr, (type(self).__name__, *parameters)))
+        self.identity = hashlib.sha256(f"{steps.identity} {told}".encode()).hexdigest()
+        if not len(steps):
+            raise SamplingError(
+                "expected at least one step, found an empty dataset; its filters may leave nothing: preview() lists "
+                "the episodes"
+            )
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def steps_of(self, items: Array) -> Array:
+        """The number of the step that each of some items (int64) belongs to."""
+
+    @abstractmethod
+    def counts(self) -> Array:
+        """How many items each episode has (int64); they follow each other as the episodes do."""
+
+    @abstractmethod
+    def _one(self, item: int) -> T: ...
+
+    @abstractmethod
+    def _batch(self, items: Array) -> T: ...
+
+    def __getitem__(self, index: int | slice | Sequence[int] | Array) -> T:
+        n = len(self)
+        if isinstance(index, int | np.integer) and not isinstance(index, bool):
+            if not -n <= index < n:
+                raise IndexError(f"expected a number from 0 to {n - 1}, found {index}")
+            return self._one(int(index) % n)
+        if isinstance(index, slice):
+            return self._batch(np.arange(*index.indices(n)))
+        chosen = np.asarray(index)
+        if chosen.ndim != 1 or (chosen.dtype.kind not in "iu" and len(chosen)):
+            raise SamplingError(f"expected numbers from 0 to {n - 1} in one dimension, found {index!r:.80}")
+        chosen = chosen.astype(np.int64)
+        if len(chosen) and (chosen.min() < -n or chosen.max() >= n):
+            wrong = chosen[(chosen < -n) | (chosen >= n)][0]
+            raise IndexError(f"expected numbers from 0 to {n - 1}, found {wrong}")
+        return self._batch(np.where(chosen < 0, chosen + n, chosen))
+
+    def __iter__(self) -> Iterator[T]:
+        return map(self._one, range(len(self)))
+
+    def block_runs(self) -> tuple[Array, Array, Array]:
+        """Runs of items that lie in one block of the storage: the first item and the length of each, and its block."""
+        starts, blocks = [], []
+        for first in range(0, len(self), _MANY):
+            items = np.arange(first, min(first + _MANY, len(self)))
+            found = self.source.blocks(self.steps_of(items))
+            cuts = np.flatnonzero(np.diff(found, prepend=-1))
+            starts.append(items[cuts])
+            blocks.append(found[cuts])
+        begin = np.concatenate(starts)
+        return begin, np.diff(begin, append=len(self)), np.concatenate(blocks)
+
+
+def checked_count(value: object, least: int, what: str) -> int:
+    """The value, if it is an integer from `least` on.
+
+    Raises:
+        SamplingError: it is something else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise SamplingError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
+    return int(value)

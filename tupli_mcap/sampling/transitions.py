@@ -1,0 +1,168 @@
+"""Transitions: state, action, reward, next state; over one step or several."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.sampling.items import Items, checked_count
+from tupli_mcap.sampling.steps import SamplingError, Steps, checked_fields, map_arrays
+
+__all__ = ["TRANSITION_FIELDS", "Transition", "Transitions"]
+
+Array = np.ndarray[Any, Any]
+TRANSITION_FIELDS = ("states", "actions", "rewards", "next_states", "terminals", "timeouts")
+
+
+@dataclass(frozen=True)
+class Transition:
+    """One transition, or columns of B transitions; columns are nested as the space is, None where not asked for.
+
+    states, actions: where the transition starts.
+    rewards: the reward; over several steps the discounted sum of rewards (float).
+    next_states: the state after the last of its steps.
+    terminals, timeouts: the flags of its last step (bool).
+    discounts: what the value of `next_states` counts (float64): 0 after a terminal, else the discount to the power
+        of the number of its steps; so the target is `rewards + discounts * value(next_states)`, at timeouts too.
+    mask: False where the state after the last step was not recorded, and matters: `next_states` repeats the last state
+        that was, and the transition is better left out.
+    steps: the number of the step it starts at (int64), `episodes` the place of its episode in the query.
+    """
+
+    mask: Any
+    discounts: Any
+    steps: Any
+    episodes: Any
+    states: Any = None
+    actions: Any = None
+    rewards: Any = None
+    next_states: Any = None
+    terminals: Any = None
+    timeouts: Any = None
+
+    def asdict(self) -> dict[str, Any]:
+        """What there is, by name, without what was not asked for."""
+        named = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return {name: value for name, value in named if value is not None}
+
+
+class Transitions(Items[Transition]):
+    """The transition that starts at each step, by the number of the step.
+
+    With `n_step`, a transition is of as many steps, or of fewer where its episode (or the run of steps that a tuple
+    filter leaves) ends before. Where the state after an episode's last step was not recorded, it ends one step
+    earlier.
+
+    Raises:
+        SamplingError: an argument means nothing, a field is unknown, or rewards of variable size would be summed.
+    """
+
+    def __init__(
+        self,
+        steps: Steps,
+        n_step: int = 1,
+        discount: float = 1.0,
+        *,
+        fields: Sequence[str] = TRANSITION_FIELDS,
+    ) -> None:
+        super().__init__(steps, (n_step, discount))
+        self.n_step = checked_count(n_step, 1, "a number of steps")
+        if not isinstance(discount, int | float | np.number) or not 0 <= discount <= 1:
+            raise SamplingError(f"expected a discount from 0 to 1, found {discount!r:.80}")
+        self.discount = float(discount)
+        self.fields = tuple(checked_fields(fields, TRANSITION_FIELDS))
+        self._episode_ends = np.cumsum(steps.episode_lengths)
+        varying = steps.layout is not None and any(leaf.kind == "variable" for leaf in steps.layout.reward)
+        if self.n_step > 1 and varying and "rewards" in self.fields:
+            raise SamplingError(
+                "expected rewards that can be summed, found some of variable size; take n_step=1"
+            )
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def steps_of(self, items: Array) -> Array:
+        return items
+
+    def counts(self) -> Array:
+        return self.source.episode_lengths
+
+    def _one(self, item: int) -> Transition:
+        return Transition(**{name: _first(part) for name, part in self._read(np.array([item])).items()})
+
+    def _batch(self, items: Array) -> Transition:
+        return Transition(**self._read(items))
+
+    def _read(self, rows: Array) -> dict[str, Any]:
+        source = self.source
+        found: dict[str, Any] = {}
+        last, counts = rows, np.ones(len(rows), np.int64)
+        if self.n_step > 1:
+            last, counts, found = self._ahead(rows)
+        at_end = ("next_states", "terminals", "timeouts")
+        first = [name for name in self.fields if name not in (*at_end, *found)]
+        ends = list(dict.fromkeys(["terminals", *(name for name in self.fields if name in at_end)]))
+        if self.n_step == 1:
+            found = source.read([*first, *ends], rows)
+        else:
+            found |= source.read(first, rows) | source.read(ends, last)
+        terminals = found["terminals"]
+        unknown = _isin(last, source.open_ends) & ~terminals
+        columns = {name: found[name] for name in self.fields}
+        return {
+            "mask": ~unknown,
+            "discounts": np.where(terminals, 0.0, self.discount**counts),
+            "steps": rows,
+            "episodes": self._episode_ends.searchsorted(rows, side="right"),
+            **columns,
+        }
+
+    def _ahead(self, rows: Array) -> tuple[Array, Array, dict[str, Any]]:
+        """The last step of each transition, how many it has, and its rewards if they are asked for."""
+        source = self.source
+        breaks = source.breaks[source.breaks.searchsorted(rows)]
+        ahead = np.arange(self.n_step)
+        wanted = np.minimum(rows[:, None] + ahead, breaks[:, None])
+        names = ["terminals", *(["rewards"] if "rewards" in self.fields else [])]
+        found = source.read(names, wanted.reshape(-1))
+        over = found["terminals"].reshape(wanted.shape)
+        earlier = np.cumsum(over, axis=1) - over > 0  # a terminal lies before
+        counts = ((rows[:, None] + ahead <= breaks[:, None]) & ~earlier).sum(axis=1)
+        last = rows + counts - 1
+        over_last = over[np.arange(len(rows)), counts - 1]
+        short = (counts > 1) & _isin(last, source.open_ends) & ~over_last
+        counts, last = counts - short, last - short
+        sums: dict[str, Any] = {}
+        if "rewards" in found:
+            weights = np.where(ahead < counts[:, None], self.discount**ahead, 0.0)
+            sums["rewards"] = map_arrays(lambda part: _sum(part, weights), found["rewards"])
+        return last, counts, sums
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} transitions>"
+
+
+def _sum(rewards: Array, weights: Array) -> Array:
+    """Weighted sums of rewards (B * n, ...), with weights (B, n); floats keep their dtype, the others give float64."""
+    terms = rewards.reshape(*weights.shape, *rewards.shape[1:])
+    shaped = weights.reshape(*weights.shape, *[1] * (terms.ndim - 2))
+    sums = np.where(shaped > 0, terms * shaped, 0.0).sum(axis=1)
+    summed: Array = sums.astype(rewards.dtype if rewards.dtype.kind == "f" else np.float64)
+    return summed
+
+
+def _isin(rows: Array, ascending: Array) -> Array:
+    if not len(ascending):
+        return np.zeros(len(rows), np.bool_)
+    found: Array = ascending[np.minimum(ascending.searchsorted(rows), len(ascending) - 1)] == rows
+    return found
+
+
+def _first(column: Any) -> Any:
+    """The only row of a column."""
+    if isinstance(column, dict):
+        return {key: _first(part) for key, part in column.items()}
+    return tuple(_first(part) for part in column) if isinstance(column, tuple) else column[0]
