@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from tupli_mcap.materialized import OpenedColumns, open_columns
 from tupli_mcap.materialized.opened import VariableColumn
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.sampling.steps import FIELDS, checked_fields
+from tupli_mcap.sampling.steps import FIELDS, checked_fields, pick_runs, rows_of_runs
 
 __all__ = ["MAPPED_FIELDS", "MappedSteps"]
 
@@ -23,6 +23,17 @@ _BLOCK = 4096  # steps
 
 Array = np.ndarray[Any, Any]
 Take = Callable[[Any, Array | None], Any]
+
+
+class _Runs(NamedTuple):
+    """`length` rows from each of `starts` on."""
+
+    starts: Array
+    length: int
+
+    @property
+    def rows(self) -> Array:
+        return rows_of_runs(self.starts, self.length)
 
 
 class MappedSteps:
@@ -59,6 +70,13 @@ class MappedSteps:
         """
         return {field: self._field(field, rows) for field in checked_fields(fields, MAPPED_FIELDS)}
 
+    def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
+        """Columns of runs of steps, as of any `Steps`."""
+        return {
+            field: self._field(field, _Runs(starts, length))
+            for field in checked_fields(fields, MAPPED_FIELDS)
+        }
+
     def blocks(self, rows: Array) -> Array:
         """int64: rows of one block are close to each other."""
         return rows // _BLOCK
@@ -68,7 +86,7 @@ class MappedSteps:
         variable size, which are made anew."""
         return self._field(field, None)
 
-    def _field(self, field: str, rows: Array | None) -> Any:
+    def _field(self, field: str, rows: Array | _Runs | None) -> Any:
         opened, layout = self.opened, self.opened.layout
         if field == "states":
             return layout.nest_state([_taken(opened.leaves[leaf.name], rows) for leaf in layout.state])
@@ -77,7 +95,7 @@ class MappedSteps:
         if field == "rewards":
             return layout.nest_reward([_taken(opened.leaves[leaf.name], rows) for leaf in layout.reward])
         if field == "next_states":
-            return self._next_states(rows)
+            return self._next_states(rows.rows if isinstance(rows, _Runs) else rows)
         plain = {
             "terminals": opened.terminal, "timeouts": opened.timeout, "times": opened.time, "steps": opened.step,
         }  # fmt: skip
@@ -113,7 +131,11 @@ class MappedSteps:
         return f"<MappedSteps {self.opened.path}: {len(self)} steps of {len(self.episode_lengths)} episodes>"
 
 
-def _taken(column: Any, rows: Array | None) -> Any:
+def _taken(column: Any, rows: Array | _Runs | None) -> Any:
+    if isinstance(rows, _Runs):
+        if isinstance(column, np.ndarray):
+            return pick_runs(column, rows.starts, rows.length)
+        rows = rows.rows
     if isinstance(column, VariableColumn):
         return column[:] if rows is None else column.take(rows.tolist())
     return column if rows is None else column.take(rows, axis=0)

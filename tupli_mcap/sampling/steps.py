@@ -145,7 +145,7 @@ def rows_of_runs(starts: Array, length: int) -> Array:
 
 
 def _copy_runs(array: Array, starts: Array, length: int) -> Array:
-    width = array.strides[0] * length if array.flags.c_contiguous else 0
+    width = array.strides[0] * length if array.size and array.flags.c_contiguous else 0
     if not 0 < width < _MAX_ITEM:
         return array.take(rows_of_runs(starts, length), axis=0)
     # each run as one item: NumPy copies it at once, an order of magnitude faster than row by row
