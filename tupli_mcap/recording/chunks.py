@@ -97,6 +97,12 @@ class ChunkCache:
             while self._bytes > self.budget and len(self._kept) > 1:
                 self._bytes -= len(self._kept.popitem(last=False)[1].data)
 
+    def clear(self) -> None:
+        """Keeps nothing any more."""
+        with self._held():
+            self._kept.clear()
+            self._bytes = 0
+
     def __getstate__(self) -> dict[str, Any]:
         return {"budget": self.budget}
 

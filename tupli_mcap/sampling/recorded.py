@@ -119,6 +119,28 @@ class RecordedSteps:
         where = next(iter(self._index.images.values()), self._index.steps)
         return where.units[where.of(listed)]
 
+    @property
+    def block_bytes(self) -> int:
+        """Bytes of a chunk once it is decompressed, on average; 0 where there is none."""
+        index = self._index
+        units = next(iter(index.images.values()), index.steps)
+        sizes = [
+            index.stores[file]
+            .table["uncompressed"][units.chunk_of[units.file_of == file]]
+            .sum(dtype=np.int64)
+            for file in range(len(index.stores))
+        ]
+        return int(sum(sizes)) // max(1, len(units.chunk_of))
+
+    def limit(self, cache_bytes: int, threads: int) -> None:
+        """Forgets what is kept, and keeps to another budget, and to other threads, from now on."""
+        self.cache_bytes, self.threads = cache_bytes, threads
+        self._cache.clear()
+        for rows in self._rows:
+            if isinstance(rows, ConstantRows):
+                rows.hold(False)
+        self._share_budget()
+
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
         listed = rows if self._wanted is None else self._wanted[rows]
         return self._columns(

@@ -1,0 +1,29 @@
+"""Datasets for PyTorch's DataLoader over windows, transitions and episodes; `torch` in here is PyTorch itself."""
+
+from __future__ import annotations
+
+from tupli_mcap.errors import MissingExtraError
+
+try:
+    import torch  # noqa: F401
+except ImportError as err:
+    raise MissingExtraError(
+        "tupli_mcap.torch needs PyTorch, which is not installed; pip install 'tupli-mcap[torch]'"
+    ) from err
+
+from tupli_mcap.torch.episodes import Episodes
+from tupli_mcap.torch.items import WORKER_CACHE_BYTES, Items
+from tupli_mcap.torch.mapped import MapDataset
+from tupli_mcap.torch.stream import StreamDataset
+from tupli_mcap.torch.tensors import Samples, collate, tensors
+
+__all__ = [
+    "WORKER_CACHE_BYTES",
+    "Episodes",
+    "Items",
+    "MapDataset",
+    "Samples",
+    "StreamDataset",
+    "collate",
+    "tensors",
+]

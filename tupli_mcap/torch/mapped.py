@@ -1,0 +1,55 @@
+"""A map-style dataset: items by number, for any sampler."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from torch.utils.data import Dataset
+
+from tupli_mcap.torch.items import WORKER_CACHE_BYTES, Items, ReadItems, check_state, identity_of
+from tupli_mcap.torch.tensors import Samples
+
+__all__ = ["MapDataset"]
+
+
+class MapDataset(Dataset[dict[str, Any]]):
+    """Windows, transitions or episodes by number, as dicts of tensors (see `tensors`).
+
+        DataLoader(MapDataset(dataset.windows(32)), batch_size=256, shuffle=True, collate_fn=collate)
+
+    A batch is read at once, and `collate` hands it on as it is. PyTorch's own collate function works too, and
+    copies. Any sampler works, `DistributedSampler` too; which items it draws does not depend on the workers. Safe
+    with fork, spawn and forkserver: each worker opens the files itself.
+
+    Args:
+        items: `dataset.windows(...)`, `dataset.transitions(...)`, `Episodes(dataset.steps)`, ...
+        worker_cache_bytes: what each worker of a DataLoader keeps decoded.
+    """
+
+    def __init__(self, items: Items, *, worker_cache_bytes: int = WORKER_CACHE_BYTES) -> None:
+        self._reader = ReadItems(items, worker_cache_bytes)
+        self._identity = identity_of(items)
+
+    def __len__(self) -> int:
+        return len(self._reader.items)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return self._reader.read(int(index))
+
+    def __getitems__(self, indices: Sequence[int]) -> Samples:
+        """The items of a batch, read together."""
+        return Samples(self._reader.read(np.asarray(indices, np.int64)), len(indices))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Says which items these are; where an epoch stands, the sampler knows."""
+        return {"items": self._identity}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Checks that the state is one of the same items.
+
+        Raises:
+            SamplingError: it is another's.
+        """
+        check_state(state_dict, self._identity, {})

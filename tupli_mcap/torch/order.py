@@ -1,0 +1,163 @@
+"""In which order an epoch goes through its items: shuffled, and still near each other on the disk.
+
+The blocks (chunks) of the items are shuffled, and laid out as one sequence, of which each rank has its part, and each
+stream of a rank a part of that. Within a stream, the items of `mix` blocks at a time are shuffled. Batch b of a rank is
+number b // streams of stream b % streams, as a DataLoader takes batches from its workers in turn: each of `streams`
+workers reads blocks of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.torch.items import Items
+
+__all__ = ["Batches", "Blocks", "Part", "blocks_of"]
+
+Array = np.ndarray[Any, Any]
+_AT_A_TIME = 1 << 20  # items
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Items by the block their first step lies in, all int64.
+
+    Run i holds the items from `starts[i]` to `stops[i] - 1`; those of block k are runs `firsts[k]` to
+    `firsts[k + 1] - 1`.
+    """
+
+    starts: Array
+    stops: Array
+    firsts: Array
+
+    def __len__(self) -> int:
+        return len(self.firsts) - 1
+
+    @property
+    def sizes(self) -> Array:
+        """Items of each block."""
+        return np.add.reduceat(self.stops - self.starts, self.firsts[:-1])
+
+    def items(self, block: int) -> Array:
+        """The items of a block."""
+        runs = slice(int(self.firsts[block]), int(self.firsts[block + 1]))
+        sizes = self.stops[runs] - self.starts[runs]
+        found: Array = np.arange(sizes.sum()) + np.repeat(self.starts[runs] - np.cumsum(sizes) + sizes, sizes)
+        return found
+
+
+def blocks_of(items: Items, least: int) -> Blocks:
+    """The blocks of items, and neighbours joined as long as there are fewer than `least` items in them together."""
+    total = len(items)
+    starts, kinds = [], []
+    for first in range(0, total, _AT_A_TIME):
+        numbers = np.arange(first, min(first + _AT_A_TIME, total))
+        found = items.source.blocks(items.first_steps(numbers))
+        changes = np.concatenate([[0], np.flatnonzero(found[1:] != found[:-1]) + 1])
+        starts.append(numbers[changes])
+        kinds.append(found[changes])
+    begins, kind = np.concatenate(starts), np.concatenate(kinds)
+    stops = np.append(begins[1:], total)
+    order = np.argsort(kind, kind="stable")
+    begins, stops, kind = begins[order], stops[order], kind[order]
+    firsts = np.concatenate([[0], np.flatnonzero(kind[1:] != kind[:-1]) + 1])
+    sizes = np.add.reduceat(stops - begins, firsts)
+    joined = (np.cumsum(sizes) - sizes) // max(1, least)  # blocks that begin in the same `least` items
+    kept = np.concatenate([[True], joined[1:] != joined[:-1]])
+    return Blocks(begins, stops, np.append(firsts[kept], len(begins)))
+
+
+class Part(NamedTuple):
+    """Which of the batches are meant: those of one of `ranks`, in `streams` streams."""
+
+    rank: int
+    ranks: int
+    streams: int
+
+
+class Batches:
+    """The batches of one rank in one epoch: batch b is an array of numbers of items (int64).
+
+    Args:
+        key: what the order is drawn from (non-negative integers); None for the order of the items.
+        mix: blocks whose items are mixed.
+        drop_last: only full batches, and as many in every rank.
+    """
+
+    def __init__(
+        self,
+        blocks: Blocks | None,
+        total: int,
+        size: int,
+        part: Part,
+        key: Sequence[int] | None,
+        mix: int,
+        drop_last: bool,
+    ) -> None:
+        self._blocks, self._key, self._mix = blocks, key, mix
+        self._size = size
+        first = total * part.rank // part.ranks
+        count = total * (part.rank + 1) // part.ranks - first
+        if drop_last:
+            count = total // part.ranks // size * size
+        self._count = -(-count // size)
+        self._streams = part.streams if key is not None else 1
+        self._bounds = first + _stream_bounds(count, size, self._streams)
+        self._group: tuple[int, int, Array] = (0, 0, np.empty(0, np.int64))
+        if blocks is not None and key is not None:
+            self._order = np.random.default_rng(key).permutation(len(blocks))
+            self._ends = np.cumsum(blocks.sizes[self._order])
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, batch: int) -> Array:
+        stream, place = batch % self._streams, batch // self._streams
+        start = int(self._bounds[stream]) + place * self._size
+        stop = min(start + self._size, int(self._bounds[stream + 1]))
+        if self._key is None:
+            return np.arange(start, stop)
+        parts = []
+        while start < stop:
+            low, high, items = self._mixed(start, stream)
+            end = min(stop, high)
+            parts.append(items[start - low : end - low])
+            start = end
+        return np.concatenate(parts)
+
+    def _mixed(self, place: int, stream: int) -> tuple[int, int, Array]:
+        """The places of the mixed blocks that a place of the stream lies in, and their items in the order drawn."""
+        low, high, items = self._group
+        if not low <= place < high:
+            begin, end = int(self._bounds[stream]), int(self._bounds[stream + 1])
+            first = int(np.searchsorted(self._ends, begin, side="right"))
+            at = int(np.searchsorted(self._ends, place, side="right"))
+            group = first + (at - first) // self._mix * self._mix
+            low = max(begin, int(self._ends[group - 1]) if group else 0)
+            high = min(end, int(self._ends[min(group + self._mix, len(self._ends)) - 1]))
+            items = np.random.default_rng([*(self._key or ()), low]).permutation(self._laid_out(low, high))
+            self._group = low, high, items
+        return low, high, items
+
+    def _laid_out(self, low: int, high: int) -> Array:
+        """The items at places `low` to `high - 1` of the shuffled blocks."""
+        if self._blocks is None:
+            raise AssertionError("only known blocks are shuffled")
+        first = int(np.searchsorted(self._ends, low, side="right"))
+        last = int(np.searchsorted(self._ends, high, side="left"))
+        found = np.concatenate([self._blocks.items(int(k)) for k in self._order[first : last + 1]])
+        before = int(self._ends[first - 1]) if first else 0
+        return found[low - before : high - before]
+
+
+def _stream_bounds(count: int, size: int, streams: int) -> Array:
+    """Where the streams begin and end, so that batch b is in stream b % streams and only the last one is not full."""
+    batches = -(-count // size)
+    full = np.array([len(range(stream, batches, streams)) for stream in range(streams)], np.int64) * size
+    if batches:
+        full[(batches - 1) % streams] -= batches * size - count
+    return np.concatenate([[0], np.cumsum(full)])

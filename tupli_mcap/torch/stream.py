@@ -1,0 +1,205 @@
+"""An iterable dataset: batches in a shuffled order that reads each chunk once, over workers and ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import IterableDataset, get_worker_info
+
+from tupli_mcap.sampling import SamplingError
+from tupli_mcap.torch.items import WORKER_CACHE_BYTES, Items, ReadItems, check_state, identity_of
+from tupli_mcap.torch.order import Batches, Blocks, Part, blocks_of
+
+__all__ = ["StreamDataset"]
+
+_CHUNK_BYTES = 256 << 10  # where nobody knows
+
+
+class StreamDataset(IterableDataset[dict[str, Any]]):
+    """Whole batches of windows, transitions or episodes, as dicts of tensors (see `tensors`).
+
+        DataLoader(StreamDataset(dataset.windows(32), 256, seed=0), batch_size=None, num_workers=2, collate_fn=collate)
+
+    With a shuffle, chunks are read in a random order, and the items of many chunks at a time are mixed: each chunk is
+    read about once an epoch. (`MapDataset` with `shuffle=True` is the exact shuffle.) Every item comes once an epoch,
+    in one of the ranks and one of the workers. `state_dict` says where the epoch stands, to the next batch: used by
+    torchdata's `StatefulDataLoader`, with as many workers as before, or by hand where there is none.
+
+    The same seed, epoch and number of workers give the same order. The number of workers does not matter without a
+    shuffle, nor as long as it divides `streams`, where that is given; else each worker reads chunks of its own.
+
+    Args:
+        items: `dataset.windows(...)`, `dataset.transitions(...)`, `Episodes(dataset.steps)`, ...
+        batch_size: items of a batch; the last one of an epoch has what is left.
+        seed: the order, together with `set_epoch`, without which it is the same in each epoch, as in PyTorch's
+            DistributedSampler. None draws another one each time from PyTorch's own random numbers
+            (`torch.manual_seed`), and is for one rank only.
+        drop_last: only full batches, and as many in every rank, as gradients that are averaged over ranks need.
+        rank, ranks: which part of the items; by default that of `torch.distributed`, if it has been initialised.
+        streams: how many parts the order consists of; the number of workers, by default.
+        worker_cache_bytes: what each worker keeps decoded; chunks of half as much are mixed.
+
+    Raises:
+        SamplingError: a number means nothing.
+    """
+
+    def __init__(
+        self,
+        items: Items,
+        batch_size: int,
+        *,
+        shuffle: bool = True,
+        seed: int | None = None,
+        drop_last: bool = False,
+        rank: int | None = None,
+        ranks: int | None = None,
+        streams: int | None = None,
+        worker_cache_bytes: int = WORKER_CACHE_BYTES,
+    ) -> None:
+        self._reader = ReadItems(items, worker_cache_bytes)
+        self._size, self._drop_last, self._seed = _least(batch_size, 1, "a batch size"), drop_last, seed
+        self._rank, self._ranks = _place(rank, ranks)
+        self._streams = None if streams is None else _least(streams, 1, "a number of streams")
+        if seed is not None:
+            _least(seed, 0, "a seed")
+        elif shuffle and self._ranks > 1:
+            raise SamplingError("expected a seed, which all ranks share, found None with several ranks")
+        self._identity = identity_of(items)
+        self._mix = 1
+        self._blocks: Blocks | None = None
+        if shuffle:
+            self._mix, self._blocks = _mixing(items, worker_cache_bytes)
+        self._epoch = torch.zeros((), dtype=torch.int64)
+        self._epoch.share_memory_()  # type: ignore[no-untyped-call]  # workers that persist see it change
+        self._drawn: tuple[int, int] | None = None  # a worker's seed, and how often it has gone through
+        self._loaded: dict[str, Any] | None = None
+        self._state = self._state_of(None, 0)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Says which epoch begins with the next iteration; another number is another order.
+
+        Raises:
+            SamplingError: it is no integer from 0.
+        """
+        self._epoch.fill_(_least(epoch, 0, "a number of an epoch"))
+
+    def __len__(self) -> int:
+        """Batches of an epoch in this rank."""
+        return len(self._batches(None, 1))
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        info = get_worker_info()
+        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
+        key = self._key(None if info is None else info.seed - info.id)
+        state, self._loaded = self._loaded, None
+        done = 0
+        if state is not None:
+            check_state(state, self._identity, self._options(workers))
+            key, done = state["key"] or key, state["batches"]  # no key: saved before the first iteration
+        self._state = self._state_of(key, done)
+        return self._read(key, done, worker, workers)
+
+    def _read(self, key: list[int] | None, done: int, worker: int, workers: int) -> Iterator[dict[str, Any]]:
+        batches = self._batches(key, workers)
+        for number in range(worker + done * workers, len(batches), workers):
+            batch = self._reader.read(batches[number])
+            done += 1
+            self._state = self._state_of(key, done)
+            yield batch
+
+    def _batches(self, key: list[int] | None, workers: int) -> Batches:
+        streams = self._streams or workers
+        if streams % workers:
+            raise SamplingError(
+                f"expected a number of workers that divides streams={streams}, found {workers} workers"
+            )
+        part = Part(self._rank, self._ranks, streams)
+        total = len(self._reader.items)
+        return Batches(self._blocks, total, self._size, part, key, self._mix, self._drop_last)
+
+    def _key(self, worker_seed: int | None) -> list[int] | None:
+        """What this epoch's order is drawn from."""
+        if self._blocks is None:
+            return None
+        if self._seed is not None:
+            return [self._seed, int(self._epoch)]
+        if worker_seed is None:
+            return [int(torch.empty((), dtype=torch.int64).random_())]
+        before = self._drawn
+        passes = before[1] + 1 if before is not None and before[0] == worker_seed else 0
+        self._drawn = worker_seed, passes  # the seed stays the same in workers that persist
+        return [worker_seed, passes]
+
+    # ---- where an epoch stands
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the epoch stands, in this process: what `load_state_dict` goes on from."""
+        return dict(self._state)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """The next iteration goes on from there, in the order of that epoch.
+
+        Raises:
+            SamplingError: the state is of another dataset, or of other options; the iteration raises it where the
+                number of workers is another.
+        """
+        info = get_worker_info()
+        workers = state_dict.get("workers") if isinstance(state_dict, dict) and info is None else None
+        check_state(
+            state_dict, self._identity, self._options(info.num_workers if info is not None else workers)
+        )
+        self._loaded = self._state = dict(state_dict)
+
+    def _options(self, workers: Any) -> dict[str, Any]:
+        return {
+            "batch_size": self._size,
+            "shuffle": self._blocks is not None,
+            "drop_last": self._drop_last,
+            "rank": self._rank,
+            "ranks": self._ranks,
+            "streams": self._streams,
+            "workers": workers,
+            "mix": self._mix,
+        }
+
+    def _state_of(self, key: list[int] | None, done: int) -> dict[str, Any]:
+        info = get_worker_info()
+        workers = 1 if info is None else info.num_workers
+        return {"items": self._identity, **self._options(workers), "key": key, "batches": done}
+
+
+def _mixing(items: Items, cache_bytes: int) -> tuple[int, Blocks]:
+    """How many blocks are mixed at a time, and the blocks, of one or several chunks: what is mixed fits into half of
+    the cache, and little is read twice because items of one block go on in the next."""
+    chunk_bytes = getattr(items.source, "block_bytes", 0) or _CHUNK_BYTES
+    chunks = max(4, cache_bytes // 2 // chunk_bytes)
+    single = blocks_of(items, 1)
+    items_of_chunk = len(items) / len(single)
+    steps = getattr(items, "length", 1) + getattr(items, "history", 0)  # of an item, about
+    least = int(min(2 * steps, chunks * items_of_chunk / 4))
+    blocks = blocks_of(items, least) if least > items_of_chunk else single
+    return max(2, chunks * len(blocks) // len(single)), blocks
+
+
+def _place(rank: int | None, ranks: int | None) -> tuple[int, int]:
+    if (rank is None) != (ranks is None):
+        raise SamplingError(
+            f"expected rank and ranks, or neither of them, found rank={rank!r}, ranks={ranks!r}"
+        )
+    if rank is None or ranks is None:
+        distributed = torch.distributed
+        if not (distributed.is_available() and distributed.is_initialized()):
+            return 0, 1
+        rank, ranks = distributed.get_rank(), distributed.get_world_size()
+    if not 0 <= _least(rank, 0, "a rank") < _least(ranks, 1, "a number of ranks"):
+        raise SamplingError(f"expected a rank from 0 to {ranks - 1}, found {rank}")
+    return rank, ranks
+
+
+def _least(value: int, least: int, what: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise SamplingError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
+    return int(value)
