@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -404,3 +405,43 @@ def test_padding_is_zero_where_rows_are_left_out(tmp_path: Path) -> None:
     with path.open("rb") as file:
         for _, _, message in make_reader(file).iter_messages(topics=["/env_0/step", "/env_1/step"]):
             assert not np.frombuffer(message.data, np.uint8)[4:][~used[BODY:]].any()
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_half_whose_chunks_are_not_written_yet_is_in_the_journal(tmp_path: Path, compression: str) -> None:
+    space = spaces.Box(-1, 1, (250,), np.float64)  # some 30 rows a half
+    path, copied = tmp_path / "r.mcap", tmp_path / "killed.mcap"
+    env = RecordEpisodes(make(space, None), path, compression=compression)
+    add = env._writer.container.add_prepared
+    env._writer.container.add_prepared = lambda chunks: None  # type: ignore[method-assign]
+    taken = run(env, None, 50)  # more than a half, less than two
+    env._writer.container.add_prepared = add  # type: ignore[method-assign]
+    shutil.copy(path, copied)
+    shutil.copy(f"{path}.journal", f"{copied}.journal")
+    recording = check(copied, taken)
+    assert not recording.complete
+    assert recording.num_steps == sum(len(steps) for episodes in taken for steps in episodes) > 3 * 31
+
+
+def test_many_large_metadata_end_at_one_step(tmp_path: Path) -> None:
+    """Ends of one step go to the journal together, but not without bound."""
+
+    class Long(EpisodeMetadataCallback):
+        def reset(self) -> None: ...
+
+        def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+            return {"text": "long " * 9000}
+
+    inner = SyncVectorEnv([lambda: Sampler(SPACES["box"], SPACES["discrete"], length=4)] * 20)
+    with RecordEpisodes(inner, tmp_path / "r.mcap", metadata_callback=Long()) as env:
+        env.reset(seed=1)
+        for _ in range(12):
+            env.step(env.action_space.sample())
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert len(recording.episodes) == 60
+        assert all(
+            e.metadata == {"text": "long " * 9000} for e in recording.episodes if e.end != "interrupted"
+        )
+        with (tmp_path / "r.mcap").open("rb") as file:
+            chunks = make_reader(file).get_summary().chunk_indexes  # type: ignore[union-attr]
+        assert max(chunk.uncompressed_size for chunk in chunks) <= 512 * 1024

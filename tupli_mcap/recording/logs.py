@@ -123,20 +123,20 @@ class EventLog:
             self._time = time_ns
         else:
             time_ns = self._time
-        end = self._position
+        end = self._position + BODY * len(messages)
         for _, body in messages:
-            end += BODY + len(body)
+            end += len(body)
         if end > self._capacity:
             end -= self._position
             self.flush()
-        data, sequences, groups, channel = b"", self.sequences, self._groups, 0
+        data, sequences, groups, channel = [], self.sequences, self._groups, 0
         for channel, body in messages:
             sequence = sequences[channel]
             sequences[channel] = sequence + 1
             front = _FRONT.pack(5, BODY - 9 + len(body), channel, sequence, time_ns)
             tail = CDR_HEADER + body
             record = front + crc32(tail, crc32(front)).to_bytes(8, "little") + tail
-            data += record
+            data.append(record)
             group = groups.get(channel)
             if group is None:
                 groups[channel] = (sequence, [record], [time_ns])
@@ -148,7 +148,7 @@ class EventLog:
             self._can_drop = False
             return time_ns
         self._last, self._last_channel, self._can_drop = self._position, channel, True
-        self._records[self._last : end] = data
+        self._records[self._last : end] = b"".join(data)
         self._position = end
         self._commit[0] = end
         return time_ns

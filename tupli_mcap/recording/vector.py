@@ -20,6 +20,7 @@ from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.exact import decide_dtype, leaf_value, shorten
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.batches import EndedEpisode, StartingEpisode, end_episodes, start_episodes
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.logs import Encoder, StepLog, leaf_encoders
@@ -61,11 +62,12 @@ class VectorRecorder:
         self._numbers = np.zeros(
             (num_envs, 2), dtype=np.uint32
         )  # of the running episodes: number, steps so far
-        self._lengths = self._numbers[:, 1]
+        self._episode_numbers, self._lengths = self._numbers[:, 0], self._numbers[:, 1]
         self._totals: Array = np.zeros(num_envs)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._any_ended = False
         self._everybody = np.ones(num_envs, dtype=np.bool_)
+        self._nobody = ~self._everybody
         self._texts = ["{}"] * num_envs
         self._was_reset = False
         self._refused = False
@@ -89,8 +91,8 @@ class VectorRecorder:
     def _reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None) -> None:
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
         ended = self._ended.copy()
+        self._end([(int(i), INTERRUPTED) for i in chosen])
         for i in chosen:
-            self._end(int(i), INTERRUPTED)
             self._replace_facts(int(i), facts[int(i)])
             ended[int(i)] = False
         self._writer.sync_step()  # before the running states are written over
@@ -167,8 +169,8 @@ class VectorRecorder:
             rewards, terminals, timeouts = self._numbers_of(rewards, terminals, timeouts)
             if self._writer.vector is None:
                 self._begin(actions, states, rewards)
-            done = terminals | timeouts
-            any_done = bool(done.any())
+            any_done = bool(np.count_nonzero(terminals) or np.count_nonzero(timeouts))
+            done = terminals | timeouts if any_done else self._nobody
             holes = self._ended if self._any_ended and self._autoreset == "NextStep" else None
             active = None if holes is None else ~holes
             finals = self._finals(done, infos) if any_done and self._autoreset == "SameStep" else {}
@@ -185,8 +187,8 @@ class VectorRecorder:
         self._lengths += active
         self._totals += totals * active
         self._note_resets(~active, infos)
-        self._ended = done & active
-        self._any_ended = bool(self._ended.any())
+        self._ended = done & active if any_done else done
+        self._any_ended = any_done and bool(np.count_nonzero(self._ended))
         return active
 
     def _numbers_of(self, rewards: Any, terminals: Any, timeouts: Any) -> tuple[Array, Array, Array]:
@@ -211,8 +213,8 @@ class VectorRecorder:
         if not self._any_ended or self._writer.failed is not None:
             return
         with self._writer.whole:
-            for i in np.flatnonzero(self._ended).tolist():
-                self._end(i, TERMINAL if terminals[i] else TIMEOUT)
+            ended = self._ended.nonzero()[0].tolist()
+            self._end([(i, TERMINAL if terminals[i] else TIMEOUT) for i in ended])
             if self._autoreset == "SameStep":
                 self._note_resets(self._ended, infos)
                 self._any_ended = False
@@ -281,23 +283,42 @@ class VectorRecorder:
 
     def _start(self, active: Array | None) -> None:
         waiting = sorted(i for i in self._waiting if active is None or active[i])
+        if not waiting:
+            return
+        starting: list[StartingEpisode] = []
         for i in waiting:
-            facts = self._facts[i]
+            facts, self._facts[i] = self._facts[i], None
             if facts is None:  # stepped on after an end, without a reset
                 facts = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
-            for earlier in self._earlier[i]:
-                self._writer.start_episode(i, self._count(i), earlier)
-                self._writer.keep_start()
-            self._earlier[i] = []
-            episode = self._writer.start_episode(i, self._count(i), facts)
-            self._episodes[i] = episode
-            self._facts[i] = None
-            self._numbers[i] = episode.number, 0
-            self._totals[i] = 0.0
-            if isinstance(self._writer.vector, list):
-                self._writer.vector[i].begin_episode(episode.number)
-        self._waiting -= set(waiting)
+            if self._earlier[i] or i in self._writer.lost_streams:
+                self._started(start_episodes(self._writer, starting))
+                starting = []
+                for earlier in self._earlier[i]:
+                    self._writer.start_episode(i, self._count(i), earlier)
+                    self._writer.keep_start()
+                self._earlier[i] = []
+                self._started([self._writer.start_episode(i, self._count(i), facts)])
+            else:
+                starting.append(StartingEpisode(i, self._count(i), facts))
+        self._started(start_episodes(self._writer, starting))
+        self._waiting.difference_update(waiting)
         self._fresh = bool(self._waiting)
+
+    def _started(self, episodes: Sequence[StartedEpisode]) -> None:
+        numbers, lengths, totals, store = (
+            self._episode_numbers,
+            self._lengths,
+            self._totals,
+            self._writer.vector,
+        )
+        for episode in episodes:
+            i = episode.env
+            self._episodes[i] = episode
+            numbers[i] = episode.number
+            lengths[i] = 0
+            totals[i] = 0.0
+            if isinstance(store, list):
+                store[i].begin_episode(episode.number)
 
     def _count(self, i: int) -> int:
         store = self._writer.vector
@@ -317,7 +338,7 @@ class VectorRecorder:
         store = self._writer.vector
         ends = {i: self._encode_final(state) for i, state in finals.items()}
         if isinstance(store, VectorRows):
-            images = self._check_images(states)
+            images = self._check_images(states) if self._writer.images else []
             batch = store.check(actions, states, rewards)
             if self._fresh:
                 self._start(active)
@@ -373,30 +394,38 @@ class VectorRecorder:
         return bytes(out[8:])
 
     def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
-        now = time.time_ns()
-        for i in np.flatnonzero(holes).tolist():
+        plain = ResetFacts(None, None, "", "{}", time.time_ns())
+        for i in holes.nonzero()[0].tolist():
             info = info_of(infos, i, self._n) if infos else None
-            text = jsonvalue.dumps_any(info) if info else "{}"
-            self._facts[i] = ResetFacts(None, None, "", text, now)
+            self._facts[i] = plain._replace(info=jsonvalue.dumps_any(info)) if info else plain
         self._fresh = True
 
     # ---- ends
 
-    def _end(self, i: int, end: int) -> None:
-        episode, self._episodes[i] = self._episodes[i], None
-        text, self._texts[i] = self._texts[i], "{}"
-        if episode is None:
-            return
-        self._fresh = True
-        self._waiting.add(i)
-        length, total = int(self._lengths[i]), float(self._totals[i])
-        if i in self._final_rows:
-            self._writer.end_episode(episode, end, length, total, None, text, self._final_rows.pop(i))
-            return
+    def _end(self, ends: Iterable[tuple[int, int]]) -> None:
+        """Ends the running episodes of sub-environments: (sub-environment, how)."""
+        ended = []
+        for i, how in ends:
+            episode, self._episodes[i] = self._episodes[i], None
+            text, self._texts[i] = self._texts[i], "{}"
+            if episode is None:
+                continue
+            self._fresh = True
+            self._waiting.add(i)
+            facts = episode, how, int(self._lengths[i]), float(self._totals[i])
+            if i in self._final_rows:
+                ended.append(EndedEpisode(*facts, None, text, self._final_rows.pop(i)))
+            else:
+                ended.append(EndedEpisode(*facts, self._pending_state(i), text))
+        if ended:
+            end_episodes(self._writer, ended)
+
+    def _pending_state(self, i: int) -> bytes:
         store: Any = self._writer.vector
-        final = store.pending_state(i) if isinstance(store, VectorRows) else store[i].pending_state()
-        final += b"".join(sinks[i].pending() for sinks in self._writer.images)
-        self._writer.end_episode(episode, end, length, total, final, text)
+        final: bytes = store.pending_state(i) if isinstance(store, VectorRows) else store[i].pending_state()
+        for sinks in self._writer.images:
+            final += sinks[i].pending()
+        return final
 
     @property
     def is_running(self) -> bool:
@@ -427,9 +456,7 @@ class VectorRecorder:
         if self._writer.failed is not None or self._writer.closed:
             return
         with self._writer.whole:
-            for i in range(self._n):
-                if self._episodes[i] is not None and self._lengths[i]:
-                    self._end(i, INTERRUPTED)
+            self._end([(i, INTERRUPTED) for i in range(self._n) if self._lengths[i]])
 
     def close(self) -> None:
         """Ends the running episodes as interrupted and closes the recording."""
@@ -438,8 +465,7 @@ class VectorRecorder:
         try:
             if self._writer.failed is None:
                 with self._writer.whole:
-                    for i in range(self._n):
-                        self._end(i, INTERRUPTED)
+                    self._end([(i, INTERRUPTED) for i in range(self._n)])
         finally:
             self._refused = True
             self._writer.close()

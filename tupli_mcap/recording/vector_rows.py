@@ -156,8 +156,9 @@ class VectorRows:
 
     def pending_state(self, i: int) -> bytes:
         """The CDR bytes of a sub-environment's running state, as they follow `episode` and `env` in `/final_state`."""
-        data: bytes = self._state_bytes[self._half, i, self._row, BODY + 8 : self._state_end].tobytes()
-        return data
+        area = self._area
+        start = self._half * area.half + i * area.block + self._row * area.row_size
+        return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
 
     def _seal(self, active: Array | None) -> None:
         size = self._area.row_size

@@ -41,11 +41,18 @@ from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.worker import ChunkWorker
 from tupli_mcap.system import refused
 
-__all__ = ["FORMAT_VERSION", "RECORDING_METADATA", "RecordingWriter", "ResetFacts", "StartedEpisode"]
+__all__ = [
+    "EPISODE_AND_ENV",
+    "FORMAT_VERSION",
+    "RECORDING_METADATA",
+    "RecordingWriter",
+    "ResetFacts",
+    "StartedEpisode",
+]
 
 FORMAT_VERSION = "1"
 RECORDING_METADATA = "tupli_mcap.recording"
-_NUMBERS = struct.Struct("<II")
+EPISODE_AND_ENV = struct.Struct("<II")
 LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
 
 
@@ -275,7 +282,7 @@ class RecordingWriter:
             now = events.append(now, (channels.end, message))
         else:
             final_row = sequences[channels.final_state]
-            body = _NUMBERS.pack(number, env) + final_state
+            body = EPISODE_AND_ENV.pack(number, env) + final_state
             now = events.append(now, (channels.final_state, body), (channels.end, message))
         self.index.add(
             (first_row, length, total, episode.start_time, now, episode.seed, episode.start_row, end_row, final_row,
@@ -288,7 +295,7 @@ class RecordingWriter:
         """Writes `/final_state` ahead of the step that ends the episodes; returns the first one's row."""
         channel, events = self.channels.final_state, self._events()
         row = events.sequences[channel]
-        pack = _NUMBERS.pack
+        pack = EPISODE_AND_ENV.pack
         events.append(time.time_ns(), *[(channel, pack(e.number, e.env) + final) for e, final in finals])
         return row
 
@@ -314,7 +321,7 @@ class RecordingWriter:
         self._warn_if_deleted()
 
     def _start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], None]:
-        """Begins to compress chunks, on the worker's thread; the result waits for that and writes them.
+        """Begins to compress and write chunks, on the worker's thread; the result waits until they are in the file.
 
         Until then their memory must stay, and no other chunk of their channels be written.
         """
@@ -322,17 +329,15 @@ class RecordingWriter:
             self._check_room(rows)
         container = self.container
         with self.whole:
-            prepared = [container.prepare(rows) for rows in chunks]
-            job = partial(container.pack_all, [chunk.data for chunk in prepared])
+            job = partial(container.add_prepared, [container.prepare(rows) for rows in chunks])
             # a thread that needs the interpreter lock for every chunk would wait for it again and again
-            result = self.worker.submit(job).result if container.packs_together else job
+            written = self.worker.submit(job).result if container.packs_together else job
 
         def finish() -> None:
             if self.failed is not None:
                 raise self.failed
             with self.whole:
-                for chunk, packed in zip(prepared, result(), strict=True):
-                    container.place(chunk, packed)
+                written()
                 if self._durable:
                     self._settle()
             self._warn_if_deleted()
