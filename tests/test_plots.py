@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -217,6 +218,24 @@ def test_the_two_dimensions_that_vary_most(tmp_path: Path) -> None:
     )
     assert most_varying(measured(path), 2) == [(0, 3), (0, 2)]
     assert most_varying(measured(path)) == [(0, 3), (0, 2), (0, 0)]  # the constant one is none
+
+
+def test_numbers_on_an_axis_stand_apart(tmp_path: Path) -> None:
+    path = scripted(
+        tmp_path / "r.mcap",
+        lambda n: np.full(2, -0.1 * (n % 3)),
+        spaces.Box(-1, 1, (2,), np.float64),
+        length=3,
+    )
+    made = report(path)
+    made.png()  # places the labels
+    for axes in made.figure.axes:
+        shown = [label for label in axes.get_xticklabels() if label.get_text() and label.get_visible()]
+        low, high = sorted(axes.get_xlim())
+        boxes = [at.get_window_extent() for at in shown if low <= at.get_position()[0] <= high]
+        boxes.sort(key=lambda box: box.x0)
+        for left, right in itertools.pairwise(boxes):
+            assert left.x1 + 5 < right.x0, (axes.get_title(), [at.get_text() for at in shown])
 
 
 def test_lines_of_one_axis_have_about_one_size() -> None:

@@ -86,6 +86,7 @@ def _draw_map(
         norm=LogNorm(least, max(most, least * 10)),
     )  # fmt: skip
     axes.grid(False)
+    axes.locator_params(axis="x", nbins=6)  # numbers such as -0.175 beside each other
     names = [measured.states[leaf].names[i] for leaf, i in pair]
     axes.set_xlabel(cut(names[0], 40))
     axes.set_ylabel(cut(names[1], 26))

@@ -116,7 +116,7 @@ def _draw_histogram(axes: Any, dimension: Dimension) -> None:
         if beyond:
             text += f"; {beyond:,} beyond"
         axes.set_xlabel(text, color=GREY, fontsize=7.5)
-    axes.locator_params(axis="x", nbins=5)
+    axes.locator_params(axis="x", nbins=4)
     axes.locator_params(axis="y", nbins=4)
 
 
