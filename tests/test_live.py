@@ -130,6 +130,19 @@ def shown(path: Path, entity: str, component: str = "Scalars:scalars") -> tuple[
     return np.array(rows), values
 
 
+def last_card(path: Path) -> str:
+    """What a receiver was told last of the rollout as a whole."""
+    from rerun.chunk import RrdReader
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        chunks = [chunk for chunk in RrdReader(path).stream() if chunk.entity_path == "/card"]
+    batches = sorted(
+        (c.to_record_batch() for c in chunks), key=lambda b: b.column("rerun.controls.RowId")[0].as_py()
+    )
+    return str(batches[-1].column("TextDocument:text").to_pylist()[-1][0])
+
+
 # ---- what is looked at
 
 
@@ -222,6 +235,7 @@ def test_rerun_is_sent_what_is_recorded(tmp_path: Path) -> None:
         states = recording.read().states
     assert len(rows) == 300
     assert np.array_equal(np.array(values, np.float32), states[rows])
+    assert last_card(tmp_path / "r.rrd").split("\n")[2] == "recorded"  # it is over, and stays in the window
 
 
 def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:

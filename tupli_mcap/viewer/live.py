@@ -148,7 +148,7 @@ class LivePicture:
         self._returns = [*self._returns, *ended["return"].tolist()][-_BARS:]
         self._lengths = [*self._lengths, *ended["length"].tolist()][-_BARS:]
         if time.monotonic() >= self._next_overview or watcher.is_over:
-            self._send_overview(stream)
+            self._send_overview(stream, "recorded" if watcher.is_over else "being recorded")
             self._next_overview = time.monotonic() + _EVERY
 
     def _leave_out(self, stream: Any, after: NewSteps) -> None:
@@ -262,10 +262,10 @@ class LivePicture:
         )
         return _Columns(layout.nest_state(states), layout.nest_action(actions), layout.nest_reward(rewards))
 
-    def _send_overview(self, stream: Any) -> None:
+    def _send_overview(self, stream: Any, state: str) -> None:
         import rerun as rr
 
-        lines = [f"### {plain(self._title)}", "", "being recorded", ""]
+        lines = [f"### {plain(self._title)}", "", state, ""]
         if self._episodes:
             mean = float(np.mean(self._returns))
             lines.append(
