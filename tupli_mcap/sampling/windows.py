@@ -137,13 +137,6 @@ class Windows(Items[Window]):
         episodes = self._episode_ends.searchsorted(starts, side="right")
         return {"mask": mask, "steps": starts, "episodes": episodes, **columns}
 
-    def first_steps(self, numbers: Array) -> Array:
-        """The number of the first step, history included, in each of some windows (int64); nothing is read."""
-        pieces = np.searchsorted(self._ends, numbers, side="right")
-        before = np.where(pieces > 0, self._ends[pieces - 1], 0)
-        starts: Array = self._firsts[pieces] + (numbers - before) * self.stride
-        return starts
-
     def __repr__(self) -> str:
         return f"<{len(self)} windows of {self.history + self.length} steps>"
 

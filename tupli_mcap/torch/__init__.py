@@ -12,7 +12,7 @@ except ImportError as err:
     ) from err
 
 from tupli_mcap.torch.episodes import Episodes
-from tupli_mcap.torch.items import WORKER_CACHE_BYTES, Items
+from tupli_mcap.torch.items import WORKER_CACHE_BYTES
 from tupli_mcap.torch.mapped import MapDataset
 from tupli_mcap.torch.stream import StreamDataset
 from tupli_mcap.torch.tensors import Samples, collate, tensors
@@ -20,7 +20,6 @@ from tupli_mcap.torch.tensors import Samples, collate, tensors
 __all__ = [
     "WORKER_CACHE_BYTES",
     "Episodes",
-    "Items",
     "MapDataset",
     "Samples",
     "StreamDataset",

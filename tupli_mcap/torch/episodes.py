@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.sampling import SamplingError, Steps, Window
+from tupli_mcap.sampling import Items, Steps, Window
 from tupli_mcap.sampling.steps import checked_fields, map_arrays
 from tupli_mcap.sampling.windows import FIVE
 
@@ -16,47 +16,47 @@ __all__ = ["Episodes"]
 Array = np.ndarray[Any, Any]
 
 
-class Episodes:
+class Episodes(Items[Window]):
     """The episodes that have a step, by number: an index gives a `Window` of all its steps.
 
     An array of numbers gives a `Window` of shape (B, T), T being the longest of them; the shorter ones are filled up
-    with zero (None in a list), and `mask` is False there. Raises SamplingError: there is no step.
+    with zero (None in a list), and `mask` is False there. Raises SamplingError: there is no step, or no such field.
     """
 
     def __init__(self, steps: Steps, *, fields: Sequence[str] = FIVE) -> None:
-        self.source = steps
+        super().__init__(steps, ())
         self.fields = tuple(checked_fields(fields))
-        ends = np.cumsum(steps.episode_lengths)
-        self._numbers = np.flatnonzero(steps.episode_lengths)
+        self._counts = np.minimum(steps.episode_lengths, 1)
+        self._numbers = np.flatnonzero(self._counts)
         self._lengths = steps.episode_lengths[self._numbers]
-        self._firsts = ends[self._numbers] - self._lengths
-        self.length = len(steps) // max(1, len(self))  # on average
-        if not len(self):
-            raise SamplingError("expected an episode with a step, found none; look at the filters")
+        self._firsts = np.cumsum(self._lengths) - self._lengths
+        self.length = len(steps) // len(self)  # on average
 
     def __len__(self) -> int:
         return len(self._numbers)
 
-    def first_steps(self, numbers: Array) -> Array:
-        """The number of the first step of each of some episodes (int64); nothing is read."""
-        found: Array = self._firsts[numbers]
+    def steps_of(self, items: Array) -> Array:
+        found: Array = self._firsts[items]
         return found
 
-    def __getitem__(self, index: int | Sequence[int] | Array) -> Window:
-        numbers = np.asarray(index, np.int64)
-        if numbers.size and not (-len(self) <= numbers.min() and numbers.max() < len(self)):
-            raise IndexError(f"expected episodes from 0 to {len(self) - 1}, found {index!r:.80}")
-        firsts, lengths = self._firsts[numbers], self._lengths[numbers]
-        if not numbers.ndim:
-            rows = firsts + np.arange(int(lengths))
-            columns = self.source.read(self.fields, rows)
-            return Window(np.ones(len(rows), np.bool_), firsts, self._numbers[numbers], **columns)
+    def counts(self) -> Array:
+        return self._counts
+
+    def _one(self, item: int) -> Window:
+        length = int(self._lengths[item])
+        columns = self.source.read(self.fields, self._firsts[item] + np.arange(length))
+        return Window(np.ones(length, np.bool_), self._firsts[item], self._numbers[item], **columns)
+
+    def _batch(self, items: Array) -> Window:
+        firsts, lengths = self._firsts[items], self._lengths[items]
         places = np.arange(lengths.max(initial=0))
         mask = places < lengths[:, None]
-        rows = (firsts[:, None] + places)[mask]
-        found = self.source.read(self.fields, rows)
+        found = self.source.read(self.fields, (firsts[:, None] + places)[mask])
         columns = {name: _spread(column, mask) for name, column in found.items()}
-        return Window(mask, firsts, self._numbers[numbers], **columns)
+        return Window(mask, firsts, self._numbers[items], **columns)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} episodes>"
 
 
 def _spread(column: Any, mask: Array) -> Any:

@@ -1,44 +1,19 @@
-"""What datasets for PyTorch are made of: anything that gives one item for a number, and a batch for several."""
+"""Items (windows, transitions, episodes) as tensors, and the state dicts of datasets of them."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
 from torch.utils.data import get_worker_info
 
-from tupli_mcap.sampling import SamplingError, Steps
+from tupli_mcap.sampling import Items, SamplingError
 from tupli_mcap.torch.tensors import tensors
 
-__all__ = ["WORKER_CACHE_BYTES", "Items", "ReadItems", "check_state", "identity_of"]
+__all__ = ["WORKER_CACHE_BYTES", "ReadItems", "check_state"]
 
 WORKER_CACHE_BYTES = 64 << 20
-Array = np.ndarray[Any, Any]
-
-
-class Item(Protocol):
-    """Columns of one item, or of several."""
-
-    def asdict(self) -> dict[str, Any]: ...
-
-
-class Items(Protocol):
-    """`dataset.windows(...)` and its kin, by number: an array of numbers gives a batch, read together."""
-
-    @property
-    def source(self) -> Steps: ...
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, index: Any) -> Item: ...
-
-    def first_steps(self, numbers: Array) -> Array:
-        """The first step of each of some items; nothing is read."""
-        ...
 
 
 @runtime_checkable
@@ -51,7 +26,7 @@ class Caching(Protocol):
 class ReadItems:
     """Reads items as tensors; in a DataLoader's worker within a budget (bytes) of its own, and with one thread."""
 
-    def __init__(self, items: Items, worker_cache_bytes: int) -> None:
+    def __init__(self, items: Items[Any], worker_cache_bytes: int) -> None:
         self.items = items
         self._worker_cache_bytes = worker_cache_bytes
         self._limited_in = 0  # the worker process that keeps to the budget
@@ -64,13 +39,6 @@ class ReadItems:
                 self.items.source.limit(self._worker_cache_bytes, 1)
         found: dict[str, Any] = tensors(self.items[index].asdict())
         return found
-
-
-def identity_of(items: Items) -> str:
-    """A digest of which items these are: the same steps, cut in the same way."""
-    options = {name: value for name, value in vars(items).items() if name[0] != "_" and name != "source"}
-    told = json.dumps([type(items).__name__, options, len(items), items.source.identity], default=repr)
-    return hashlib.sha256(told.encode()).hexdigest()
 
 
 def check_state(state: Any, identity: str, expected: Mapping[str, Any]) -> None:

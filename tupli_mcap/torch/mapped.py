@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from torch.utils.data import Dataset
 
-from tupli_mcap.torch.items import WORKER_CACHE_BYTES, Items, ReadItems, check_state, identity_of
+from tupli_mcap.sampling import Items
+from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.tensors import Samples
 
 __all__ = ["MapDataset"]
@@ -28,9 +29,8 @@ class MapDataset(Dataset[dict[str, Any]]):
         worker_cache_bytes: what each worker of a DataLoader keeps decoded.
     """
 
-    def __init__(self, items: Items, *, worker_cache_bytes: int = WORKER_CACHE_BYTES) -> None:
+    def __init__(self, items: Items[Any], *, worker_cache_bytes: int = WORKER_CACHE_BYTES) -> None:
         self._reader = ReadItems(items, worker_cache_bytes)
-        self._identity = identity_of(items)
 
     def __len__(self) -> int:
         return len(self._reader.items)
@@ -44,7 +44,7 @@ class MapDataset(Dataset[dict[str, Any]]):
 
     def state_dict(self) -> dict[str, Any]:
         """Says which items these are; where an epoch stands, the sampler knows."""
-        return {"items": self._identity}
+        return {"items": self._reader.items.identity}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Checks that the state is one of the same items.
@@ -52,4 +52,4 @@ class MapDataset(Dataset[dict[str, Any]]):
         Raises:
             SamplingError: it is another's.
         """
-        check_state(state_dict, self._identity, {})
+        check_state(state_dict, self._reader.items.identity, {})

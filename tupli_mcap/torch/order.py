@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.torch.items import Items
+from tupli_mcap.sampling import Items
 
 __all__ = ["Batches", "Blocks", "Part", "blocks_of"]
 
 Array = np.ndarray[Any, Any]
-_AT_A_TIME = 1 << 20  # items
 
 
 @dataclass(frozen=True)
@@ -50,18 +49,10 @@ class Blocks:
         return found
 
 
-def blocks_of(items: Items, least: int) -> Blocks:
+def blocks_of(items: Items[Any], least: int) -> Blocks:
     """The blocks of items, and neighbours joined as long as there are fewer than `least` items in them together."""
-    total = len(items)
-    starts, kinds = [], []
-    for first in range(0, total, _AT_A_TIME):
-        numbers = np.arange(first, min(first + _AT_A_TIME, total))
-        found = items.source.blocks(items.first_steps(numbers))
-        changes = np.concatenate([[0], np.flatnonzero(found[1:] != found[:-1]) + 1])
-        starts.append(numbers[changes])
-        kinds.append(found[changes])
-    begins, kind = np.concatenate(starts), np.concatenate(kinds)
-    stops = np.append(begins[1:], total)
+    begins, lengths, kind = items.block_runs()
+    stops = begins + lengths
     order = np.argsort(kind, kind="stable")
     begins, stops, kind = begins[order], stops[order], kind[order]
     firsts = np.concatenate([[0], np.flatnonzero(kind[1:] != kind[:-1]) + 1])

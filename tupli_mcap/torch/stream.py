@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
-from tupli_mcap.sampling import SamplingError
-from tupli_mcap.torch.items import WORKER_CACHE_BYTES, Items, ReadItems, check_state, identity_of
+from tupli_mcap.sampling import Items, SamplingError
+from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.order import Batches, Blocks, Part, blocks_of
 
 __all__ = ["StreamDataset"]
@@ -48,7 +48,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
 
     def __init__(
         self,
-        items: Items,
+        items: Items[Any],
         batch_size: int,
         *,
         shuffle: bool = True,
@@ -67,7 +67,6 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             _least(seed, 0, "a seed")
         elif shuffle and self._ranks > 1:
             raise SamplingError("expected a seed, which all ranks share, found None with several ranks")
-        self._identity = identity_of(items)
         self._mix = 1
         self._blocks: Blocks | None = None
         if shuffle:
@@ -97,7 +96,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         state, self._loaded = self._loaded, None
         done = 0
         if state is not None:
-            check_state(state, self._identity, self._options(workers))
+            check_state(state, self._reader.items.identity, self._options(workers))
             key, done = state["key"] or key, state["batches"]  # no key: saved before the first iteration
         self._state = self._state_of(key, done)
         return self._read(key, done, worker, workers)
@@ -149,7 +148,9 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         info = get_worker_info()
         workers = state_dict.get("workers") if isinstance(state_dict, dict) and info is None else None
         check_state(
-            state_dict, self._identity, self._options(info.num_workers if info is not None else workers)
+            state_dict,
+            self._reader.items.identity,
+            self._options(info.num_workers if info is not None else workers),
         )
         self._loaded = self._state = dict(state_dict)
 
@@ -168,17 +169,19 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
     def _state_of(self, key: list[int] | None, done: int) -> dict[str, Any]:
         info = get_worker_info()
         workers = 1 if info is None else info.num_workers
-        return {"items": self._identity, **self._options(workers), "key": key, "batches": done}
+        return {"items": self._reader.items.identity, **self._options(workers), "key": key, "batches": done}
 
 
-def _mixing(items: Items, cache_bytes: int) -> tuple[int, Blocks]:
+def _mixing(items: Items[Any], cache_bytes: int) -> tuple[int, Blocks]:
     """How many blocks are mixed at a time, and the blocks, of one or several chunks: what is mixed fits into half of
     the cache, and little is read twice because items of one block go on in the next."""
     chunk_bytes = getattr(items.source, "block_bytes", 0) or _CHUNK_BYTES
     chunks = max(4, cache_bytes // 2 // chunk_bytes)
     single = blocks_of(items, 1)
     items_of_chunk = len(items) / len(single)
-    steps = getattr(items, "length", 1) + getattr(items, "history", 0)  # of an item, about
+    steps = getattr(items, "length", 1) + getattr(
+        items, "history", 0
+    )  # of an item, if there are more than a few
     least = int(min(2 * steps, chunks * items_of_chunk / 4))
     blocks = blocks_of(items, least) if least > items_of_chunk else single
     return max(2, chunks * len(blocks) // len(single)), blocks
