@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import os
 import pickle
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from environments import same
@@ -14,14 +20,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_sampling import SPACES, record
 
-from tupli_mcap import TupliDataset
+from tupli_mcap import F, FormatError, RecordEpisodes, Recording, TupliDataset
+from tupli_mcap.sampling import SamplingError
 
 torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader, DistributedSampler, default_collate  # noqa: E402
+from torchdata.stateful_dataloader import StatefulDataLoader  # noqa: E402
 
 from tupli_mcap.torch import Episodes, MapDataset, StreamDataset, collate  # noqa: E402
 from tupli_mcap.torch.order import Batches, Blocks, Part  # noqa: E402
 
+pytestmark = pytest.mark.filterwarnings("ignore:'set_vital' is deprecated:UserWarning")  # torchdata's
 SMALL = 20_000  # bytes: a few chunks of what `record` writes
 
 
@@ -233,3 +242,248 @@ def test_without_a_shuffle_workers_do_not_matter(dataset: TupliDataset) -> None:
     stream = StreamDataset(windows, 32, shuffle=False)
     loader = DataLoader(stream, batch_size=None, num_workers=2, collate_fn=collate)
     assert all_of(loader) == all_of(stream) == windows[:].steps.tolist()
+
+
+def test_transitions_with_several_steps(dataset: TupliDataset) -> None:
+    items = dataset.transitions(3, 0.9)
+    batches = list(DataLoader(StreamDataset(items, 50, seed=0), None, collate_fn=collate))
+    for batch in batches:
+        assert same(as_numpy(batch), items[batch["steps"].numpy()].asdict())
+    assert sorted(all_of(batches)) == list(range(len(items)))
+
+
+# ---- resuming
+
+
+def stream_of(dataset: TupliDataset, seed: int | None) -> StreamDataset:
+    return StreamDataset(dataset.windows(2), 32, seed=seed, worker_cache_bytes=SMALL)
+
+
+def resumable(stream: StreamDataset, workers: int) -> Any:
+    return StatefulDataLoader(stream, batch_size=None, num_workers=workers, collate_fn=collate)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("seed", [None, 0])
+@settings(max_examples=4)
+@given(data=st.data())
+def test_a_resumed_run_goes_on_with_the_next_batch(
+    dataset: TupliDataset, workers: int, seed: int | None, data: st.DataObject
+) -> None:
+    stream = stream_of(dataset, seed)
+    stream.set_epoch(2)
+    stop = data.draw(st.integers(1, len(stream)))
+    loader = resumable(stream, workers)
+    shown: list[list[int]] = []
+    state: bytes = b""
+    for batch in loader:
+        shown.append(batch["steps"].tolist())
+        if len(shown) == stop:
+            state = pickle.dumps(loader.state_dict())
+    resumed = resumable(stream_of(dataset, seed), workers)
+    resumed.load_state_dict(pickle.loads(state))
+    assert numbers(resumed) == shown[stop:]
+    following = all_of(resumed)
+    assert sorted(following) == sorted(dataset.windows(2)[:].steps.tolist())
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_shuffled_map_resumes(dataset: TupliDataset, workers: int) -> None:
+    windows = dataset.windows(2)
+
+    def loader() -> Any:
+        return StatefulDataLoader(
+            MapDataset(windows), batch_size=64, shuffle=True, num_workers=workers, collate_fn=collate
+        )
+
+    torch.manual_seed(0)
+    first = loader()
+    batches = iter(first)
+    for _ in range(3):
+        next(batches)
+    state = first.state_dict()
+    rest = numbers(batches)
+    resumed = loader()
+    resumed.load_state_dict(state)
+    assert numbers(resumed) == rest != []
+
+
+def test_state_dicts_without_a_loader(dataset: TupliDataset) -> None:
+    stream = stream_of(dataset, 0)
+    batches = iter(stream)
+    for _ in range(4):
+        next(batches)
+    state = stream.state_dict()
+    resumed = stream_of(dataset, 0)
+    resumed.load_state_dict(state)
+    assert numbers(resumed) == numbers(batches) != []
+    assert numbers(resumed) == numbers(stream)  # the next epoch, from its beginning
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("kind", [StreamDataset, MapDataset])
+def test_a_state_dict_of_another_dataset_is_refused(dataset: TupliDataset, workers: int, kind: Any) -> None:
+    def loader(items: Any) -> Any:
+        if kind is StreamDataset:
+            return StatefulDataLoader(StreamDataset(items, 32), None, num_workers=workers)
+        return StatefulDataLoader(MapDataset(items), 32, num_workers=workers, collate_fn=collate)
+
+    first = loader(dataset.windows(2))
+    next(iter(first))
+    other = loader(dataset.with_episode_filter(F("n_tuples") > 5).windows(2))
+    other.load_state_dict(first.state_dict())
+    with pytest.raises(
+        SamplingError, match="expected a state dict of the same items, found one of another dataset"
+    ):
+        next(iter(other))
+
+
+def test_state_dicts_of_other_options_are_refused(dataset: TupliDataset) -> None:
+    state = stream_of(dataset, 0).state_dict()
+    windows = dataset.windows(2)
+    with pytest.raises(SamplingError, match="expected a state dict with batch_size=8, found 32"):
+        StreamDataset(windows, 8, worker_cache_bytes=SMALL).load_state_dict(state)
+    with pytest.raises(SamplingError, match="expected a state dict with ranks=2, found 1"):
+        StreamDataset(windows, 32, seed=0, rank=0, ranks=2, worker_cache_bytes=SMALL).load_state_dict(state)
+    with pytest.raises(SamplingError, match="expected the state dict of such a dataset, with items"):
+        stream_of(dataset, 0).load_state_dict({"step": 3})
+    other = stream_of(dataset, 0)
+    other.load_state_dict({**state, "workers": 2})
+    with pytest.raises(SamplingError, match="expected a state dict with workers=1, found 2"):
+        next(iter(other))
+
+
+# ---- ranks
+
+RANK = """
+import json, sys
+import torch
+from torch.utils.data import DataLoader, DistributedSampler
+from tupli_mcap import TupliDataset
+from tupli_mcap.torch import MapDataset, StreamDataset, collate
+
+rank, meeting, files = int(sys.argv[1]), sys.argv[2], sys.argv[3:]
+torch.distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=2)
+items = TupliDataset.from_files(files).transitions(fields=["rewards"])
+mapped, stream = MapDataset(items), StreamDataset(items, 16, seed=0)
+loaders = [
+    DataLoader(mapped, 16, sampler=DistributedSampler(mapped, seed=1), collate_fn=collate),
+    DataLoader(stream, None, num_workers=1, collate_fn=collate),
+]
+total = torch.zeros(())
+for batch in loaders[0]:
+    total += batch["rewards"].sum()
+torch.distributed.all_reduce(total)
+found = [[step for batch in loader for step in batch["steps"].tolist()] for loader in loaders]
+print(json.dumps([total.item(), *found]))
+torch.distributed.destroy_process_group()
+"""
+
+
+def test_two_ranks_share_an_epoch(tmp_path: Path) -> None:
+    files = [str(record(tmp_path / f"{i}.mcap", SPACES["box"], 80)) for i in range(2)]
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-c", RANK, str(rank), str(tmp_path / "meeting"), *files], stdout=subprocess.PIPE
+        )
+        for rank in range(2)
+    ]
+    told = [json.loads(rank.communicate(timeout=200)[0]) for rank in ranks]
+    rewards = TupliDataset.from_files(files).rewards
+    assert told[0][0] == told[1][0] == pytest.approx(rewards.sum())
+    for loader in (1, 2):
+        assert sorted(told[0][loader] + told[1][loader]) == list(range(160))
+
+
+# ---- what goes wrong
+
+
+def test_a_worker_that_is_killed_is_told(dataset: TupliDataset) -> None:
+    loader = DataLoader(stream_of(dataset, 0), batch_size=None, num_workers=1, collate_fn=collate)
+    batches = iter(loader)
+    next(batches)
+    os.kill(batches._workers[0].pid, signal.SIGKILL)
+    with pytest.raises(
+        RuntimeError, match=r"DataLoader worker \(pid.* (is killed by signal|exited unexpectedly)"
+    ):
+        list(batches)
+
+
+def test_a_damaged_file_is_told_by_workers(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", SPACES["box"], 400)
+    stream = StreamDataset(TupliDataset.from_files(path).windows(2), 32, seed=0)
+    damaged = bytearray(path.read_bytes())
+    start = int(Recording(path).stored.store.table["offset"][0])
+    damaged[start + 60] ^= 255
+    path.write_bytes(damaged)
+    loader = DataLoader(stream, batch_size=None, num_workers=1, collate_fn=collate)
+    with pytest.raises(FormatError, match=r"a\.mcap: chunk at offset"):
+        list(loader)
+
+
+def test_numbers_that_mean_nothing(dataset: TupliDataset) -> None:
+    windows = dataset.windows(2)
+    with pytest.raises(SamplingError, match="expected a batch size that is an integer from 1, found 0"):
+        StreamDataset(windows, 0)
+    with pytest.raises(SamplingError, match="expected rank and ranks, or neither of them, found rank=1"):
+        StreamDataset(windows, 4, seed=0, rank=1)
+    with pytest.raises(SamplingError, match="expected a rank from 0 to 1, found 2"):
+        StreamDataset(windows, 4, seed=0, rank=2, ranks=2)
+    with pytest.raises(SamplingError, match="expected a seed, which all ranks share, found None"):
+        StreamDataset(windows, 4, rank=1, ranks=2)
+    with pytest.raises(SamplingError, match="a number of workers that divides streams=3, found 2"):
+        list(DataLoader(StreamDataset(windows, 4, streams=3), None, num_workers=2))
+    with pytest.raises(
+        SamplingError, match="expected a number of an epoch that is an integer from 0, found -1"
+    ):
+        stream_of(dataset, 0).set_epoch(-1)
+    empty = dataset.with_episode_filter(F("n_tuples") > 1000)
+    with pytest.raises(SamplingError, match="expected at least one step, found an empty dataset"):
+        MapDataset(Episodes(empty.steps))
+
+
+def test_without_pytorch_the_extra_is_named() -> None:
+    code = "import sys; sys.modules['torch'] = None\nimport tupli_mcap.torch"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "MissingExtraError: tupli_mcap.torch needs PyTorch" in done.stderr
+    assert "pip install 'tupli-mcap[torch]'" in done.stderr
+
+
+@pytest.mark.filterwarnings("ignore:'pin_memory' argument is set as true but no accelerator:UserWarning")
+def test_batches_go_through_the_pinning_thread(dataset: TupliDataset) -> None:
+    stream = stream_of(dataset, 0)
+    loader = DataLoader(stream, None, num_workers=1, collate_fn=collate, pin_memory=True)
+    assert numbers(loader) == numbers(stream)
+
+
+# ---- training
+
+
+def test_a_policy_learns_from_recorded_episodes(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "expert.mcap") as env:
+        state, _ = env.reset(seed=0)
+        for _ in range(2000):
+            state, _, terminal, timeout, _ = env.step(int(state[2] + 0.3 * state[3] > 0))
+            if terminal or timeout:
+                state, _ = env.reset()
+    dataset = TupliDataset.from_files(tmp_path / "expert.mcap")
+    torch.manual_seed(0)
+    policy = torch.nn.Linear(4, 2)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=0.05)
+    stream = StreamDataset(dataset.transitions(fields=["states", "actions"]), 64, seed=0)
+    for epoch in range(6):
+        stream.set_epoch(epoch)
+        for batch in DataLoader(stream, batch_size=None, collate_fn=collate):
+            loss = torch.nn.functional.cross_entropy(policy(batch["states"]), batch["actions"])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    test = gym.make("CartPole-v1")
+    state, _ = test.reset(seed=1)
+    steps, over = 0, False
+    while not over:
+        action = int(policy(torch.from_numpy(state)).argmax())
+        state, _, terminal, timeout, _ = test.step(action)
+        steps, over = steps + 1, terminal or timeout
+    assert steps > 150  # at random, about 20
