@@ -158,6 +158,9 @@ class Episode:
     def to_rerun(self, stream: Any = None) -> Any:
         """Sends the episode and a blueprint into a `rerun.RecordingStream`, by default a new one; returns it.
 
+        Its steps are numbered from 0, so give each episode a stream of its own; `tupli_mcap.viewer.send` sends several
+        into one, after each other.
+
         Raises:
             MissingExtraError: rerun-sdk is not installed.
         """

@@ -124,8 +124,8 @@ def to_window(plans: Iterable[Plan]) -> int:
     program = viewer_program()
     if not has_display():
         raise ViewerError(
-            "there is no display to open the viewer on; write a file with --save FILE.rrd, or look in a browser "
-            "with --web"
+            "there is no display to open the viewer on; write a file with --save FILE.rrd (in Python: save=), or look "
+            "in a browser with --web (tupli_mcap.viewer.serve)"
         )
     port = free_port()
     with scratch() as folder, (folder / "log").open("wb") as log:
