@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.pieces import Pieces, Runs, final_runs
 
-__all__ = ["FIELDS", "ColumnReader", "Columns", "Run", "runs_of"]
+__all__ = ["FIELDS", "ColumnReader", "Columns"]
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
 _TIME = "#log_time"
@@ -46,51 +48,6 @@ class Columns:
         return int(self.episode_lengths.sum())
 
 
-class Run(NamedTuple):
-    """Consecutive rows of a channel that go to consecutive places in the columns."""
-
-    channel: int
-    first: int
-    steps: int
-    out: int
-
-
-class Piece(NamedTuple):
-    """Rows `begin:end` of a chunk, and where they go."""
-
-    begin: int
-    end: int
-    out: int
-
-
-def runs_of(episodes: Array, channels: Sequence[int]) -> list[Run]:
-    """The runs of the given index rows, in their order; neighbours that continue each other are one run."""
-    if not len(episodes):
-        return []
-    lengths = episodes["length"].astype(np.int64)
-    first = episodes["first_row"].astype(np.int64)
-    env = episodes["env"].astype(np.int64)
-    if env.max() >= len(channels):
-        raise FormatError(f"an episode names sub-environment {env.max()}, but there are {len(channels)}")
-    out = np.cumsum(lengths) - lengths
-    breaks = np.flatnonzero((env[1:] != env[:-1]) | (first[1:] != first[:-1] + lengths[:-1])) + 1
-    starts = np.concatenate([[0], breaks])
-    ends = np.concatenate([breaks, [len(episodes)]])
-    totals = np.concatenate([[0], np.cumsum(lengths)])
-    return [
-        Run(channels[int(env[a])], int(first[a]), int(totals[b] - totals[a]), int(out[a]))
-        for a, b in zip(starts, ends, strict=True)
-    ]
-
-
-def _final_runs(episodes: Array, channel: int) -> list[Run]:
-    """The runs of the final states of index rows in `/final_state`."""
-    rows = episodes["final_row"].astype(np.int64)
-    starts = np.flatnonzero(np.diff(rows, prepend=-2) != 1)
-    ends = np.append(starts[1:], len(rows))
-    return [Run(channel, int(rows[a]), int(b - a), int(a)) for a, b in zip(starts, ends, strict=True)]
-
-
 class ColumnReader:
     """Reads columns of a recording's layout."""
 
@@ -102,7 +59,7 @@ class ColumnReader:
 
     def read(
         self,
-        runs: Sequence[Run],
+        runs: Runs,
         total: int,
         fields: Sequence[str],
         threads: int,
@@ -143,7 +100,7 @@ class ColumnReader:
             self._decode(runs, plain, out)
         for leaf in leaves:
             if leaf.kind == "image" and leaf.name not in skipped:
-                moved = [run._replace(channel=self._images[leaf.name][run.channel]) for run in runs]
+                moved = runs._replace(channels=self._image_channels(leaf.name, runs.channels))
                 tasks += self._tasks(
                     moved, ["data"], {"data": out[leaf.name]}, layout.image_messages[leaf.name].dtype, keep
                 )
@@ -171,50 +128,34 @@ class ColumnReader:
             return [None] * total
         return np.empty((total, *leaf.shape), self._layout.dtypes[leaf.name])
 
+    def _image_channels(self, name: str, channels: Array) -> Array:
+        found, places = np.unique(channels, return_inverse=True)
+        return np.array([self._images[name][channel] for channel in found.tolist()], np.int64)[places]
+
     def _tasks(
-        self, runs: Sequence[Run], names: list[str], out: dict[str, Any], dtype: Any, keep: bool
+        self, runs: Runs, names: Sequence[str], out: Mapping[str, Any], dtype: Any, keep: bool
     ) -> list[Callable[[], None]]:
-        pieces: dict[int, list[Piece]] = {}
-        for run in runs:
-            place = run.out
-            for span in self._store.spans(run.channel, run.first, run.steps):
-                pieces.setdefault(span.chunk, []).append(Piece(span.begin, span.end, place))
-                place += span.end - span.begin
-        return [self._task(chunk, parts, names, out, dtype, keep) for chunk, parts in pieces.items()]
+        targets = [(name, out[name]) for name in names]
 
-    def _task(
-        self, chunk: int, pieces: list[Piece], names: list[str], out: dict[str, Any], dtype: Any, keep: bool
-    ) -> Callable[[], None]:
-        def copy() -> None:
-            rows = self._store.rows(chunk, dtype, keep=keep)
-            if len(pieces) <= 4:
-                for name in names:
-                    source, target = rows[name], out[name]
-                    for begin, end, place in pieces:
-                        target[place : place + end - begin] = _shaped(source[begin:end], target)
-                return
-            sizes = np.array([piece.end - piece.begin for piece in pieces])
-            steps = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-            source_rows = np.repeat([piece.begin for piece in pieces], sizes) + steps
-            places = np.repeat([piece.out for piece in pieces], sizes) + steps
-            for name in names:
-                out[name][places] = _shaped(rows[name][source_rows], out[name])
+        def copy(pieces: Pieces) -> None:
+            pieces.copy(self._store.rows(pieces.chunk, dtype, keep=keep), targets)
 
-        return copy
+        return [partial(copy, pieces) for pieces in Pieces.of(runs, self._store)]
 
-    def _decode(self, runs: Sequence[Run], names: list[str], out: dict[str, Any]) -> None:
+    def _decode(self, runs: Runs, names: list[str], out: dict[str, Any]) -> None:
         if self._decoder is None:
             raise RecordingError("a constant layout is not decoded message by message")
-        for run in runs:
-            for i, body in enumerate(self._store.bodies(run.channel, run.first, run.steps)):
+        for channel, first, steps, place in runs.each():
+            for i, body in enumerate(self._store.bodies(channel, first, steps)):
                 values = self._decoder.step(body)
                 for name in names:
-                    out[name][run.out + i] = values[name]
+                    out[name][place + i] = values[name]
 
-    def _read_times(self, runs: Sequence[Run], out: Array) -> None:
-        for run in runs:
-            times = self._store.times(run.channel, run.first, run.steps)
-            out[run.out : run.out + run.steps] = np.fromiter(times, np.uint64, run.steps)
+    def _read_times(self, runs: Runs, out: Array) -> None:
+        for channel, first, steps, place in runs.each():
+            out[place : place + steps] = np.fromiter(
+                self._store.times(channel, first, steps), np.uint64, steps
+            )
 
     def final_columns(self, channel: int, episodes: Array) -> list[Any]:
         """A column of final states for each leaf of the state, of index rows that all have one."""
@@ -230,7 +171,7 @@ class ColumnReader:
         numbers = np.empty(len(episodes), np.uint32)
         names = [leaf.name for leaf in self._layout.state if leaf.size] + ["episode"]
         for task in self._tasks(
-            _final_runs(episodes, channel),
+            final_runs(episodes, channel),
             names,
             {**out, "episode": numbers},
             self._layout.final_message.dtype,
@@ -275,10 +216,3 @@ class ColumnReader:
                     ]
             found.append(values)
         return found
-
-
-def _shaped(values: Array, target: Array) -> Array:
-    """One-element dimensions of a structured field may be folded; the target's shape says what is meant."""
-    return (
-        values if values.shape[1:] == target.shape[1:] else values.reshape((len(values), *target.shape[1:]))
-    )

@@ -20,12 +20,13 @@ from tupli_mcap.messages.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.claims import EPISODE_TOPICS, check_episodes
-from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns, Run, runs_of
+from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns
 from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.frames import Cameras, Frames
 from tupli_mcap.recording.infos import InfoDecoder
+from tupli_mcap.recording.pieces import Runs, runs_of
 from tupli_mcap.recording.signed import SIGNATURE_NAME, voucher
 from tupli_mcap.recording.source import open_source
 from tupli_mcap.recording.stored import StoredSteps
@@ -451,9 +452,9 @@ class Recording:
                 f"{self.name}: expected steps from 0 to {row['length']}, found {start}:{stop}"
             )
         channel = self._step_channels[int(row["env"])]
-        run = Run(channel, int(row["first_row"]) + start, count, 0)
+        run = Runs.one(channel, int(row["first_row"]) + start, count)
         columns = Columns(np.array([count]))
-        for field, values in self._reader.read([run], count, fields, 1, True, images).items():
+        for field, values in self._reader.read(run, count, fields, 1, True, images).items():
             setattr(columns, field, values)
         return columns
 

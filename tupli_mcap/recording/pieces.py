@@ -1,0 +1,141 @@
+"""Which rows of which chunks go where: runs of rows, cut at the chunks, and copied a chunk at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.chunks import ChunkStore
+
+__all__ = ["Pieces", "Runs", "final_runs", "runs_of"]
+
+Array = np.ndarray[Any, Any]
+_FEW = 4  # so many pieces are copied one by one
+
+
+class Runs(NamedTuple):
+    """Consecutive rows of a channel each, which go to the columns one run after the other; all arrays are int64."""
+
+    channels: Array
+    first: Array
+    steps: Array
+
+    @classmethod
+    def one(cls, channel: int, first: int, steps: int) -> Runs:
+        return cls(*(np.array([value], np.int64) for value in (channel, first, steps)))
+
+    @property
+    def starts(self) -> Array:
+        """Where each run goes to in the columns."""
+        starts: Array = np.cumsum(self.steps) - self.steps
+        return starts
+
+    def each(self) -> Iterator[tuple[int, int, int, int]]:
+        """Channel, first row, number of rows, and where they go, of one run after the other."""
+        parts = (self.channels, self.first, self.steps, self.starts)
+        return zip(*(part.tolist() for part in parts), strict=True)
+
+
+def runs_of(episodes: Array, channels: Sequence[int]) -> Runs:
+    """The runs of index rows, in their order; neighbours that continue each other are one run.
+
+    Args:
+        channels: that of each sub-environment.
+
+    Raises:
+        FormatError: an episode is of another sub-environment.
+    """
+    env = episodes["env"].astype(np.int64)
+    if len(env) and env.max() >= len(channels):
+        raise FormatError(f"an episode names sub-environment {env.max()}, but there are {len(channels)}")
+    lengths = episodes["length"].astype(np.int64)
+    return _joined(np.array(channels, np.int64)[env], episodes["first_row"].astype(np.int64), lengths)
+
+
+def final_runs(episodes: Array, channel: int) -> Runs:
+    """The runs of the final states of index rows in `/final_state`."""
+    rows = episodes["final_row"].astype(np.int64)
+    return _joined(np.full_like(rows, channel), rows, np.ones_like(rows))
+
+
+def _joined(channels: Array, first: Array, steps: Array) -> Runs:
+    if not len(first):
+        return Runs(channels, first, steps)
+    breaks = (channels[1:] != channels[:-1]) | (first[1:] != first[:-1] + steps[:-1])
+    starts = np.concatenate([[0], np.flatnonzero(breaks) + 1])
+    return Runs(channels[starts], first[starts], np.add.reduceat(steps, starts))
+
+
+class Pieces(NamedTuple):
+    """Parts of a chunk: `steps[i]` rows from `begin[i]` on (ascending), which go to `out[i]` on. All int64."""
+
+    chunk: int
+    begin: Array
+    steps: Array
+    out: Array
+
+    @classmethod
+    def of(cls, runs: Runs, store: ChunkStore) -> list[Pieces]:
+        """The pieces of some runs, one for each chunk.
+
+        Raises:
+            FormatError: there are no such rows.
+        """
+        starts, found = runs.starts, []
+        for channel in np.unique(runs.channels).tolist():
+            chosen = np.flatnonzero(runs.channels == channel)
+            located = store.locate(channel, runs.first[chosen], runs.steps[chosen])
+            if not len(located.chunk):
+                continue
+            # Within its run, a piece comes after those before it.
+            before = np.cumsum(located.steps) - located.steps
+            new = np.diff(located.run, prepend=-1) != 0
+            out = starts[chosen[located.run]] + before - before[np.flatnonzero(new)][np.cumsum(new) - 1]
+            found += _by_chunk(located.chunk, located.begin, located.steps, out)
+        return found
+
+    def copy(self, rows: Array, targets: Sequence[tuple[str, Array]]) -> None:
+        """Copies fields of the chunk's rows to columns."""
+        if len(self.begin) <= _FEW:
+            for begin, steps, out in zip(*(part.tolist() for part in self[1:]), strict=True):
+                for name, target in targets:
+                    target[out : out + steps] = _shaped(rows[name][begin : begin + steps], target)
+            return
+        source, places = _indexes(self.begin, self.steps), _indexes(self.out, self.steps)
+        if isinstance(source, slice) or len(targets) == 1:
+            for name, target in targets:
+                target[places] = _shaped(rows[name][source], target)
+            return
+        picked = rows.take(source)  # whole rows: one walk through the chunk instead of one a field
+        for name, target in targets:
+            target[places] = _shaped(picked[name], target)
+
+
+def _by_chunk(chunks: Array, begin: Array, steps: Array, out: Array) -> list[Pieces]:
+    order = np.lexsort((begin, chunks))
+    chunks, begin, steps, out = chunks[order], begin[order], steps[order], out[order]
+    firsts = np.flatnonzero(np.diff(chunks, prepend=-1))
+    ends = np.append(firsts[1:], len(chunks))
+    return [
+        Pieces(int(chunks[a]), begin[a:b], steps[a:b], out[a:b])
+        for a, b in zip(firsts.tolist(), ends.tolist(), strict=True)
+    ]
+
+
+def _indexes(begin: Array, steps: Array) -> slice | Array:
+    """The rows of some pieces, one after the other."""
+    if (begin[1:] == begin[:-1] + steps[:-1]).all():
+        return slice(int(begin[0]), int(begin[-1] + steps[-1]))
+    before = np.cumsum(steps) - steps
+    found: Array = np.repeat(begin - before, steps) + np.arange(int(steps.sum()))
+    return found
+
+
+def _shaped(values: Array, target: Array) -> Array:
+    """One-element dimensions of a structured field may be folded; the target's shape says what is meant."""
+    return (
+        values if values.shape[1:] == target.shape[1:] else values.reshape((len(values), *target.shape[1:]))
+    )
