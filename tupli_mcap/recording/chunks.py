@@ -10,9 +10,9 @@ import itertools
 import os
 import struct
 import threading
-import zlib
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
+from mmap import mmap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.compression import decompress
 from tupli_mcap.recording.container import COMPRESSIONS
+from tupli_mcap.recording.crc import crc32
 from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.source import Source
 
@@ -130,6 +131,7 @@ class ChunkStore:
         self.table = table
         self._memory = memory
         self._cache = ChunkCache(cache) if isinstance(cache, int) else cache
+        self._checked = np.zeros(len(table), np.bool_)
         self._number = next(_numbers)  # tells the stores apart that share a cache
         self._by_channel: dict[int, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
         self._counts: dict[int, int] = {}
@@ -182,6 +184,7 @@ class ChunkStore:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._number = next(_numbers)
+        self._checked = np.zeros(len(self.table), np.bool_)
 
     def locate(self, channel: int, first: np.ndarray[Any, Any], counts: np.ndarray[Any, Any]) -> Located:
         """Where the runs `first[i]:first[i] + counts[i]` (int64) of a channel's rows lie, in their order."""
@@ -234,18 +237,20 @@ class ChunkStore:
             raise FormatError(
                 f"{where}: expected a chunk of at most {MAX_CHUNK} bytes, found {length} holding {size}"
             )
-        record = self._source.read(offset, length)
-        opcode, claimed, _, _, found_size, crc, name_length = _CHUNK_HEAD.unpack_from(record)
         name = COMPRESSIONS[row["compression"]].replace("none", "")
+        # what is not compressed is used where it is
+        record = self._source.lend(offset, length) if name else self._source.view(offset, length)
+        opcode, claimed, _, _, found_size, crc, name_length = _CHUNK_HEAD.unpack_from(record)
         start = _CHUNK_HEAD.size + name_length + 8
         head_ok = opcode == 6 and claimed + 9 == length and found_size == size and name_length == len(name)
         if not head_ok or record[_CHUNK_HEAD.size : start - 8] != name.encode():
             raise FormatError(
                 f"{where}: expected a chunk of {size} bytes ({name or 'none'}), found another record"
             )
-        data = decompress(name, memoryview(record)[start:], size, where)
-        if zlib.crc32(data) != crc or crc != row["crc"]:
+        data = decompress(name, record[start:], size, where)
+        if crc != row["crc"] or not (self._checked[i] or crc32(data) == crc):
             raise FormatError(f"{where}: its CRC differs, the chunk is damaged or another one")
+        self._checked[i] = isinstance(record.obj, mmap)  # what is mapped stays as it is, and is checked once
         return memoryview(data)[skip:] if skip else data
 
     def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> np.ndarray[Any, Any]:

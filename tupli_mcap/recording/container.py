@@ -36,6 +36,7 @@ from mcap.records import (
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording.checksums import with_crc
+from tupli_mcap.recording.crc import crc32
 from tupli_mcap.system import refused
 
 __all__ = ["CHUNK_ROWS", "MAGIC", "Compression", "Container"]
@@ -187,7 +188,7 @@ class Container:
         """The records of a chunk and their CRC. The channel's chunk before it must be in the file."""
         head = b"" if rows.channel in self._announced else self.definitions(rows.channel)
         data = rows.data if not head else head + bytes(rows.data)
-        return Prepared(rows, len(head), data, zlib.crc32(data))
+        return Prepared(rows, len(head), data, crc32(data))
 
     def pack(self, data: Any) -> bytes:
         """Compresses the records of a chunk."""

@@ -5,17 +5,22 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import mmap
 import os
 import stat
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol, TypeVar
 
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
 from tupli_mcap.system import refused
 
 __all__ = ["Source", "open_regular", "open_source"]
+
+_T = TypeVar("_T")
+_LARGEST_LENT = 4 << 20
+_lent = threading.local()
 
 
 class Source(Protocol):
@@ -27,6 +32,17 @@ class Source(Protocol):
 
     def read(self, offset: int, length: int) -> bytes:
         """Exactly `length` bytes, or FormatError."""
+        ...
+
+    def lend(self, offset: int, length: int) -> memoryview:
+        """The same bytes, until this thread asks for others: a local file needs no new memory for them."""
+        ...
+
+    def view(self, offset: int, length: int) -> memoryview:
+        """The same bytes for as long as anybody holds them; of a local file not copied, but mapped into memory.
+
+        Who cuts the file short meanwhile kills this process.
+        """
         ...
 
     def refresh(self) -> None:
@@ -53,6 +69,14 @@ def open_regular(path: Path) -> int:
     raise OSError(errno.EINVAL, "a device, a pipe or a socket, and no file", str(path))
 
 
+def _lent_buffer(length: int) -> memoryview:
+    """This thread's buffer: memory that is there already is much cheaper than new pages for each chunk."""
+    buffer: memoryview | None = getattr(_lent, "buffer", None)
+    if buffer is None or len(buffer) < length:
+        buffer = _lent.buffer = memoryview(bytearray(max(length, 1 << 18)))
+    return buffer[:length]
+
+
 class PathSource:
     """A local file, read with positioned reads."""
 
@@ -76,18 +100,43 @@ class PathSource:
         except BaseException:
             self.close()
             raise
+        self._mapped: Any = b""
 
     def read(self, offset: int, length: int) -> bytes:
+        self._check(offset, length)
+        data = _refusals_told(self.name, offset, length, lambda: self._read(offset, length))
+        if len(data) != length:
+            raise self._too_short(offset, length)
+        return data
+
+    def lend(self, offset: int, length: int) -> memoryview:
+        self._check(offset, length)
+        if length > _LARGEST_LENT or not hasattr(os, "preadv"):
+            return memoryview(self.read(offset, length))
+        buffer = _lent_buffer(length)
+        found = _refusals_told(self.name, offset, length, lambda: os.preadv(self._fd, [buffer], offset))
+        return buffer if found == length else memoryview(self.read(offset, length))
+
+    def view(self, offset: int, length: int) -> memoryview:
+        self._check(offset, length)
+        mapped = self._mapped
+        if offset + length > len(mapped):  # not yet, or the file has grown since
+            try:
+                mapped = self._mapped = mmap.mmap(self._fd, self.size, access=mmap.ACCESS_READ)
+            except (OSError, ValueError):  # a file system that maps nothing; a file cut short
+                return memoryview(self.read(offset, length))
+        return memoryview(mapped)[offset : offset + length]
+
+    def _check(self, offset: int, length: int) -> None:
         if self._fd < 0:
             raise RecordingError(f"{self.name} is closed; open it again with Recording(...)")
-        data = b""
-        if offset + length <= self.size:
-            data = _refusals_told(self.name, offset, length, lambda: self._read(offset, length))
-        if len(data) != length:
-            raise FormatError(
-                f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
-            )
-        return data
+        if offset + length > self.size:
+            raise self._too_short(offset, length)
+
+    def _too_short(self, offset: int, length: int) -> FormatError:
+        return FormatError(
+            f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
+        )
 
     def _read(self, offset: int, length: int) -> bytes:
         data = os.pread(self._fd, length, offset)
@@ -112,6 +161,7 @@ class PathSource:
     def close(self) -> None:
         if self._fd >= 0:
             fd, self._fd = self._fd, -1
+            self._mapped = b""  # whoever holds a view of it keeps it
             with contextlib.suppress(OSError):  # nothing was written
                 os.close(fd)
 
@@ -152,6 +202,12 @@ class FileSource:
             raise FormatError(f"{self.name}: expected {length} bytes at offset {offset}, found {len(data)}")
         return data
 
+    def lend(self, offset: int, length: int) -> memoryview:
+        return memoryview(self.read(offset, length))
+
+    def view(self, offset: int, length: int) -> memoryview:
+        return memoryview(self.read(offset, length))
+
     def _read(self, offset: int, length: int) -> bytes:
         if self._fd >= 0 and not self._file.closed:
             return os.pread(self._fd, length, offset)
@@ -172,7 +228,7 @@ def _is_system_file(file: BinaryIO) -> bool:
     return type(raw) is io.FileIO and not file.closed
 
 
-def _refusals_told(name: str, offset: int, length: int, read: Callable[[], bytes]) -> bytes:
+def _refusals_told(name: str, offset: int, length: int, read: Callable[[], _T]) -> _T:
     """What `read` gives; a disk or a connection that fails is no defect of the file."""
     try:
         return read()

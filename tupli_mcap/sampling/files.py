@@ -72,6 +72,12 @@ class FileOfMany:
     def read(self, offset: int, length: int) -> bytes:
         return self._files.source(self.name).read(offset, length)
 
+    def lend(self, offset: int, length: int) -> memoryview:
+        return self._files.source(self.name).lend(offset, length)
+
+    def view(self, offset: int, length: int) -> memoryview:
+        return self._files.source(self.name).view(offset, length)
+
     def refresh(self) -> None:
         self.size = self._files.source(self.name).size
 

@@ -1,0 +1,142 @@
+"""The reading path: runs of rows, chunks that are mapped, memory that is lent, checksums."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import roll, same
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tupli_mcap import RecordEpisodes, Recording
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.crc import crc32
+from tupli_mcap.recording.source import PathSource, open_source
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
+
+
+@pytest.fixture(scope="module")
+def vector(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """Some 200 episodes of five CartPoles, whose steps are mixed in several chunks."""
+    path = tmp_path_factory.mktemp("vector") / "v.mcap"
+    with RecordVector(gym.make_vec("CartPole-v1", num_envs=5), path, chunk_size=4096) as env:
+        env.reset(seed=1)
+        env.action_space.seed(1)
+        for _ in range(900):
+            env.step(env.action_space.sample())
+    return Recording(path)
+
+
+@pytest.fixture(scope="module")
+def by_episode(vector: Recording) -> list[Any]:
+    """The columns of each episode, read on its own."""
+    return [vector.read([i], fields=FIELDS, threads=1) for i in range(len(vector))]
+
+
+@settings(max_examples=40)
+@given(data=st.data())
+def test_episodes_in_any_order(vector: Recording, by_episode: list[Any], data: st.DataObject) -> None:
+    some = st.lists(st.integers(0, len(vector) - 1), max_size=60)
+    chosen = data.draw(st.one_of(some, st.just(list(range(len(vector)))), some.map(sorted)))
+    fields = data.draw(st.lists(st.sampled_from(FIELDS), min_size=1, unique=True))
+    found = vector.read(chosen, fields=fields, threads=data.draw(st.integers(1, 2)))
+    for field in FIELDS:
+        parts = [getattr(by_episode[i], field) for i in chosen]
+        if field not in fields:
+            assert getattr(found, field) is None
+        elif parts:
+            assert same(getattr(found, field), np.concatenate(parts))
+        else:
+            assert len(getattr(found, field)) == 0
+
+
+def record(path: Path, steps: int = 500, **options: Any) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), path, **options) as env:
+        roll(env, steps)
+
+
+def test_rows_that_are_not_compressed_are_not_copied(tmp_path: Path) -> None:
+    for compression in ("none", "zstd"):
+        record(tmp_path / f"{compression}.mcap", compression=compression)
+    plain, packed = (Recording(tmp_path / f"{name}.mcap") for name in ("none", "zstd"))
+    chunk = plain._store.chunks(plain._step_channels[0])[0]
+    rows = plain._store.rows(chunk, plain.layout.step_message.dtype)
+    held = rows
+    while isinstance(held, np.ndarray):
+        held = held.base
+    assert isinstance(held.obj, mmap.mmap)
+    columns = plain.read(fields=FIELDS[:6])
+    assert same(columns.states, packed.read().states)
+    columns.states[:] = 0  # one's own
+    plain.close()
+    assert rows["#channel"].all()  # what is held stays
+
+
+def test_damage_in_rows_that_are_not_compressed(tmp_path: Path) -> None:
+    record(tmp_path / "a.mcap", compression="none")
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    row = Recording(tmp_path / "a.mcap")._store.table[0]
+    data[int(row["offset"]) + int(row["length"]) // 2] ^= 1
+    (tmp_path / "a.mcap").write_bytes(data)
+    for _ in range(2):
+        with pytest.raises(FormatError, match="its CRC differs"):
+            Recording(tmp_path / "a.mcap").read()
+
+
+def test_a_file_that_grows_is_mapped_anew(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(bytes(range(100)))
+    source = PathSource(path)
+    first = source.view(10, 5)
+    with path.open("ab") as file:
+        file.write(b"more")
+    with pytest.raises(FormatError, match="expected 4 bytes at offset 100, found the end of the file at 100"):
+        source.view(100, 4)
+    source.refresh()
+    assert bytes(source.view(100, 4)) == b"more"
+    assert bytes(first) == bytes(range(10, 15))
+
+
+@pytest.mark.parametrize("kind", ["path", "file"])
+def test_what_is_lent(tmp_path: Path, kind: str) -> None:
+    """Each thread has a buffer of its own; one that is too small grows."""
+    content = os.urandom(9 << 20)
+    (tmp_path / "a").write_bytes(content)
+    file = (tmp_path / "a").open("rb")
+    source = open_source(tmp_path / "a" if kind == "path" else file)
+
+    def check(seed: int) -> bool:
+        random = np.random.default_rng(seed)
+        for size in (1, 1000, 300_000, 5 << 20):
+            at = int(random.integers(0, len(content) - size))
+            lent = source.lend(at, size)
+            if (
+                bytes(lent) != content[at : at + size]
+                or bytes(source.view(at, size)) != content[at : at + size]
+            ):
+                return False
+        return True
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(check, range(12)))
+    with pytest.raises(FormatError, match="found the end"):
+        source.lend(len(content) - 1, 2)
+    source.close()
+    file.close()
+
+
+def test_checksums_are_those_of_zlib() -> None:
+    for size in (0, 1, 7, 8, 63, 4096, 6000, 100_001):
+        data = os.urandom(size)
+        assert crc32(data) == zlib.crc32(data)
+        assert crc32(memoryview(data)[size // 3 :], 5) == zlib.crc32(data[size // 3 :], 5)
