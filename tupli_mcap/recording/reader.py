@@ -243,9 +243,10 @@ class Recording:
     def benchmark(self) -> RecordedBenchmark:
         """The environment that was recorded, as data; `make_env()` rebuilds it."""
         if "benchmark.json" not in self._contents.attachments:
-            raise RecordingError(
-                f"{self.name} carries no environment; load its benchmark from the storage it is in"
-            )
+            advice = "load its benchmark from the storage it is in"
+            if not self.benchmark_id:
+                advice = "it was left out, could not be captured, or lived in other processes"
+            raise RecordingError(f"{self.name} carries no environment; {advice}")
         pickle = None
         if "env.cloudpickle" in self._contents.attachments:
             pickle = self.read_attachment("env.cloudpickle")
