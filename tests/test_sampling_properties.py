@@ -203,3 +203,42 @@ def transition(
     over = episode.terminal(last)
     next_state = episode.first + last if after is None else after
     return episode.first + run[start], total, next_state, over, 0.0 if over else discount**steps, known
+
+
+@FEW
+@LIBRARIES
+def test_delta_windows(
+    libraries: list[tuple[Library, Path]], number: int, filtered: bool, cache_bytes: int, data: st.DataObject
+) -> None:
+    library, directory = libraries[number]
+    offsets = st.lists(st.integers(-4, 4), min_size=1, max_size=4)
+    deltas = {"state": data.draw(offsets), "reward": data.draw(offsets), "next_state": [0]}
+    unit = data.draw(st.sampled_from(["steps", "seconds"]))
+    seconds = {key: [0.02 * n for n in values] for key, values in deltas.items()}
+    dataset = dataset_of(directory, filtered=filtered, cache_bytes=cache_bytes)
+    if not len(dataset):
+        with pytest.raises(SamplingError, match="found an empty dataset"):
+            dataset.delta_windows(deltas)
+        return
+    windows = dataset.delta_windows(
+        deltas if unit == "steps" else seconds, unit, step_seconds=None if unit == "steps" else 0.02
+    )
+    batch, item = windows[:], 0
+    for place, episode, run in runs_of(library, filtered=filtered):
+        for i, step in enumerate(run):
+            inside = {key: [0 <= i + d < len(run) for d in deltas[key]] for key in deltas}
+            near = {key: [run[min(max(i + d, 0), len(run) - 1)] for d in deltas[key]] for key in deltas}
+            after = episode.next_state(step)
+            wanted = {
+                "state": [episode.first + s for s in near["state"]],
+                "reward": [episode.rewards[s] for s in near["reward"]],
+                "next_state": [episode.first + step if after is None else after],
+            }
+            one = windows[item]
+            assert one.episodes == batch.episodes[item] == place
+            for key, values in wanted.items():
+                assert batch[key][item].reshape(len(values), -1)[:, 0].tolist() == values
+                assert one[key].reshape(len(values), -1)[:, -1].tolist() == values
+                assert one.masks[key].tolist() == batch.masks[key][item].tolist() == inside[key]
+            item += 1
+    assert item == len(windows)

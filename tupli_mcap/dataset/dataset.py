@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from tupli_mcap.dataset import convert, display
+from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.episodes import EpisodeItems, items_of
 from tupli_mcap.dataset.loading import read_columns
 from tupli_mcap.dataset.parsers import BaseTupleParser, NumpyTupleParser
@@ -17,8 +18,6 @@ from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.selection import TupleFilter
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
 from tupli_mcap.dataset.tuples import Tuples
-from tupli_mcap.sampling import Pad, Steps, Transitions, Windows
-from tupli_mcap.sampling.transitions import TRANSITION_FIELDS
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.tuples import anew
@@ -32,7 +31,7 @@ FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 SIX = (*FIVE, "infos")
 
 
-class TupliDataset:
+class TupliDataset(RandomAccess):
     """Episodes of a storage (or of files, see `from_files`), and the steps in them, as filters choose them.
 
     A dataset reads when it is asked for something, and only what it is asked for. Its filters never change:
@@ -364,58 +363,6 @@ class TupliDataset:
         columns, selected, layout = read_columns(self._query.source, chosen, SIX)
         items = items_of(chosen, columns, selected.lengths, layout)
         return [items[i] for i in np.searchsorted(in_order, drawn)]
-
-    # --- random access ---
-
-    @property
-    def steps(self) -> Steps:
-        """The wanted steps by number, from 0, in the episodes' order: what windows and samplers read from."""
-        return self._query.steps()
-
-    def with_cache(self, cache_bytes: int, threads: int | None = None) -> Self:
-        """The dataset with another budget (bytes, 512 MiB by default) for what random access keeps in memory.
-
-        Args:
-            threads: how many read chunks; by default as many as there are cores, at most 4.
-
-        Raises:
-            DatasetError: a number is no integer, or too small.
-        """
-        made = self._with()
-        made._query.cache_bytes = _count(cache_bytes, 0, "a budget in bytes")
-        if threads is not None:
-            made._query.threads = _count(threads, 1, "a number of threads")
-        return made
-
-    def windows(
-        self,
-        length: int,
-        stride: int = 1,
-        pad: Pad = "none",
-        history: int = 0,
-        *,
-        fields: Sequence[str] = FIVE,
-    ) -> Windows:
-        """Sub-trajectories of `length` steps that never cross episodes, nor the cuts of a tuple filter.
-
-        See `Windows`: an index gives one window, an array of numbers gives a batch of them.
-
-        Raises:
-            SamplingError: no episode is long enough, or the arguments mean nothing.
-        """
-        return Windows(self.steps, length, stride, pad, history, fields=fields)
-
-    def transitions(
-        self, n_step: int = 1, discount: float = 1.0, *, fields: Sequence[str] = TRANSITION_FIELDS
-    ) -> Transitions:
-        """The transition (s, a, r, s') that starts at each step, by its number; an array of numbers gives a batch.
-
-        See `Transitions` for several steps, and `Transition` for what to bootstrap with.
-
-        Raises:
-            SamplingError: the dataset is empty, or the arguments mean nothing.
-        """
-        return Transitions(self.steps, n_step, discount, fields=fields)
 
     # --- display ---
 

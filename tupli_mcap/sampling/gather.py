@@ -65,48 +65,48 @@ class Rows(Protocol):
 class ConstantRows:
     """Rows of constant size, in chunks of several files.
 
-    A row is copied from the decoded columns once `hold` was called (they fill as chunks are read), else from the
-    chunks that the stores' cache keeps. Safe from several threads: two may read the same chunk, with the same result.
+    A row is copied from decoded columns where `hold` says so (they fill as chunks are read), else from the chunks that
+    the stores' cache keeps. Safe from several threads: two may read the same chunk, with the same result.
     """
 
     def __init__(self, segments: Segments, formats: Sequence[RowFormat], columns: dict[str, Column]) -> None:
         self.segments = segments
         self.columns = columns
         self._formats = formats
-        self._held = False
-        self._forget()
-
-    def _forget(self) -> None:
-        self._decoded: dict[str, Array] = {}
-        self._there: dict[str, Array] = {}  # column -> which units are decoded
-        self._whole: set[str] = set()
-        self._of_unit: tuple[Array, Array] | None = None
+        self._held: _HeldColumns | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_decoded": {}, "_there": {}, "_whole": set(), "_of_unit": None}
+        return {**self.__dict__, "_held": None}
 
-    def hold(self, held: bool) -> None:
-        """Whether columns are kept decoded: `nbytes` of memory, as far as they have been read."""
-        if not held:
-            self._forget()
-        self._held = held
+    def hold(self, names: Iterable[str]) -> None:
+        """Keeps these columns decoded, in `nbytes` of memory as far as they have been read; none: not any more."""
+        chosen = set(names)
+        if not chosen:
+            self._held = None
+        elif self._held is None or self._held.columns.keys() != chosen:
+            self._held = _HeldColumns(
+                self.segments, {name: self.columns[name].empty(self.segments.total) for name in chosen}
+            )
 
     def nbytes(self, names: Iterable[str]) -> int:
         """Bytes of some columns of all rows, decoded."""
         return self.segments.total * sum(self.columns[name].nbytes for name in names)
 
     def read(self, names: Sequence[str], rows: Array, threads: int) -> dict[str, Any]:
-        if self._held:
-            self._decode(names, rows, threads)
-            return {name: self._decoded[name].take(rows, axis=0) for name in names}
-        return self._read_chunks(names, rows, threads)
+        held = self._held
+        if held is None or not held.columns.keys() >= set(names):
+            return self._read_chunks(names, rows, threads)
+        if not held.whole:
+            self._fill(held, rows, threads)
+        return {name: held.columns[name].take(rows, axis=0) for name in names}
 
     def read_runs(self, names: Sequence[str], starts: Array, length: int, threads: int) -> dict[str, Any]:
-        if not self._held:
+        held = self._held
+        if held is None or not held.columns.keys() >= set(names):
             return self._read_chunks(names, rows_of_runs(starts, length), threads)
-        if not self._whole.issuperset(names):
-            self._decode(names, rows_of_runs(starts, length), threads)
-        return {name: pick_runs(self._decoded[name], starts, length) for name in names}
+        if not held.whole:
+            self._fill(held, rows_of_runs(starts, length), threads)
+        return {name: pick_runs(held.columns[name], starts, length) for name in names}
 
     def _read_chunks(self, names: Sequence[str], rows: Array, threads: int) -> dict[str, Any]:
         out = {name: self.columns[name].empty(len(rows)) for name in names}
@@ -125,61 +125,50 @@ class ConstantRows:
         chunk = source.store.rows(int(self.segments.chunk_of[unit]), source.dtype, keep=keep)
         return chunk, source.fields
 
-    # ---- decoded columns
+    def _fill(self, held: _HeldColumns, rows: Array, threads: int) -> None:
+        missing = held.missing(rows)
+        run([partial(self._fill_unit, held, unit) for unit in missing], threads)
+        if missing:
+            held.whole = bool(held.there.all())
 
-    def _decode(self, names: Sequence[str], rows: Array, threads: int) -> None:
-        """Sees to it that the columns hold the rows."""
-        missing = [name for name in names if name not in self._whole]
-        for name in missing:
-            self._prepare(name)
-        missing = [name for name in missing if name not in self._whole]
-        if not missing:
-            return
-        wanted = np.zeros(len(self.segments.chunk_of), np.bool_)
-        wanted[self.segments.units[self.segments.of(rows)]] = True
-        lacking = [
-            (u, [n for n in missing if not self._there[n][u]]) for u in np.flatnonzero(wanted).tolist()
-        ]
-        tasks = [partial(self._fill, unit, lacks) for unit, lacks in lacking if lacks]
-        run(tasks, threads)
-        if tasks:
-            self._whole.update(name for name in missing if self._there[name].all())
+    def _fill_unit(self, held: _HeldColumns, unit: int) -> None:
+        held.put(unit, *self._open(unit, keep=False))
 
-    def _prepare(self, name: str) -> None:
-        if name not in self._decoded:
-            self._there[name] = np.zeros(len(self.segments.chunk_of), np.bool_)
-            self._decoded[name] = self.columns[name].empty(self.segments.total)
-        if not self._decoded[name].size:
-            self._whole.add(name)
 
-    def _fill(self, unit: int, names: Sequence[str]) -> None:
-        chunk, fields = self._open(unit, keep=False)
-        starts, begins, lengths = self._segments_of(unit)
-        if len(starts) <= 4:
-            for start, begin, steps in zip(starts.tolist(), begins.tolist(), lengths.tolist(), strict=True):
-                for name in names:
-                    target = self._decoded[name]
-                    part = chunk[fields.get(name, name)][begin : begin + steps]
-                    target[start : start + steps] = _shaped(part, target)
+class _HeldColumns:
+    """Decoded columns of all rows. `there` says which units are in them, `whole` that all are."""
+
+    def __init__(self, segments: Segments, columns: dict[str, Array]) -> None:
+        self.columns = columns
+        self.there = np.zeros(len(segments.chunk_of), np.bool_)
+        self._filled = [name for name, column in columns.items() if column.size]
+        self.whole = not self._filled
+        self._segments = segments
+        self._order = np.argsort(segments.units, kind="stable")  # by unit
+        counts = np.bincount(segments.units, minlength=len(self.there))
+        self._ends = np.concatenate([[0], np.cumsum(counts)])
+
+    def missing(self, rows: Array) -> list[int]:
+        """The units that rows lie in and that are not there."""
+        wanted = np.zeros(len(self.there), np.bool_)
+        wanted[self._segments.units[self._segments.of(rows)]] = True
+        return np.flatnonzero(wanted & ~self.there).tolist()
+
+    def put(self, unit: int, chunk: Array, fields: dict[str, str]) -> None:
+        """Copies the rows of a chunk to where they belong."""
+        chosen = self._order[self._ends[unit] : self._ends[unit + 1]]
+        begins, starts = self._segments.begins[chosen], self._segments.starts[chosen]
+        lengths = np.append(self._segments.starts[1:], self._segments.total)[chosen] - starts
+        if len(chosen) == 1:
+            source: Any = slice(begins[0], begins[0] + lengths[0])
+            place: Any = slice(starts[0], starts[0] + lengths[0])
         else:
             within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
             source, place = np.repeat(begins, lengths) + within, np.repeat(starts, lengths) + within
-            for name in names:
-                target = self._decoded[name]
-                target[place] = _shaped(chunk[fields.get(name, name)][source], target)
-        for name in names:
-            self._there[name][unit] = True  # last: another thread may be looking
-
-    def _segments_of(self, unit: int) -> tuple[Array, Array, Array]:
-        if self._of_unit is None:
-            order = np.argsort(self.segments.units, kind="stable")
-            counts = np.bincount(self.segments.units, minlength=len(self.segments.chunk_of))
-            self._of_unit = order, np.concatenate([[0], np.cumsum(counts)])
-        order, ends = self._of_unit
-        chosen = order[ends[unit] : ends[unit + 1]]
-        starts = self.segments.starts[chosen]
-        after = np.append(self.segments.starts[1:], self.segments.total)[chosen]
-        return starts, self.segments.begins[chosen], after - starts
+        for name in self._filled:
+            target = self.columns[name]
+            target[place] = _shaped(chunk[fields.get(name, name)][source], target)
+        self.there[unit] = True  # last: another thread may be looking
 
 
 class DecodedRows:

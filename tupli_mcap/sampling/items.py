@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
 
 from tupli_mcap.sampling.steps import SamplingError, Steps
+from tupli_mcap.schema import BaseFilter, F
+
+if TYPE_CHECKING:
+    from tupli_mcap.sampling.batches import Batches
+    from tupli_mcap.sampling.draws import Numbers, Order, Sampler, Shuffle, Weights
 
 __all__ = ["Items", "checked_count"]
 
@@ -31,6 +36,7 @@ class Items(ABC, Generic[T]):
 
     def __init__(self, steps: Steps, parameters: Sequence[object]) -> None:
         self.source = steps
+        self._values_of: Callable[[F | BaseFilter], Array] | None = None
         told = " ".join(map(repr, (type(self).__name__, *parameters)))
         self.identity = hashlib.sha256(f"{steps.identity} {told}".encode()).hexdigest()
         if not len(steps):
@@ -75,6 +81,69 @@ class Items(ABC, Generic[T]):
 
     def __iter__(self) -> Iterator[T]:
         return map(self._one, range(len(self)))
+
+    # ---- in batches
+
+    def sampler(
+        self,
+        batch_size: int,
+        *,
+        by: Literal["steps", "episodes"] = "steps",
+        weights: Weights | None = None,
+        seed: int | None = None,
+    ) -> Sampler:
+        """A `Sampler` of these items: draws batches of their numbers without end."""
+        from tupli_mcap.sampling.draws import Sampler  # which builds on this module
+
+        return Sampler(self, batch_size, by=by, weights=weights, seed=seed)
+
+    def order(
+        self,
+        batch_size: int,
+        *,
+        shuffle: Shuffle | Literal[False] = False,
+        seed: int | None = None,
+        drop_last: bool = False,
+        buffer: int | None = None,
+    ) -> Order:
+        """An `Order` of these items: the number of each once an epoch, in batches."""
+        from tupli_mcap.sampling.draws import Order
+
+        return Order(self, batch_size, shuffle=shuffle, seed=seed, drop_last=drop_last, buffer=buffer)
+
+    def batches(self, numbers: Numbers | int, *, read_ahead: int = 0) -> Batches[T]:
+        """The items that an order or a sampler gives, read in batches; a number stands for `order(number)`.
+
+        See `Batches`, also for reading ahead.
+        """
+        from tupli_mcap.sampling.batches import Batches
+
+        chosen = self.order(numbers) if isinstance(numbers, int) else numbers
+        return Batches(self, chosen, read_ahead=read_ahead)
+
+    def episode_values(self, expression: F | BaseFilter) -> Array:
+        """The value of an expression over `EpisodeHeader` for each episode (float64).
+
+        Raises:
+            SamplingError: these items are of no dataset, which alone knows its episodes; or a value is no number.
+        """
+        if self._values_of is None:
+            raise SamplingError(
+                f"expected one weight for each episode, found {expression!r:.80}, whose values are only known to "
+                "windows and transitions of a dataset"
+            )
+        return self._values_of(expression)
+
+    def of_episodes(self, values_of: Callable[[F | BaseFilter], Array]) -> Self:
+        """These items, which from now on know the values of expressions over their episodes."""
+        self._values_of = values_of
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            **self.__dict__,
+            "_values_of": None,
+        }  # a copy elsewhere reads items; it needs no list of episodes
 
     def block_runs(self) -> tuple[Array, Array, Array]:
         """Runs of items that lie in one block of the storage: the first item and the length of each, and its block."""

@@ -138,8 +138,15 @@ class RecordedSteps:
         self._cache.clear()
         for rows in self._rows:
             if isinstance(rows, ConstantRows):
-                rows.hold(False)
+                rows.hold(())
         self._share_budget()
+
+    @property
+    def room(self) -> int:
+        """How many steps are in the chunks that fit into half the cache."""
+        tables = [store.table for store in self._index.stores]
+        size = sum(int(table["uncompressed"].sum()) for table in tables)
+        return len(self) if size == 0 else int(len(self) * self.cache_bytes / 2 / size)
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
         listed = rows if self._wanted is None else self._wanted[rows]
@@ -223,7 +230,7 @@ class RecordedSteps:
                 sizes = {}
         for i, rows in enumerate(self._rows):
             if isinstance(rows, ConstantRows):
-                rows.hold(i in sizes)
+                rows.hold(self._used[i] if i in sizes else ())
         self._cache.budget = self.cache_bytes - sum(sizes.values())
 
     def _next_states(self, nest: Callable[[list[Any]], Any], names: Sequence[str], listed: Array) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.sampling.items import Items, checked_count
 from tupli_mcap.sampling.steps import FIELDS, SamplingError, Steps, checked_fields, map_arrays
 
-__all__ = ["Pad", "Window", "Windows"]
+__all__ = ["Pad", "Window", "Windows", "shaped_rows"]
 
 Array = np.ndarray[Any, Any]
 Pad = Literal["none", "repeat", "zero"]
@@ -116,7 +116,7 @@ class Windows(Items[Window]):
         found = self._read(items)
         shape = found["mask"].shape
         return Window(
-            **{name: _shaped(part, shape) if name in FIELDS else part for name, part in found.items()}
+            **{name: shaped_rows(part, shape) if name in FIELDS else part for name, part in found.items()}
         )
 
     def _read(self, items: Array) -> dict[str, Any]:
@@ -156,7 +156,7 @@ def _zeroed(column: Any, rows: Array) -> Any:
     return map_arrays(of_array, column, of_list)
 
 
-def _shaped(column: Any, shape: tuple[int, ...]) -> Any:
+def shaped_rows(column: Any, shape: tuple[int, ...]) -> Any:
     """The column with its rows in the shape (B, T)."""
 
     def of_list(part: list[Any]) -> list[Any]:

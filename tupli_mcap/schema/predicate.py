@@ -19,7 +19,7 @@ Item: TypeAlias = Mapping[str, Any] | BaseModel
 Predicate: TypeAlias = Callable[[Item], bool]
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
-_MISSING: Final = object()
+MISSING: Final = object()
 
 
 def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
@@ -78,8 +78,8 @@ def _predicate(filter: BaseFilter) -> Predicate:
     path, test = path_of(filter), scalar_test(filter)
 
     def comparison(item: Item) -> bool:
-        found = _look_up(item, path)
-        return found is not _MISSING and test(classify(found))
+        found = look_up(item, path)
+        return found is not MISSING and test(classify(found))
 
     return comparison
 
@@ -94,16 +94,17 @@ def scalar_test(filter: BaseFilter) -> Callable[[Scalar], bool]:
     return lambda found: compare(operation, found, wanted)
 
 
-def _look_up(item: object, path: tuple[str, ...]) -> object:
+def look_up(item: object, path: tuple[str, ...]) -> object:
+    """What nested mappings and models hold at a path; `MISSING` if there is nothing."""
     for segment in path:
         if isinstance(item, BaseModel):
             if segment not in type(item).model_fields:
-                return _MISSING
+                return MISSING
             item = getattr(item, segment)
         elif isinstance(item, Mapping) and segment in item and untag_float(item) is None:
             item = item[segment]
         else:
-            return _MISSING
+            return MISSING
     return item
 
 
@@ -144,7 +145,7 @@ def _mask(filter: BaseFilter, columns: Mapping[str, Any], length: int) -> Mask:
             return np.logical_or.reduce(parts) if parts else np.zeros(length, np.bool_)
         return _compare_array(filter.type.value, leaf, classify(filter.value))
     test = scalar_test(filter)
-    matches = (value is not _MISSING and test(classify(value)) for value in leaf)
+    matches = (value is not MISSING and test(classify(value)) for value in leaf)
     return np.fromiter(matches, np.bool_, count=len(leaf))
 
 
@@ -200,7 +201,7 @@ def _step_value(value: Any, path: tuple[str, ...]) -> Any:
         try:
             value = value[segment] if isinstance(value, Mapping) else value[int(segment)]
         except (LookupError, ValueError, TypeError):
-            return _MISSING
+            return MISSING
     return value
 
 

@@ -1,0 +1,85 @@
+"""Batches of items, read one after the other, some of them ahead."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sized
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from tupli_mcap.sampling.draws import Numbers
+from tupli_mcap.sampling.items import Items, checked_count
+from tupli_mcap.sampling.steps import SamplingError
+
+__all__ = ["Batches"]
+
+Array = np.ndarray[Any, Any]
+T = TypeVar("T")
+
+
+class Batches(Generic[T]):
+    """The items whose numbers an `Order` or a `Sampler` gives, a batch at a time.
+
+    Args:
+        read_ahead: batches that a thread reads while the one before is used: worth it where chunks are decompressed
+            or files are slow. A sampler draws them as early; weights that change meanwhile count for later ones.
+
+    Raises:
+        SamplingError: the numbers are those of other items.
+    """
+
+    def __init__(self, items: Items[T], numbers: Numbers, *, read_ahead: int = 0) -> None:
+        if numbers.items_identity != items.identity:
+            raise SamplingError("expected numbers of the same items, found those of others")
+        self.items = items
+        self.numbers = numbers
+        self.read_ahead = checked_count(read_ahead, 0, "a number of batches to read ahead")
+        self._drawn: deque[tuple[Array, Future[T] | None]] = deque()
+
+    def __len__(self) -> int:
+        """Batches in an epoch of an `Order`.
+
+        Raises:
+            SamplingError: a `Sampler` has no end.
+        """
+        if not isinstance(self.numbers, Sized):
+            raise SamplingError("expected an Order, which has epochs, found a Sampler, which has no end")
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[T]:
+        source = iter(self.numbers)
+        drawn = self._drawn = deque()
+        pool = ThreadPoolExecutor(1) if self.read_ahead else None
+        try:
+            while True:
+                while len(drawn) <= self.read_ahead and (numbers := next(source, None)) is not None:
+                    drawn.append(
+                        (numbers, None if pool is None else pool.submit(self.items.__getitem__, numbers))
+                    )
+                if not drawn:
+                    return
+                numbers, future = drawn[0]
+                batch = self.items[numbers] if future is None else future.result()
+                drawn.popleft()
+                yield batch
+        finally:
+            if drawn and drawn is self._drawn:
+                self.numbers.give_back([numbers for numbers, _ in drawn])
+                drawn.clear()
+            if pool is not None:
+                pool.shutdown(cancel_futures=True)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the iteration is: the next batch is the first that was not given yet."""
+        return self.numbers.state_dict([numbers for numbers, _ in self._drawn])
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """The next iteration goes on from there.
+
+        Raises:
+            SamplingError: it is the state of something else, or of other items.
+        """
+        self.numbers.load_state_dict(state)
+        self._drawn = deque()

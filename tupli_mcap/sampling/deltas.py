@@ -1,0 +1,188 @@
+"""Delta windows: for each step, the values some steps or seconds before and after it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from tupli_mcap.sampling.items import Items
+from tupli_mcap.sampling.steps import SamplingError, Steps
+from tupli_mcap.sampling.windows import shaped_rows
+
+__all__ = ["DeltaWindow", "DeltaWindows", "Unit"]
+
+Array = np.ndarray[Any, Any]
+Unit = Literal["steps", "seconds", "clock"]
+UNITS = ("steps", "seconds", "clock")
+KEYS = {
+    "state": "states", "action": "actions", "reward": "rewards", "terminal": "terminals",
+    "timeout": "timeouts", "next_state": "next_states", "time": "times",
+}  # fmt: skip
+_CLOSEST = 1e-4  # seconds that a delta may lie beside a step
+
+
+@dataclass(frozen=True)
+class DeltaWindow:
+    """Values around one step, or around B steps, by key ("state", "action", …).
+
+    `values[key]` is a column of shape (K, ...), or (B, K, ...), with K the number of the key's deltas, nested as the
+    space is; lists where values differ in size. `masks[key]` (bool, (B, K)) is False where the episode has no such
+    step: the nearest one stands there. `steps` (int64, (B,)) is the number of the step, `episodes` the place of its
+    episode in the query. `window["state"]` is `window.values["state"]`.
+    """
+
+    values: dict[str, Any]
+    masks: dict[str, Array]
+    steps: Any
+    episodes: Any
+
+    def __getitem__(self, key: str) -> Any:
+        return self.values[key]
+
+
+class DeltaWindows(Items[DeltaWindow]):
+    """The values around each step, by the number of the step, as LeRobot's delta_timestamps give them.
+
+    Values are of the step's own episode, and between the cuts of a tuple filter.
+
+    Args:
+        deltas: for each key ("state", "action", "reward", "terminal", "timeout", "next_state", "time") how far from the
+            step: `{"state": [-2, -1, 0], "action": range(16)}`.
+        unit: "steps"; "seconds", of which a step has `step_seconds`; or "clock": seconds of the wall clock between the
+            times recorded, of which the nearest is taken.
+        step_seconds: how long a step takes (s).
+
+    Raises:
+        SamplingError: unknown keys, deltas that are no numbers, no steps (in seconds: none within 0.1 ms), or unknown
+            seconds of a step.
+    """
+
+    def __init__(
+        self,
+        steps: Steps,
+        deltas: Mapping[str, Iterable[float]],
+        unit: Unit = "steps",
+        *,
+        step_seconds: float | None = None,
+    ) -> None:
+        if unit not in UNITS:
+            raise SamplingError(
+                f"expected unit to be one of {', '.join(map(repr, UNITS))}, found {unit!r:.80}"
+            )
+        given = {key: _numbers(key, values) for key, values in _checked_keys(deltas).items()}
+        super().__init__(steps, (unit, step_seconds, {key: values.tolist() for key, values in given.items()}))
+        self.unit = unit
+        self.deltas = given if unit == "clock" else _in_steps(given, unit, step_seconds)
+        self._lasts = steps.breaks
+        self._firsts = np.concatenate([[0], self._lasts[:-1] + 1])
+        self._episode_ends = np.cumsum(steps.episode_lengths)
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def steps_of(self, items: Array) -> Array:
+        return items
+
+    def counts(self) -> Array:
+        return self.source.episode_lengths
+
+    def _one(self, item: int) -> DeltaWindow:
+        return self._read(np.array([item]), single=True)
+
+    def _batch(self, items: Array) -> DeltaWindow:
+        return self._read(items, single=False)
+
+    def _read(self, steps: Array, *, single: bool) -> DeltaWindow:
+        pieces = self._lasts.searchsorted(steps)
+        firsts, lasts = self._firsts[pieces], self._lasts[pieces]
+        together: dict[bytes, list[str]] = {}  # keys with the same deltas are read at once
+        for key, deltas in self.deltas.items():
+            together.setdefault(deltas.tobytes(), []).append(key)
+        values: dict[str, Any] = {}
+        masks: dict[str, Array] = {}
+        for keys in together.values():
+            rows, mask = self._rows(steps, self.deltas[keys[0]], firsts, lasts)
+            columns = self.source.read([KEYS[key] for key in keys], rows.reshape(-1))
+            for key in keys:
+                column = columns[KEYS[key]]
+                values[key] = column if single else shaped_rows(column, rows.shape)
+                masks[key] = mask[0] if single else mask
+        episodes = self._episode_ends.searchsorted(steps, side="right")
+        ordered = {key: values[key] for key in self.deltas}
+        return DeltaWindow(ordered, masks, *((steps[0], episodes[0]) if single else (steps, episodes)))
+
+    def _rows(self, steps: Array, deltas: Array, firsts: Array, lasts: Array) -> tuple[Array, Array]:
+        """The step of each delta, of shape (B, K), and whether it is there."""
+        if self.unit == "clock":
+            return self._nearest(steps, deltas, firsts, lasts)
+        wanted = steps[:, None] + deltas
+        rows = np.clip(wanted, firsts[:, None], lasts[:, None])
+        return rows, rows == wanted
+
+    def _nearest(self, steps: Array, deltas: Array, firsts: Array, lasts: Array) -> tuple[Array, Array]:
+        """The steps whose times are nearest, found by bisection: times grow within an episode."""
+        shape = (len(steps), len(deltas))
+        target = self._times(steps)[:, None] + np.round(deltas * 1e9).astype(np.int64)
+        low, high = (np.broadcast_to(ends[:, None], shape).copy() for ends in (firsts, lasts))
+        slack = round(_CLOSEST * 1e9)
+        mask = (target >= self._times(low) - slack) & (target <= self._times(high) + slack)
+        while (low < high).any():  # the last step not after the target, or the first one of all
+            middle = (low + high + 1) // 2
+            before = self._times(middle) <= target
+            low, high = np.where(before, middle, low), np.where(before, high, np.maximum(middle - 1, low))
+        after = np.minimum(low + 1, lasts[:, None])
+        nearer = np.abs(self._times(after) - target) < np.abs(self._times(low) - target)
+        return np.where(nearer, after, low), mask
+
+    def _times(self, rows: Array) -> Array:
+        found: Array = self.source.read(["times"], rows.reshape(-1))["times"]
+        return found.reshape(rows.shape)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} delta windows of {', '.join(self.deltas)}>"
+
+
+def _checked_keys(deltas: Mapping[str, Iterable[float]]) -> Mapping[str, Iterable[float]]:
+    if not isinstance(deltas, Mapping) or not deltas:
+        raise SamplingError(f"expected deltas such as {{'state': [-1, 0]}}, found {deltas!r:.80}")
+    unknown = [key for key in deltas if key not in KEYS]
+    if unknown:
+        raise SamplingError(f"expected deltas of {', '.join(KEYS)}, found {', '.join(map(repr, unknown))}")
+    return deltas
+
+
+def _numbers(key: str, deltas: Iterable[float]) -> Array:
+    try:
+        found = np.array(list(deltas))
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if found.ndim != 1 or not len(found) or found.dtype.kind not in "iuf" or not np.isfinite(found).all():
+        raise SamplingError(f"expected numbers, at least one, as deltas of {key!r}, found {deltas!r:.80}")
+    return found
+
+
+def _in_steps(given: Mapping[str, Array], unit: str, step_seconds: float | None) -> dict[str, Array]:
+    """The deltas as numbers of steps (int64)."""
+    scale: float = 1
+    if unit == "seconds":
+        if step_seconds is None or not 0 < step_seconds < np.inf:
+            raise SamplingError(
+                f"expected a known time of a step, found {step_seconds!r}; give step_seconds=, or take unit='clock', "
+                "for the times recorded"
+            )
+        scale = step_seconds
+    found = {}
+    for key, deltas in given.items():
+        steps = np.round(deltas / scale)
+        away = np.abs(steps * scale - deltas)
+        if (away > (0 if unit == "steps" else _CLOSEST)).any():
+            wrong = deltas[np.argmax(away)]
+            raise SamplingError(
+                f"expected deltas of {key!r} that are whole steps{f' of {scale} s' if unit == 'seconds' else ''}, "
+                f"found {wrong}"
+            )
+        found[key] = steps.astype(np.int64)
+    return found

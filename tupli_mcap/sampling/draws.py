@@ -1,0 +1,332 @@
+"""Numbers of items in batches: drawn without end, or each once an epoch. Seeded; they go on from a saved state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from tupli_mcap.sampling.items import Items, checked_count
+from tupli_mcap.sampling.shuffling import through_buffer
+from tupli_mcap.sampling.steps import SamplingError
+from tupli_mcap.sampling.sumtree import SumTree
+from tupli_mcap.schema import BaseFilter, F
+
+__all__ = ["Numbers", "Order", "Sampler", "Shuffle", "Weights"]
+
+Array = np.ndarray[Any, Any]
+Shuffle = Literal["exact", "blocks"]
+Weights = Array | Sequence[float] | F | BaseFilter
+_DRAWS, _EPOCHS = 0, 1  # streams of random numbers
+_BUFFER = 1 << 16
+_SHUFFLES = (False, "exact", "blocks")
+
+
+class Numbers(Protocol):
+    """Batches of item numbers (int64), one after the other.
+
+    `items_identity` tells of which items; `give_back` takes the last batches that were not used after all.
+    """
+
+    items_identity: str
+
+    def __iter__(self) -> Iterator[Array]: ...
+
+    def give_back(self, batches: Sequence[Array]) -> None: ...
+
+    def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
+        """Where this is: plain numbers, strings, lists and arrays. `unused` are the last batches, to be given again."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on from there.
+
+        Raises:
+            SamplingError: it is the state of something else, or of other items.
+        """
+        ...
+
+
+class Sampler:
+    """Draws batches of item numbers without end, with replacement; batch i of a seed is the same wherever it is drawn.
+
+    Args:
+        items: what is drawn from.
+        batch_size: numbers in a batch.
+        by: "steps" draws from all items alike; "episodes" draws an episode (of those that have items) first, and then
+            one of its items, so that long episodes weigh no more than short ones.
+        weights: one for each item, or with `by="episodes"` one for each episode of the query; the chance is in
+            proportion. `update` changes them at little cost. An expression, such as `F("metadata.score")` or
+            `F("metadata.score") > 3`, is the weight of an episode; with `by="steps"`, of each of its items.
+        seed: an integer from 0; None takes one of the system's.
+
+    Raises:
+        SamplingError: an argument means nothing; weights that are negative, NaN, infinite, all zero or too few.
+    """
+
+    def __init__(
+        self,
+        items: Items[Any],
+        batch_size: int,
+        *,
+        by: Literal["steps", "episodes"] = "steps",
+        weights: Weights | None = None,
+        seed: int | None = None,
+    ) -> None:
+        if by not in ("steps", "episodes"):
+            raise SamplingError(f"expected by to be 'steps' or 'episodes', found {by!r:.80}")
+        self.items_identity = items.identity
+        self.batch_size = checked_count(batch_size, 1, "a batch size")
+        self.by = by
+        self.seed = _checked_seed(seed)
+        self.batch = 0  # the next one
+        self._unused: list[Array] = []
+        self._n = len(items)
+        self._counts = items.counts() if by == "episodes" else None
+        self._firsts = None if self._counts is None else np.cumsum(self._counts) - self._counts
+        self._what = "item" if self._counts is None else "episode"
+        self._episodes = None if self._counts is None else np.flatnonzero(self._counts)
+        if isinstance(weights, F | BaseFilter):
+            weights = items.episode_values(weights)
+            weights = weights if by == "episodes" else np.repeat(weights, items.counts())
+        self._tree = None
+        if weights is not None:
+            self._tree = SumTree(
+                self._checked(weights, self._n if self._counts is None else len(self._counts))
+            )
+
+    def _checked(self, weights: Any, n: int) -> Array:
+        found = np.asarray(weights)
+        if found.shape != (n,) or found.dtype.kind not in "biuf":
+            raise SamplingError(
+                f"expected {n} weights, one for each {self._what}, found {found.dtype} of shape {found.shape}"
+            )
+        found = found.astype(np.float64)
+        if not (np.isfinite(found) & (found >= 0)).all():
+            i = int(np.argmin(np.isfinite(found) & (found >= 0)))
+            raise SamplingError(f"expected weights from 0 on, found {found[i]} for {self._what} {i}")
+        if self._counts is not None and len(found) == len(self._counts):
+            found = np.where(self._counts > 0, found, 0.0)  # of an episode without items, none can be drawn
+        if not found.any():
+            raise SamplingError(
+                f"expected a weight above 0, found none for any {self._what} that can be drawn"
+            )
+        return found
+
+    def update(self, places: Array | Sequence[int], weights: Array | Sequence[float] | float) -> None:
+        """Sets the weights of some items (of some episodes with `by="episodes"`), from the next batch on.
+
+        Raises:
+            SamplingError: there are no weights, the places are not there, or a weight means nothing.
+        """
+        if self._tree is None:
+            raise SamplingError(
+                "expected a sampler with weights, found one without; give weights=... when it is made"
+            )
+        places = np.asarray(places, np.int64).reshape(-1)
+        n = len(self._tree.weights)
+        if len(places) and (places.min() < 0 or places.max() >= n):
+            raise SamplingError(
+                f"expected {self._what}s from 0 to {n - 1}, found {places.min()} to {places.max()}"
+            )
+        given = np.broadcast_to(np.asarray(weights, np.float64), places.shape)
+        if not (np.isfinite(given) & (given >= 0)).all():
+            raise SamplingError(f"expected finite weights from 0 on, found {given.min()} to {given.max()}")
+        if self._counts is not None:
+            given = np.where(self._counts[places] > 0, given, 0.0)
+        self._tree.update(places, given)
+
+    @property
+    def weights(self) -> Array | None:
+        """The weights as they are now (float64), as a copy; None if all count alike."""
+        return None if self._tree is None else self._tree.weights.copy()
+
+    def draw(self, number: int) -> Array:
+        """Batch `number` of this seed, with the weights as they are now."""
+        random = _random(self.seed, _DRAWS, number)
+        if self._tree is not None:
+            if not self._tree.total > 0:
+                raise SamplingError(f"expected a weight above 0, found 0 for every {self._what}")
+            found = self._tree.find(random.random(self.batch_size) * self._tree.total)
+        elif self._episodes is not None:
+            found = self._episodes[random.integers(0, len(self._episodes), self.batch_size)]
+        else:
+            return random.integers(0, self._n, self.batch_size)
+        if self._counts is None or self._firsts is None:
+            return found
+        return self._firsts[found] + random.integers(0, self._counts[found])
+
+    def __iter__(self) -> Iterator[Array]:
+        return self
+
+    def __next__(self) -> Array:
+        if self._unused:
+            return self._unused.pop(0)
+        self.batch += 1
+        return self.draw(self.batch - 1)
+
+    def give_back(self, batches: Sequence[Array]) -> None:
+        self._unused = [*batches, *self._unused]
+
+    def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
+        """Where this is; with weights, they are in it as an array."""
+        return {
+            "kind": f"{type(self).__name__} by {self.by}",
+            "items": self.items_identity,
+            "batch_size": self.batch_size,
+            "seed": self.seed,
+            "batch": self.batch,
+            "unused": [batch.tolist() for batch in (*unused, *self._unused)],
+            "weights": self.weights,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        _check_state(state, self.state_dict())
+        self.seed, self.batch = _checked_seed(state["seed"]), checked_count(state["batch"], 0, "a batch")
+        self._unused = [np.asarray(batch, np.int64) for batch in state["unused"]]
+        if (self._tree is None) != (state["weights"] is None):
+            raise SamplingError(
+                "expected a state of a sampler with weights if this one has some, and without if not"
+            )
+        if self._tree is not None:
+            self._tree = SumTree(self._checked(state["weights"], len(self._tree.weights)))
+
+
+class Order:
+    """Gives every item's number once an epoch, in batches; iterating again begins the next epoch.
+
+    Args:
+        items: what is numbered.
+        batch_size: numbers in a batch; the last one has what is left.
+        shuffle: False: in their order. "exact": any order is as likely as any other. "blocks": items wait in a
+            buffer that is filled block (chunk) by block, in random order, and leave it at random: few chunks are in
+            use at a time, and each is read about once an epoch, also where the cache holds only some of them.
+        seed: an integer from 0; None takes one of the system's. Each epoch has an order of its own.
+        drop_last: leave out a last batch that is not full.
+        buffer: how many items' worth of blocks are in use at a time; by default 65,536, or as many as half the cache
+            holds.
+
+    Raises:
+        SamplingError: an argument means nothing.
+    """
+
+    def __init__(
+        self,
+        items: Items[Any],
+        batch_size: int,
+        *,
+        shuffle: Shuffle | Literal[False] = False,
+        seed: int | None = None,
+        drop_last: bool = False,
+        buffer: int | None = None,
+    ) -> None:
+        if shuffle not in _SHUFFLES:
+            raise SamplingError(
+                f"expected shuffle to be one of {', '.join(map(repr, _SHUFFLES))}, found {shuffle!r:.80}"
+            )
+        self.items_identity = items.identity
+        self.batch_size = checked_count(batch_size, 1, "a batch size")
+        self.shuffle, self.drop_last = shuffle, drop_last
+        self.seed = _checked_seed(seed)
+        self.epoch, self.batch = 0, 0  # the next batch
+        self._resumed = True
+        self._n = len(items)
+        if buffer is not None:
+            self.buffer = checked_count(buffer, 1, "a buffer")
+        else:
+            self.buffer = max(1, min(_BUFFER, getattr(items.source, "room", _BUFFER)))
+        self._runs = items.block_runs() if shuffle == "blocks" else None
+        if not len(self):
+            raise SamplingError(
+                f"expected at least {batch_size} items for one full batch, found {self._n}; take drop_last=False"
+            )
+
+    def __len__(self) -> int:
+        """Batches in an epoch."""
+        return self._n // self.batch_size if self.drop_last else -(-self._n // self.batch_size)
+
+    def __iter__(self) -> Iterator[Array]:
+        if not self._resumed and self.batch:
+            self.epoch, self.batch = self.epoch + 1, 0
+        self._resumed = False
+        return self._rest()
+
+    def _rest(self) -> Iterator[Array]:
+        epoch, batches = self.epoch, self._batches(self.epoch)
+        for number in range(len(self)):
+            batch = next(batches)
+            if number < self.batch:
+                continue  # before the state that was loaded
+            self.batch = number + 1
+            yield batch
+            if self.epoch != epoch:
+                return  # another iteration has begun the next one
+        self.epoch, self.batch = epoch + 1, 0
+
+    def _batches(self, epoch: int) -> Iterator[Array]:
+        random = _random(self.seed, _EPOCHS, epoch)
+        if self._runs is not None:
+            return through_buffer(self._runs, self.buffer, self.batch_size, random)
+        order: Callable[[int], Array] = np.arange if self.shuffle is False else random.permutation
+        return _cut(order(self._n), self.batch_size)
+
+    def give_back(self, batches: Sequence[Array]) -> None:
+        state = self.state_dict(batches)
+        self.epoch, self.batch = state["epoch"], state["batch"]
+
+    def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
+        epoch, batch = self.epoch, self.batch
+        if unused and not batch:
+            epoch, batch = epoch - 1, len(self)
+        return {
+            "kind": f"{type(self).__name__}, shuffle={self.shuffle}",
+            "items": self.items_identity,
+            "batch_size": self.batch_size,
+            "buffer": self.buffer if self._runs is not None else 0,
+            "seed": self.seed,
+            "epoch": epoch,
+            "batch": batch - len(unused),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        _check_state(state, self.state_dict())
+        self.seed = _checked_seed(state["seed"])
+        self.epoch = checked_count(state["epoch"], 0, "an epoch")
+        self.batch = checked_count(state["batch"], 0, "a batch")
+        self._resumed = True
+
+
+def _cut(order: Array, size: int) -> Iterator[Array]:
+    for first in range(0, len(order), size):
+        yield order[first : first + size]
+
+
+def _random(seed: int, stream: int, number: int) -> np.random.Generator:
+    """A generator of its own for each number of a stream."""
+    return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, number]))
+
+
+def _checked_seed(seed: object) -> int:
+    if seed is None:
+        return int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
+    found = checked_count(seed, 0, "a seed")
+    if found >= 1 << 128:
+        raise SamplingError(f"expected a seed below 2**128, found {found}")
+    return found
+
+
+def _check_state(state: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """SamplingError unless a state is of the same kind, and of the same items."""
+    if not isinstance(state, Mapping) or not {"kind", "items"} <= state.keys():
+        raise SamplingError(f"expected a state that state_dict() gave, found {state!r:.80}")
+    if state["items"] != own["items"]:
+        raise SamplingError(
+            "expected the state of these items, found that of others: the dataset, its filters or the windows have "
+            "changed since; begin anew, or take what the state was saved with"
+        )
+    for key in ("kind", "batch_size", "buffer"):
+        if state.get(key) != own.get(key):
+            raise SamplingError(f"expected a state with {key} {own.get(key)!r}, found {state.get(key)!r:.80}")
+    if not own.keys() <= state.keys():
+        raise SamplingError(f"expected {', '.join(own)} in a state, found {', '.join(map(str, state))}")
