@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from environments import Sampler, Scripted, roll, same
 
+from tupli_mcap import progress
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.dataset import (
     BaseTupleParser,
@@ -24,7 +25,6 @@ from tupli_mcap.dataset import (
     TorchTupleParser,
     TupliDataset,
     loading,
-    progress,
     sources,
 )
 from tupli_mcap.errors import (

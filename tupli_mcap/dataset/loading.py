@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.dataset.columns import FieldBuilder, pick
-from tupli_mcap.dataset.progress import Progress, progress
 from tupli_mcap.dataset.selection import TupleSelector
 from tupli_mcap.dataset.sources import Source
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.messages.common import check_layouts
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import EpisodeHeader
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.dataset.loading import Selected
-from tupli_mcap.dataset.progress import progress
 from tupli_mcap.dataset.selection import TupleFilter
 from tupli_mcap.dataset.sources import DatasetError, Source
 from tupli_mcap.dataset.writing import StepsWriter
@@ -32,6 +31,7 @@ from tupli_mcap.materialized import (
 from tupli_mcap.messages.common import check_layouts, common_dtype
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.progress import progress
 from tupli_mcap.recording.blocks import Array
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 

@@ -37,6 +37,7 @@ __all__ = [
     "RowArea",
     "journal_in",
     "journal_info",
+    "journal_name",
     "journal_path",
     "read_journal",
     "recorded_journal",
@@ -53,7 +54,12 @@ _UUID = re.compile("[0-9a-f]{32}")
 def journal_path(path: str | os.PathLike[str]) -> Path:
     """Where the journal of a recording lies, links followed, unless it was given a `journal_dir`."""
     path = Path(os.path.realpath(path))
-    return path.parent / f"{path.name}.journal"
+    return path.parent / journal_name(path.name)
+
+
+def journal_name(name: str) -> str:
+    """The name of the journal of a recording of a name."""
+    return f"{name}.journal"
 
 
 def journal_in(directory: str | os.PathLike[str], path: Path, uuid: str) -> Path:

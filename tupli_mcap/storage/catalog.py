@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -120,6 +120,14 @@ class Catalog:
             rows = connection.execute(select(*columns).order_by(RECORDING.c.path))
             return {unescape_text(path): RecordingStamp(*stamp) for path, *stamp in rows}
 
+    def copies(self, relpath: str, uuid: str) -> bool:
+        """Whether another recording of the same UUID is catalogued."""
+        same = select(RECORDING.c.id).where(
+            RECORDING.c.uuid == uuid, RECORDING.c.path != escape_text(relpath)
+        )
+        with self._read() as connection:
+            return connection.execute(same.limit(1)).first() is not None
+
     def put_recording(
         self,
         relpath: str,
@@ -140,14 +148,27 @@ class Catalog:
         remaining = iter(rows)
         first = list(itertools.islice(remaining, _ROWS_AT_ONCE))  # read before the lock is taken
         with self._write() as connection:
-            _remove_recording(connection, relpath)
-            values = {"path": escape_text(relpath), "uuid": uuid, "benchmark_id": escape_text(benchmark_id)}
-            added = connection.execute(insert(RECORDING).values(**values, **stamp._asdict()))
-            (number,) = added.inserted_primary_key or (0,)
+            number = _add_recording(connection, relpath, stamp, uuid, benchmark_id)
             chunk = first
             while chunk:
                 connection.exec_driver_sql(_INSERT, [store_row(number, row) for row in chunk])
                 chunk = list(itertools.islice(remaining, _ROWS_AT_ONCE))
+
+    def put_stored(
+        self,
+        relpath: str,
+        stamp: RecordingStamp,
+        *,
+        uuid: str,
+        benchmark_id: str,
+        rows: Sequence[tuple[Any, ...]],
+    ) -> None:
+        """The same with rows that `store_row(0, …)` has made; raises as it does."""
+        with self._write() as connection:
+            number = _add_recording(connection, relpath, stamp, uuid, benchmark_id)
+            if rows:
+                base = number << EPISODE_BITS
+                connection.exec_driver_sql(_INSERT, [(base + row[0], number, *row[2:]) for row in rows])
 
     def remove_recording(self, relpath: str) -> None:
         """Forget a recording and its episodes; nothing happens if it is not catalogued."""
@@ -236,6 +257,17 @@ class Catalog:
 
 
 _OF_RECORDING: Final = (RECORDING.c.uuid, RECORDING.c.benchmark_id, RECORDING.c.path)
+
+
+def _add_recording(
+    connection: Connection, relpath: str, stamp: RecordingStamp, uuid: str, benchmark_id: str
+) -> int:
+    """Adds a recording without episodes, in place of what was known of it; returns its id."""
+    _remove_recording(connection, relpath)
+    values = {"path": escape_text(relpath), "uuid": uuid, "benchmark_id": escape_text(benchmark_id)}
+    added = connection.execute(insert(RECORDING).values(**values, **stamp._asdict()))
+    (number,) = added.inserted_primary_key or (0,)
+    return int(number)
 
 
 def _remove_recording(connection: Connection, relpath: str) -> None:

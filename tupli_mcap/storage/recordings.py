@@ -10,14 +10,16 @@ import re
 import secrets
 import stat
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
+from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.recording.lock import is_locked, writers_kept_out
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
+from tupli_mcap.storage.ahead import Ahead, ReadRecording
 from tupli_mcap.storage.atomic import Lock, LockError, os_errors
 from tupli_mcap.storage.catalog import (
     Catalog,
@@ -53,6 +55,7 @@ class RecordingFiles:
         self._declared_keys = list(declared_keys)
         self._opened: Catalog | None = None
         self._synced: tuple[int, int] | None = None  # the catalog that has been brought up to date
+        self._undeclared = True  # its keys are still to be declared
         self._warned: set[tuple[str, RecordingStamp]] = set()
 
     def close(self) -> None:
@@ -90,6 +93,7 @@ class RecordingFiles:
         raise StorageError(f"the catalog of {str(self._root)!r} is replaced all the time; try again later")
 
     def explain(self, filter: BaseFilter | None) -> str:
+        self._declare_keys()
         return self._catalog.explain(filter)
 
     def declare_key(self, key: str) -> None:
@@ -154,7 +158,6 @@ class RecordingFiles:
         if self._opened is None:
             try:
                 self._opened = Catalog(self._root / "catalog.sqlite")
-                self._declare_all(self._opened)
             except StorageError as err:
                 if not isinstance(err, CatalogUnusableError) and os.access(self._root, os.W_OK):
                     raise
@@ -170,12 +173,15 @@ class RecordingFiles:
             self._opened = Catalog(None)
         except (OSError, StorageError):
             raise err from None  # there is no place for another one either
-        self._declare_all(self._opened)
         return self._opened
 
-    def _declare_all(self, catalog: Catalog) -> None:
-        for key in self._declared_keys:
-            catalog.declare_key(key)
+    def _declare_keys(self) -> None:
+        """After the catalog was opened or made anew, perhaps by another process: once there is something in it, for an
+        index is made more quickly than it is added to."""
+        if self._undeclared:
+            for key in self._declared_keys:
+                self._catalog.declare_key(key)
+            self._undeclared = False
 
     def sync(self) -> None:
         """Bring the catalog up to date with the files."""
@@ -184,7 +190,6 @@ class RecordingFiles:
                 self._sync()
             except CatalogDamagedError:
                 self._catalog.reset()
-                self._declare_all(self._catalog)
                 self._sync()
         except (CatalogUnusableError, LockError) as err:
             self._use_temporary(err)
@@ -235,15 +240,24 @@ class RecordingFiles:
     def _sync_once(self) -> bool:
         """False if the catalog was replaced meanwhile."""
         if not self._changes():
+            self._declare_keys()
             return True
         # One process at a time: what another one read a moment ago must not replace what is newer.
         with contextlib.nullcontext() if self._catalog.is_temporary else self._lock:
-            for relative, path in self._changes().items():
+            self._follow(self._changes())
+            self._declare_keys()
+            return self._catalog.identity == self._synced
+
+    def _follow(self, changes: Mapping[str, Path | None]) -> None:
+        """Brings what has changed into the catalog."""
+        there = [relative for relative, path in changes.items() if path is not None]
+        with progress(len(changes), "Cataloguing recordings") as bar, Ahead(self._root, there) as ahead:
+            for relative, path in changes.items():
                 if path is None:
                     self._catalog.remove_recording(relative)
                 else:
-                    self._try_to_put(relative, path)
-            return self._catalog.identity == self._synced
+                    self._try_to_put(relative, path, ahead.take(relative))
+                bar.advance(1)
 
     def _changes(self) -> dict[str, Path | None]:
         """Recordings that the catalog does not know as they are; None for those that are gone.
@@ -253,7 +267,9 @@ class RecordingFiles:
         known = self._catalog.recordings()
         if self._catalog.identity != self._synced:
             self._synced = self._catalog.identity
-            self._declare_all(self._catalog)  # another process may have made it
+            self._undeclared = True
+        if known:
+            self._declare_keys()
         with os_errors("cannot list the recordings below", self._root):
             found = sorted(scan(self._root))
         changes: dict[str, Path | None] = dict.fromkeys(known.keys() - {item.relative for item in found})
@@ -264,9 +280,12 @@ class RecordingFiles:
                 changes[item.relative] = path
         return changes
 
-    def _try_to_put(self, relative: str, path: Path) -> None:
+    def _try_to_put(self, relative: str, path: Path, read: ReadRecording | None) -> None:
         stamp = RecordingStamp(0, 0, 0)
         try:
+            if read is not None:
+                self._put_read(relative, path, read)
+                return
             stamp = stamp_of(path)
             self._put(relative, path, stamp)
         except FileNotFoundError:
@@ -288,31 +307,42 @@ class RecordingFiles:
         live = is_locked(path)
         with Recording(path) as recording:
             live |= is_locked(path)  # a writer may have come or gone meanwhile
-            original = self._original_of(relative, recording)
-            if original is not None:
-                self._catalog.remove_recording(relative)
-                self._warn_once(
-                    relative, stamp, f"skipped a recording: {path} holds episodes of {original} again"
+            ends = [int(recording.index["episode"][i]) for i in (0, -1)] if len(recording) else []
+            if not self._is_copy(relative, path, stamp, recording.uuid, ends):
+                self._catalog.put_recording(
+                    relative,
+                    stamp._replace(sidecar_mtime_ns=_LIVE) if live else stamp,
+                    uuid=recording.uuid,
+                    benchmark_id=recording.benchmark_id,
+                    rows=catalog_rows(recording, sidecar, live=live),
                 )
-                return len(recording)
-            self._catalog.put_recording(
-                relative,
-                stamp._replace(sidecar_mtime_ns=_LIVE) if live else stamp,
-                uuid=recording.uuid,
-                benchmark_id=recording.benchmark_id,
-                rows=catalog_rows(recording, sidecar, live=live),
-            )
             return len(recording)
 
-    def _original_of(self, relative: str, recording: Recording) -> str | None:
-        """Another recording that holds the first or the last episode of this one."""
-        numbers = {int(recording.index["episode"][i]) for i in (0, -1)} if len(recording) else set()
-        for number in numbers:
-            uri = episode_id(recording.uuid, number)
-            for header in self._catalog.episodes(FilterEQ(key="id", value=uri)):
+    def _put_read(self, relative: str, path: Path, read: ReadRecording) -> None:
+        """The same of a recording that has been read already."""
+        if not self._is_copy(relative, path, read.stamp, read.uuid, read.ends):
+            self._catalog.put_stored(
+                relative,
+                read.stamp._replace(sidecar_mtime_ns=_LIVE) if read.live else read.stamp,
+                uuid=read.uuid,
+                benchmark_id=read.benchmark_id,
+                rows=read.rows,
+            )
+
+    def _is_copy(
+        self, relative: str, path: Path, stamp: RecordingStamp, uuid: str, ends: Sequence[int]
+    ) -> bool:
+        """Whether another recording holds the first or the last episode of this one, which then is left out."""
+        if not self._catalog.copies(relative, uuid):
+            return False
+        for number in set(ends):
+            for header in self._catalog.episodes(FilterEQ(key="id", value=episode_id(uuid, number))):
                 if header.recording != relative:
-                    return header.recording
-        return None
+                    self._catalog.remove_recording(relative)
+                    original = f"holds episodes of {header.recording} again"
+                    self._warn_once(relative, stamp, f"skipped a recording: {path} {original}")
+                    return True
+        return False
 
     # --- changes ---
 

@@ -24,6 +24,8 @@ _UNUSUAL: Final = re.compile('[\\\\\x01\ud7ff\ud800-\udfff]|"\\$')
 _TO_ESCAPE: Final = re.compile("[\x00\x01\ud7ff\ud800-\udfff]")
 _ESCAPED: Final = re.compile("\x01[\x01\x02]|\ud7ff[\x01\u0100-\u08ff]")
 _ALL_FIELDS: Final = set(EpisodeHeader.model_fields)
+_NEW: Final = EpisodeHeader.__new__
+_SET: Final = object.__setattr__
 _SURROGATES_AT: Final = 0x100
 _LONGEST_INT_BITS: Final = 1024  # what a float can hold
 
@@ -102,26 +104,34 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
 def header(row: StoredRow, uuid: str, benchmark_id: str, path: str) -> EpisodeHeader:
     """The header of a stored row; the other arguments come from its recording, as stored.
 
-    Built without validation, which would cost more than the rest of a query.
+    Built without validation, and without `model_construct`, which would cost more than the rest of a query.
     """
-    return EpisodeHeader.model_construct(
-        _ALL_FIELDS,
-        id=f"{uuid}-{row.episode}",
-        created_by=unescape_text(row.created_by),
-        published_in=list(_published_in(row.published_in)),
-        created_at=unescape_text(row.created_at),
-        benchmark_id=unescape_text(benchmark_id),
-        metadata=load_metadata(row.metadata if row.original is None else row.original),
-        n_tuples=row.n_tuples,
-        terminated=row.end == "terminal",
-        timeout=row.end == "timeout",
-        end=row.end,
-        episode_return=load_number(row.episode_return),
-        seed=load_number(row.seed),
-        env=row.env,
-        episode=row.episode,
-        recording=unescape_text(path),
+    found = _NEW(EpisodeHeader)
+    _SET(found, "__pydantic_fields_set__", _ALL_FIELDS)  # all of them are: nothing is ever added to it
+    _SET(found, "__pydantic_extra__", None)
+    _SET(found, "__pydantic_private__", None)
+    _SET(
+        found,
+        "__dict__",
+        {
+            "id": f"{uuid}-{row.episode}",
+            "created_by": unescape_text(row.created_by),
+            "published_in": list(_published_in(row.published_in)),
+            "created_at": unescape_text(row.created_at),
+            "benchmark_id": unescape_text(benchmark_id),
+            "metadata": load_metadata(row.metadata if row.original is None else row.original),
+            "n_tuples": row.n_tuples,
+            "terminated": row.end == "terminal",
+            "timeout": row.end == "timeout",
+            "end": row.end,
+            "episode_return": load_number(row.episode_return),
+            "seed": load_number(row.seed),
+            "env": row.env,
+            "episode": row.episode,
+            "recording": unescape_text(path),
+        },
     )
+    return found
 
 
 def searchable(text: str) -> tuple[str, str | None]:
@@ -132,9 +142,10 @@ def searchable(text: str) -> tuple[str, str | None]:
     """
     if not _is_unusual(text):
         try:
-            if isinstance(_DECODER.decode(text), dict):
+            value, end = _SCAN(text, 0)
+            if end == len(text) and isinstance(value, dict):
                 return text, None
-        except (ValueError, RecursionError):
+        except (ValueError, StopIteration, RecursionError):
             pass  # a defect, or a key twice: the slow way below decides
     value = jsonvalue.loads(text)
     if not isinstance(value, dict):
@@ -197,7 +208,8 @@ def _refuse_constant(name: str) -> Any:
     raise ValueError(f"{name} is no JSON")
 
 
-_DECODER: Final = json.JSONDecoder(object_pairs_hook=_unique, parse_constant=_refuse_constant)
+# What `decode` calls, without the time it takes around it.
+_SCAN: Final = json.JSONDecoder(object_pairs_hook=_unique, parse_constant=_refuse_constant).scan_once  # type: ignore[attr-defined]
 
 
 def _search_form(value: object) -> Any:

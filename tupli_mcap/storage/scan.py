@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tupli_mcap.recording import journal_path
+from tupli_mcap.recording.journal import journal_name
 from tupli_mcap.storage.rows import RecordingStamp
 from tupli_mcap.storage.sidecar import sidecar_path
 
@@ -37,7 +37,7 @@ def scan(root: Path) -> Iterator[FoundRecording]:
             if name.endswith(".mcap"):
                 try:
                     if entry.is_file():
-                        journal = journal_path(name).name in found
+                        journal = journal_name(name) in found
                         yield FoundRecording(prefix + name, _stamp(entry, found), journal)
                 except OSError as err:
                     if err.errno not in (errno.ENOENT, errno.ELOOP):  # deleted since, or a link in a circle
