@@ -25,6 +25,7 @@ import gymnasium as gym
 import numpy as np
 import zstandard
 from gymnasium import spaces
+from gymnasium.wrappers import FrameStackObservation
 
 from tupli_mcap import RecordEpisodes
 from tupli_mcap import vector as recorded_vector
@@ -197,6 +198,22 @@ def constant(path: Path, compression: str) -> list[Log]:
     for episode in episodes:
         total = episode["return"]
         episode["metadata"] = {"score": total, "good": total > 0, "odd": [float("nan"), "ä", None]}
+    return episodes
+
+
+def stacked(path: Path) -> list[Log]:
+    def observe(episode: int, t: int) -> Any:
+        return np.arange(6, dtype=np.uint8).reshape(2, 3) + np.uint8(40 * episode + 7 * t)
+
+    env = Played(spaces.Box(0, 255, (2, 3), np.uint8), observe, ENDS)
+    window = FrameStackObservation(env, 3)
+    with RecordEpisodes(window, path, compression="none", attachments={}, chunk_size=400) as recorder:
+        roll(recorder, env, [3, 4, 2], action)
+    episodes = expected(env)
+    for episode in episodes:
+        frames = [episode["states"][0]] * 2 + [*episode["states"], episode["final_state"]]
+        windows = [np.stack(frames[i : i + 3]) for i in range(len(frames) - 2)]
+        *episode["states"], episode["final_state"] = windows
     return episodes
 
 
@@ -462,6 +479,7 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "unfinished_images": lambda path: unfinished(path, Played(CAMERA, picture, ENDS)),
     "frames": frames,
     "unfinished_frames": unfinished_frames,
+    "stacked": stacked,
 }
 
 

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import FrameStackObservation
 
 from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
@@ -36,6 +37,7 @@ class Kind:
     reward: gym.Space[Any] | None = None
     plain: bool = False  # states of one value each, for they are large
     rotates: bool = False  # goes on in other files
+    window: bool = False  # states are the newest frames, the oldest first
     large: int = 0  # every episode's texts are longer than the last one's, up to here
 
 
@@ -76,6 +78,7 @@ KINDS = {
         (300, 60_000),
         threaded=True,
     ),
+    "stacked": Kind(spaces.Box(0, 255, (4, 90, 70), np.uint8), (20_000, 60_000), threaded=True, window=True),
     "info": Kind(_BOX, options={"record_info": True}),
     "info and text": Kind(_TEXT, _SMALL, options={"record_info": ["t"]}),
     "metadata": Kind(_BOX, options={"metadata_callback": True}),
@@ -172,6 +175,10 @@ class Teller(gym.Env[Any, Any]):
             space = self.observation_space
             return np.full(space.shape, self._random.integers(256), space.dtype)
         state = self.observation_space.sample()
+        if self._kind.window and self._steps and self._random.integers(9):  # now and then it breaks off
+            state[:-1] = self._kept[1:]
+        if self._kind.window:
+            self._kept = state
         if not self._kind.reuse:
             return state
         if self._kept is None:
@@ -182,6 +189,20 @@ class Teller(gym.Env[Any, Any]):
             self._kept["x"] = state["x"]
             self._kept["y"][...] = state["y"]
         return self._kept
+
+
+class Stacked(FrameStackObservation):
+    """Says that the environment stacks frames, which it does itself."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        gym.Wrapper.__init__(self, env)
+        self.stack_size = env.observation_space.shape[0]  # type: ignore[index, misc]
+
+    def reset(self, **kwargs: Any) -> Any:
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        return self.env.step(action)
 
 
 def open_recorder(
@@ -198,6 +219,8 @@ def open_recorder(
         options["journal_dir"] = path.parent / "journals"
     if kind.reward is not None:
         options["reward_space"] = kind.reward
+    if kind.window:
+        return RecordEpisodes(Stacked(Teller(kind, 0, seed, tell)), path, **options)
     if kind.vector is None:
         return RecordEpisodes(Teller(kind, 0, seed, tell), path, **options)
     makers = [lambda i=i: Teller(kind, i, seed, tell) for i in range(SUB_ENVIRONMENTS)]

@@ -32,7 +32,7 @@ class MessageDecoder:
 
     def state(self, body: memoryview) -> int:
         """Where the state ends in the body of a step that is not complete."""
-        leaves = [leaf for leaf in self._layout.state if leaf.kind != "image" and leaf in self._step]
+        leaves = [leaf for leaf in self._layout.state if not leaf.apart and leaf in self._step]
         return self._leaves(body, leaves)[1]
 
     def final(self, body: memoryview) -> tuple[int, dict[str, Any]]:

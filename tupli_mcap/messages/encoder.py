@@ -243,7 +243,7 @@ def _fields(
     source: _Source, layout: StepLayout, leaves: Sequence[Leaf], root: str, packed: _Packed, stores: list[str]
 ) -> None:
     for i, leaf in enumerate(leaves):
-        if leaf.kind == "image":
+        if leaf.apart:
             continue
         dtype = layout.dtypes[leaf.name]
         access = _access(source, root, leaf.keys)

@@ -134,7 +134,9 @@ class ImageLayout(NamedTuple):
 
 def image_layout(leaf: Leaf) -> ImageLayout:
     """The layout of an image leaf's messages; field `data` has the leaf's shape, `sec`/`nanosec` its stamp."""
-    height, width, channels = leaf.shape
+    frames = leaf.shape[0] if leaf.kind == "stack" else 1  # one picture below the other
+    height, width, channels = (*leaf.shape[1:], 1)[:3] if leaf.kind == "stack" else leaf.shape
+    height *= frames
     encoding = {1: b"mono8", 3: b"rgb8", 4: b"rgba8"}[channels]
     body = bytearray(8)
     for value in (leaf.name.encode(), height, width, encoding, b"", width * channels, leaf.size):

@@ -63,7 +63,7 @@ class Leaf:
     path: str
     name: str
     space: gym.Space[Any]
-    kind: Literal["array", "scalar", "image", "variable"]
+    kind: Literal["array", "scalar", "image", "stack", "variable"]
     dtype: DType | None
     shape: tuple[int, ...]
 
@@ -71,6 +71,11 @@ class Leaf:
     def size(self) -> int:
         """Number of elements of one value."""
         return math.prod(self.shape)
+
+    @property
+    def apart(self) -> bool:
+        """True if the leaf has a channel of its own: an image, or a stack of frames."""
+        return self.kind in ("image", "stack")
 
     @property
     def is_scalar(self) -> bool:

@@ -6,7 +6,7 @@ a reader refuses a file whose schema text says something else.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -28,10 +28,11 @@ from tupli_mcap.messages.leaves import ROS_TYPES, DType, Leaf, NameRegistry, fla
 from tupli_mcap.messages.spaces import space_from_json, space_to_json
 from tupli_mcap.messages.variable import VariableField
 
-__all__ = ["FINAL_STATE_SCHEMA", "STEP_SCHEMA", "StepLayout"]
+__all__ = ["FINAL_STATE_SCHEMA", "STEP_SCHEMA", "StepLayout", "can_stack"]
 
 STEP_SCHEMA = "tupli_mcap/msg/Step"
 FINAL_STATE_SCHEMA = "tupli_mcap/msg/FinalState"
+MAX_FRAMES = 256  # of a stack: what a row takes in memory is at most so many times what it takes in the file
 _RESERVED = ("episode", "step", "terminal", "timeout", "env")
 _U32, _BOOL = np.dtype(np.uint32), np.dtype(np.bool_)
 
@@ -40,7 +41,8 @@ class StepLayout:
     """Leaves, stored dtypes and message layouts of `/step`, `/final_state` and the image channels.
 
     `dtypes` maps a constant leaf's ROS name to its stored dtype; leaves not named keep the declared one. `inner_dtypes`
-    does the same inside leaves of variable size: ROS name -> path in the leaf -> dtype name.
+    does the same inside leaves of variable size: ROS name -> path in the leaf -> dtype name. `stacks` names leaves
+    whose first axis are the frames of a sliding window; one whose values are not uint8 is an array like any other.
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
@@ -53,6 +55,7 @@ class StepLayout:
         reward_space: gym.Space[Any] | None = None,
         dtypes: Mapping[str, DType] | None = None,
         inner_dtypes: Mapping[str, Mapping[str, str]] | None = None,
+        stacks: Collection[str] = (),
     ) -> None:
         self.inner_dtypes = {name: dict(found) for name, found in (inner_dtypes or {}).items() if found}
         self.observation_space = observation_space
@@ -78,6 +81,11 @@ class StepLayout:
             else leaf
             for leaf in self.state
         ]
+        self.state = [
+            _as_stack(leaf) if leaf.name in stacks and self.dtypes.get(leaf.name) == np.uint8 else leaf
+            for leaf in self.state
+        ]
+        self.stacks = [leaf.name for leaf in self.state if leaf.kind == "stack"]
         self.nest_state = structure(observation_space)
         self.nest_action = structure(action_space)
         self.nest_reward = structure(reward)
@@ -88,17 +96,18 @@ class StepLayout:
 
     @cached_property
     def images(self) -> list[Leaf]:
-        return [leaf for leaf in self.state if leaf.kind == "image"]
+        """The leaves of the state that have a channel of their own."""
+        return [leaf for leaf in self.state if leaf.apart]
 
     @cached_property
     def step_leaves(self) -> list[Leaf]:
         """The leaves that `/step` itself holds, in message order."""
-        return [leaf for leaf in self.leaves if leaf.kind != "image"]
+        return [leaf for leaf in self.leaves if not leaf.apart]
 
     @cached_property
     def final_leaves(self) -> list[Leaf]:
         """The leaves of `/final_state`: those of `/step` first, at the same offsets, then the images."""
-        return [leaf for leaf in self.state if leaf.kind != "image"] + self.images
+        return [leaf for leaf in self.state if not leaf.apart] + self.images
 
     @cached_property
     def constant(self) -> bool:
@@ -189,6 +198,7 @@ class StepLayout:
             "reward_space": reward,
             "dtypes": jsonvalue.dumps({name: dtype.name for name, dtype in self.dtypes.items()}),
             "inner_dtypes": jsonvalue.dumps(self.inner_dtypes),
+            **({"stacks": jsonvalue.dumps(self.stacks)} if self.stacks else {}),
         }
 
     @classmethod
@@ -210,6 +220,11 @@ class StepLayout:
             raise FormatError(
                 f"channel metadata 'inner_dtypes': expected paths with dtypes, found {inner!r:.200}"
             )
+        stacks = jsonvalue.loads(metadata.get("stacks", "[]"))
+        if not isinstance(stacks, list) or not all(isinstance(name, str) for name in stacks):
+            raise FormatError(
+                f"channel metadata 'stacks': expected a list of ROS names, found {stacks!r:.200}"
+            )
         try:
             layout = cls(
                 space_from_json(jsonvalue.loads(_entry(metadata, "observation_space"))),
@@ -217,11 +232,31 @@ class StepLayout:
                 reward,
                 {name: np.dtype(text) for name, text in names.items()},
                 inner,
+                stacks,
             )
+            if layout.stacks != stacks:
+                raise FormatError(
+                    f"channel metadata 'stacks': expected leaves of the state, found {stacks!r:.200}"
+                )
             _ = layout.variable
             return layout
         except SpaceError as err:
             raise FormatError(f"channel metadata describes spaces that cannot be recorded: {err}") from err
+
+
+def can_stack(leaf: Leaf) -> bool:
+    """Whether a leaf may be a stack of frames: uint8 of shape (frames, H, W) or (frames, H, W, 1|3|4)."""
+    pictures = len(leaf.shape) == 3 or (len(leaf.shape) == 4 and leaf.shape[3] in (1, 3, 4))
+    return leaf.dtype == np.uint8 and pictures and 0 not in leaf.shape and 2 <= leaf.shape[0] <= MAX_FRAMES
+
+
+def _as_stack(leaf: Leaf) -> Leaf:
+    if not can_stack(leaf):
+        raise SpaceError(
+            f"{leaf.path}: expected uint8 frames of shape (2 to {MAX_FRAMES}, H, W) or (…, H, W, 1, 3 or 4) "
+            f"as a stack, found {leaf.space}"
+        )
+    return replace(leaf, kind="stack")
 
 
 def _entry(metadata: Mapping[str, str], key: str) -> str:

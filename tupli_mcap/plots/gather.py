@@ -98,7 +98,7 @@ def measure(recording: Recording, positions: Array) -> Measured:
         first, last = np.searchsorted(sample, (found.read_steps, found.read_steps + size))
         sampled = sample[first:last] - found.read_steps
         for leaf in found.leaves:
-            if leaf.leaf.kind != "image":
+            if not leaf.leaf.apart:
                 leaf.put(block.leaves[leaf.leaf.name][:size], sampled)
         found.read_steps += size
         found.read_episodes += int((block.lengths > 0).sum()) if block.first_step == 0 else 0

@@ -143,7 +143,9 @@ def _pictures(recording: Recording, position: int, length: int, leaves: list[Lea
 
 
 def _picture(value: Array) -> Array:
-    """H x W or H x W x 3|4: the last of a stack (n, H, W); one channel becomes none."""
+    """H x W or H x W x 3|4: the last of a stack; one channel becomes none."""
+    if value.ndim == 4:
+        value = value[-1]
     if value.ndim == 3 and value.shape[2] in (3, 4):
         return value
     if value.ndim == 3 and value.shape[2] == 1:

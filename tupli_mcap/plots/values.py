@@ -124,7 +124,7 @@ class LeafValues:
 def _kind(leaf: Leaf) -> Kind:
     if leaf.kind == "variable":
         return "variable"
-    if leaf.kind == "image" or _is_picture(leaf):
+    if leaf.apart or _is_picture(leaf):
         return "picture"
     if not leaf.size:
         return "empty"

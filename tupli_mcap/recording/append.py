@@ -17,6 +17,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import COMPRESSIONS, Container
 from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.durability import sync_file
+from tupli_mcap.recording.imagecodecs import image_codecs
 from tupli_mcap.recording.journal import journal_info, journal_path, recorded_journal
 from tupli_mcap.recording.recover import belongs, head, misplaced_journal
 from tupli_mcap.recording.signed import SIGNATURE_NAME
@@ -198,6 +199,7 @@ def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> Non
     steps = [c for c in writer.container.channels.values() if c.topic.endswith("/step")]
     if steps:
         writer.layout = StepLayout.from_metadata(steps[0].metadata)
+        writer.container.codecs = image_codecs(writer.layout, writer.container.channels)
         writer.recorded_envs = len(steps)
         writer.recorded_vector = steps[0].topic != "/step"
 

@@ -17,11 +17,13 @@ from tupli_mcap.recording.cameras import (
 )
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.events import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
+from tupli_mcap.recording.imagecodecs import image_codecs
 from tupli_mcap.recording.journal import Area, LogArea, RowArea
 from tupli_mcap.recording.rows import rows_per_half
 
 __all__ = ["FRAMES_AREA", "Channels", "plan_areas", "register_channels"]
 
+_HALF = 8 << 20  # bytes of images in half a journal
 FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name
 
 
@@ -104,6 +106,7 @@ def register_channels(
                     channel(topics.frame, FRAME_NAME, FRAME_SCHEMA, about),
                 )
             )
+    container.codecs = image_codecs(layout, container.channels)
     return Channels(steps, images, *others, pairs)
 
 
@@ -124,7 +127,13 @@ def plan_areas(
         areas.append(RowArea("steps", row, rows_per_half(row, size), n))
     for leaf in layout.images:
         row = layout.image_messages[leaf.name].dtype.itemsize
-        rows = rows_per_half(row, max(size, min(8 * row, 1 << 20)))  # a few images a chunk, within 1 MiB
+        stored = (
+            row // leaf.shape[0] if leaf.kind == "stack" else row
+        )  # of a stack, most rows store one frame
+        rows = rows_per_half(
+            stored, max(size, min(8 * stored, 1 << 20))
+        )  # a few images a chunk, within 1 MiB
+        rows = max(1, min(rows, _HALF // row))
         areas += [RowArea(f"{leaf.name}/{i}", row, rows) for i in range(n)]
     areas.append(LogArea("events", 512 * 1024))
     if infos:

@@ -11,9 +11,9 @@ import os
 import struct
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from mmap import mmap
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -111,6 +111,14 @@ class ChunkCache:
         ChunkCache.__init__(self, state["budget"])
 
 
+class Decoder(Protocol):
+    """What the chunks of a channel go through before they are rows of constant size."""
+
+    def decode(self, data: Any, count: int, where: str) -> Any:
+        """The records of `count` rows; FormatError if the chunk does not hold them."""
+        ...
+
+
 _numbers = itertools.count()
 
 
@@ -133,6 +141,7 @@ class ChunkStore:
         self._cache = ChunkCache(cache) if isinstance(cache, int) else cache
         self._checked = np.zeros(len(table), np.bool_)
         self._number = next(_numbers)  # tells the stores apart that share a cache
+        self.codecs: Mapping[int, Decoder] = {}  # of the channels whose rows have to be decoded
         self._by_channel: dict[int, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
         self._counts: dict[int, int] = {}
         for channel in np.unique(table["channel"]):
@@ -179,7 +188,9 @@ class ChunkStore:
 
     def elsewhere(self, source: Source, cache: ChunkCache) -> ChunkStore:
         """The same chunks, read from another source, kept in another cache."""
-        return ChunkStore(source, self.table, self._memory, cache)
+        store = ChunkStore(source, self.table, self._memory, cache)
+        store.codecs = self.codecs
+        return store
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -255,7 +266,8 @@ class ChunkStore:
 
     def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> np.ndarray[Any, Any]:
         """The rows of a chunk of constant layout as one structured array; their headers are checked."""
-        kept = self.chunk(i, keep=keep)
+        codec = self.codecs.get(int(self.table["channel"][i]))
+        kept = self.chunk(i, keep=keep) if codec is None else self._decoded(i, codec, keep=keep)
         if kept.rows is not None:
             return kept.rows
         data = kept.data
@@ -271,6 +283,16 @@ class ChunkStore:
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
         kept.rows = rows
         return rows
+
+    def _decoded(self, i: int, codec: Decoder, *, keep: bool) -> KeptChunk:
+        """A chunk as rows of constant size, which are kept instead of what it holds."""
+        kept = self._cache.get((self._number, ~i))
+        if kept is None:
+            where = f"{self._source.name}: chunk {i}"
+            kept = KeptChunk(codec.decode(self._read(i), int(self.table["rows"][i]), where))
+            if keep:
+                self._cache.put((self._number, ~i), kept)
+        return kept
 
     def messages(self, i: int) -> list[tuple[int, int]]:
         """(start, end) of each message record of a chunk of variable layout."""

@@ -81,7 +81,7 @@ class ColumnReader:
         }  # fmt: skip
         leaves = [leaf for field, group in wanted.items() if field in fields for leaf in group]
         flags = [name for name in ("terminal", "timeout") if f"{name}s" in fields]
-        skipped = {leaf.name for leaf in leaves if leaf.kind == "image" and not images}
+        skipped = {leaf.name for leaf in leaves if leaf.apart and not images}
         out: dict[str, Any] = {
             leaf.name: self._empty(leaf, 0 if leaf.name in skipped else total) for leaf in leaves
         }
@@ -89,7 +89,7 @@ class ColumnReader:
         if "times" in fields:
             out[_TIME] = np.empty(total, np.uint64)
         tasks: list[Callable[[], None]] = []
-        plain = [leaf.name for leaf in leaves if leaf.kind != "image" and leaf.size] + flags
+        plain = [leaf.name for leaf in leaves if not leaf.apart and leaf.size] + flags
         if layout.constant and "times" in fields:
             plain.append(_TIME)
         elif "times" in fields:
@@ -99,7 +99,7 @@ class ColumnReader:
         elif plain:
             self._decode(runs, plain, out)
         for leaf in leaves:
-            if leaf.kind == "image" and leaf.name not in skipped:
+            if leaf.apart and leaf.name not in skipped:
                 moved = runs._replace(channels=self._image_channels(leaf.name, runs.channels))
                 tasks += self._tasks(
                     moved, ["data"], {"data": out[leaf.name]}, layout.image_messages[leaf.name].dtype, keep

@@ -12,7 +12,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import lz4.frame
 import numpy as np
@@ -71,6 +71,14 @@ class Rows(NamedTuple):
     times: np.ndarray[Any, np.dtype[np.uint64]]
 
 
+class Encoder(Protocol):
+    """What rows of constant size go through on their way to a chunk."""
+
+    def encode(self, rows: Rows) -> Rows:
+        """The same messages, as the channel has them."""
+        ...
+
+
 class Prepared(NamedTuple):
     """A chunk before compression: `skip` bytes of Schema and Channel records come before the rows in `data`."""
 
@@ -106,6 +114,9 @@ class Container:
         self.start_time: int | None = None
         self.end_time = 0
         self.chunk_rows = bytearray()
+        self.codecs: Mapping[
+            int, Encoder
+        ] = {}  # of the channels whose rows are written otherwise than they come
         self._announced: set[int] = set()
 
     def write(self, data: bytes) -> None:
@@ -181,7 +192,8 @@ class Container:
         The channel's first chunk starts with its Schema and Channel records.
         """
         if len(rows.offsets):
-            chunk = self.prepare(rows)
+            codec = self.codecs.get(rows.channel)
+            chunk = self.prepare(rows if codec is None else codec.encode(rows))
             self.place(chunk, self.pack(chunk.data))
 
     def prepare(self, rows: Rows) -> Prepared:

@@ -157,8 +157,10 @@ def is_ours(topic: str) -> bool:
 def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
     """The metadata without its checksum; FormatError unless it is whole, and of a format this version reads."""
     version = found.get("format_version")
-    if version != "1":
-        raise FormatError(f"{source.name}: expected format version '1', found {version!r}; update tupli-mcap")
+    if version not in ("1", "2"):
+        raise FormatError(
+            f"{source.name}: expected format version '1' or '2', found {version!r}; update tupli-mcap"
+        )
     metadata = check_crc(found, RECORDING_KEYS, f"{source.name}: the metadata record {RECORDING_METADATA!r}")
     for key, what, pattern in _VALUES:
         if not pattern.fullmatch(metadata.get(key, "")):

@@ -250,7 +250,7 @@ class StepLog:
         self._step = 0
         self._time = time_ns
         self._pending = bytearray()
-        self._state = leaf_encoders(layout, [leaf for leaf in layout.state if leaf.kind != "image"])
+        self._state = leaf_encoders(layout, [leaf for leaf in layout.state if not leaf.apart])
         self._action = leaf_encoders(layout, layout.action)
         self._reward = leaf_encoders(layout, layout.reward)
         self.count = first

@@ -34,6 +34,7 @@ class WriterOptions(NamedTuple):
     keep_empty: bool = False
     durability: Durability = "os"
     cameras: tuple[str, ...] = ()
+    format_version: str = "1"
 
 
 def check_options(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:

@@ -25,6 +25,7 @@ from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.frames import Cameras, Frames
+from tupli_mcap.recording.imagecodecs import image_codecs
 from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.pieces import Runs, runs_of
 from tupli_mcap.recording.signed import SIGNATURE_NAME, voucher
@@ -140,6 +141,7 @@ class Recording:
                 }
                 for leaf in self._layout.images
             }
+            self._store.codecs = image_codecs(self._layout, contents.channels)
             self._columns = ColumnReader(self._layout, self._store, self._images)
 
     def _check_schema(self, channel: Channel, name: str, text: str) -> None:

@@ -21,6 +21,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import record
+from tupli_mcap.recording.imagecodecs import image_codecs, uses_codecs
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_frames import OldCameras, kept_frames
@@ -34,7 +35,7 @@ __all__ = ["RECOVERED", "RepairWriter"]
 RECOVERED = "recovered"  # key of the episode metadata that says where the steps of a piece were
 _METADATA = {
     "uuid": re.compile("[0-9a-f]{32}"),
-    "format_version": re.compile("1"),
+    "format_version": re.compile("[12]"),
     "library": re.compile(".*", re.DOTALL),
     "created_ns": re.compile("[0-9]{1,20}", re.ASCII),
     "benchmark_id": re.compile(".*", re.DOTALL),
@@ -75,7 +76,7 @@ class RepairWriter:
         found = {k: v for k, v in (self._gathered.metadata or {}).items() if k != "journal"}
         made = {
             "uuid": uuid.uuid4().hex,
-            "format_version": "1",
+            "format_version": "2" if uses_codecs(self._gathered.channels) else "1",
             "library": f"tupli-mcap {version('tupli-mcap')}",
             "created_ns": str(self._now),
             "benchmark_id": "",
@@ -96,6 +97,7 @@ class RepairWriter:
             info = None if schema is None else (schema.data.decode(), channels[old.info].metadata)
         cameras = OldCameras.of(self._gathered, len(old.steps), vector)
         envs = len(old.steps) if vector else None
+        store.codecs = image_codecs(layout, channels)
         new = register_channels(self._container, "the repaired recording", layout, envs, info, cameras.names)
         self._container.define_channels()
         rows: dict[int, int] = {}  # first row of each episode in the new file

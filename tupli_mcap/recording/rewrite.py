@@ -20,6 +20,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
+from tupli_mcap.recording.imagecodecs import image_codecs
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.reader import Recording
@@ -146,6 +147,7 @@ class _Rewriter:
         whole = sorted(schemas) == list(range(1, len(schemas) + 1))
         container.schemas = schemas if whole else dict(contents.schemas)
         container.channels = own
+        container.codecs = image_codecs(self._source.layout, own) if self._source._step_channels else {}
         taken = {channel.topic for channel in own.values()} & {follower.topic for follower in followers}
         if taken:
             raise RecordingError(

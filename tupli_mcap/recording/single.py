@@ -42,7 +42,9 @@ def decide_layout(
             for value in values:
                 exact_array(value, dtype, leaf.shape, leaf.path)
             dtypes[leaf.name] = dtype
-    return StepLayout(spaces.observation_space, spaces.action_space, spaces.reward_space, dtypes, inner)
+    return StepLayout(
+        spaces.observation_space, spaces.action_space, spaces.reward_space, dtypes, inner, spaces.stacks
+    )
 
 
 class SingleRecorder:

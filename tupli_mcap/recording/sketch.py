@@ -74,7 +74,7 @@ def sketch(recording: Recording, points: int) -> Sketch:
         )
         for series in itertools.islice(_distributions(recording, leaves, field, pieces, points), most)
     )
-    dimensions = sum(leaf.size for leaf in layout.leaves if leaf.kind not in ("image", "variable"))
+    dimensions = sum(leaf.size for leaf in layout.leaves if leaf.kind != "variable" and not leaf.apart)
     return Sketch(courses, shown, sum(len(piece) for piece in pieces), dimensions - len(shown))
 
 
@@ -119,7 +119,7 @@ def _distributions(
     recording: Recording, leaves: list[Leaf], field: str, pieces: list[Columns], points: int
 ) -> Iterator[Series]:
     for leaf in leaves:
-        if leaf.kind in ("image", "variable") or not leaf.size:
+        if leaf.kind == "variable" or leaf.apart or not leaf.size:
             continue
         columns = [leaf.get(getattr(piece, field)) for piece in pieces]
         flat = np.concatenate([column.reshape(len(column), -1) for column in columns])

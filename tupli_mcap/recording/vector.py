@@ -264,8 +264,9 @@ class VectorRecorder:
                     continue
                 dtypes[leaf.name] = decide_dtype(leaf, [np.asarray(leaf_value(root, leaf)) for root in roots])
         return StepLayout(
-            self._spaces.observation_space, self._spaces.action_space, self._spaces.reward_space, dtypes
-        )
+            self._spaces.observation_space, self._spaces.action_space, self._spaces.reward_space, dtypes,
+            stacks=self._spaces.stacks,
+        )  # fmt: skip
 
     def _finals(self, done: Array, infos: Any) -> dict[int, Any]:
         """The final states of a same-step autoreset."""

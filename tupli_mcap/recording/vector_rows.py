@@ -66,7 +66,7 @@ class VectorRows:
         self._times = np.zeros((2, area.rows), np.uint64)  # of the rows in the journal, the same for a batch
         self._offsets = np.arange(area.rows, dtype=np.uint64) * np.uint64(area.row_size)
         self._write_chunks: Callable[[], None] | None = None  # of the half that is not running
-        self._state = [self._writer(leaf) for leaf in layout.state if leaf.kind != "image"]
+        self._state = [self._writer(leaf) for leaf in layout.state if not leaf.apart]
         self._action = [self._writer(leaf) for leaf in layout.action]
         self._reward = [self._writer(leaf) for leaf in layout.reward]
         self._nested = any(leaf.keys for leaf in layout.leaves)

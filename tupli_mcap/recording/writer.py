@@ -43,14 +43,12 @@ from tupli_mcap.system import refused
 
 __all__ = [
     "EPISODE_AND_ENV",
-    "FORMAT_VERSION",
     "RECORDING_METADATA",
     "RecordingWriter",
     "ResetFacts",
     "StartedEpisode",
 ]
 
-FORMAT_VERSION = "1"
 RECORDING_METADATA = "tupli_mcap.recording"
 EPISODE_AND_ENV = struct.Struct("<II")
 LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
@@ -132,7 +130,7 @@ class RecordingWriter:
         now = time.time_ns()
         values = {
             "uuid": self.uuid,
-            "format_version": FORMAT_VERSION,
+            "format_version": self.options.format_version,
             "library": f"tupli-mcap {version('tupli-mcap')}",
             "created_ns": str(now),
             "benchmark_id": self.options.benchmark_id,

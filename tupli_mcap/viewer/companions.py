@@ -77,7 +77,7 @@ def companion_topics(layout: StepLayout, top: str = "") -> dict[str, str]:
 
 
 def _is_plotted(leaf: Leaf) -> bool:
-    return leaf.dtype is not None and leaf.kind != "image" and 0 < leaf.size <= WIDEST
+    return leaf.dtype is not None and not leaf.apart and 0 < leaf.size <= WIDEST
 
 
 def _is_text(leaf: Leaf) -> bool:

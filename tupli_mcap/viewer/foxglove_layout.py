@@ -62,7 +62,7 @@ def foxglove_layout(recording: Recording) -> dict[str, Any]:
     topics = companion_topics(layout, top)
     for leaf in [*layout.state, *layout.action]:
         paths = _paths(leaf, top, labels, layout.dtypes.get(leaf.name), topics)
-        if leaf.kind == "image":
+        if leaf.apart:
             add(right, "Image", leaf.path, {"imageMode": {"imageTopic": f"{top}/image/{leaf.name}"}})
         elif type(leaf.space) is spaces.Discrete:
             add(left, "StateTransitions", leaf.path, {"isSynced": True, "paths": paths})
@@ -91,7 +91,7 @@ def _paths(
     leaf: Leaf, top: str, labels: Labels, dtype: np.dtype[Any] | None, topics: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """A message path for each dimension; none of a leaf that is no number, or too wide to be plotted."""
-    if dtype is None or leaf.kind == "image" or not 0 < leaf.size <= WIDEST:
+    if dtype is None or leaf.apart or not 0 < leaf.size <= WIDEST:
         return []
     names = dimension_names(leaf, labels.dimensions.get(leaf.path))
     # a float16 is stored as its bits, which are no number to plot

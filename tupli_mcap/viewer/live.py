@@ -20,8 +20,8 @@ from tupli_mcap.recording.watching import NewSteps, Watcher
 from tupli_mcap.viewer.about import plain
 from tupli_mcap.viewer.arrange import blueprint_of
 from tupli_mcap.viewer.blocks import Array, Block, Piece
-from tupli_mcap.viewer.panels import Place, Series
-from tupli_mcap.viewer.pictures import Camera, HeatMap, Picture
+from tupli_mcap.viewer.panels import Panel, Place, Series
+from tupli_mcap.viewer.pictures import Camera, HeatMap
 from tupli_mcap.viewer.scene import live_scene
 from tupli_mcap.viewer.sending import Times, send_scalars
 
@@ -195,7 +195,7 @@ class LivePicture:
         block = Block(asked, part, pieces, rows, steps.times[begin:end])
         times = self._times(rows, block.times)
         for panel in self._panels:
-            if not isinstance(panel, Picture):
+            if not _is_apart(panel):
                 panel.send(Place(stream), block, times)
 
     def _send_images(self, stream: Any, watcher: Watcher, steps: NewSteps) -> None:
@@ -204,7 +204,7 @@ class LivePicture:
         for number, leaf in enumerate(self._layout.images):
             found = watcher.images(number, steps.env, wanted)
             for panel in self._panels:
-                if found and isinstance(panel, Picture) and panel.leaf is leaf:
+                if found and getattr(panel, "leaf", None) is leaf:
                     rows = np.array(sorted(found))
                     images = np.stack([found[row]["data"] for row in rows.tolist()])
                     times = steps.times[rows - steps.first]
@@ -297,3 +297,9 @@ def _sliced(value: Any, begin: int, end: int) -> Any:
     if isinstance(value, tuple):
         return tuple(_sliced(item, begin, end) for item in value)
     return None if value is None else value[begin:end]
+
+
+def _is_apart(panel: Panel) -> bool:
+    """Whether what a panel shows is not in the rows of steps."""
+    leaf = getattr(panel, "leaf", None)
+    return isinstance(leaf, Leaf) and leaf.apart

@@ -30,6 +30,7 @@ from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import benchmark_attachments
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
+from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
 if TYPE_CHECKING:
     from tupli_mcap.live import LiveSession
@@ -121,6 +122,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         self._spaces = spaces = StepLayout(
             env.observation_space, env.action_space, reward_space
         )  # refused before a file is made
+        self._spaces = spaces = with_stacks(env, spaces)
         spaces.to_metadata()
         self.rotation = Rotation(path, mode, max_bytes, max_seconds)
         self._options = WriterOptions(
@@ -133,6 +135,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             flush_seconds,
             durability=durability,
             cameras=(CAMERA,) if every else (),
+            format_version=format_version(spaces),
         )
         self._writer = self.rotation.open_first(self._options)
         try:

@@ -32,6 +32,7 @@ from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
 from tupli_mcap.wrappers.single import live_session, metadata_text
+from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
 if TYPE_CHECKING:
     from tupli_mcap.live import LiveSession
@@ -96,6 +97,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         self._spaces = spaces = StepLayout(
             env.single_observation_space, env.single_action_space, reward_space
         )
+        self._spaces = spaces = with_stacks(next(iter(getattr(env.unwrapped, "envs", [])), None), spaces)
         spaces.to_metadata()
         self.rotation = Rotation(path, mode, max_bytes, max_seconds)
         self._options = WriterOptions(
@@ -108,6 +110,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             flush_seconds,
             durability=durability,
             cameras=(CAMERA,) if every else (),
+            format_version=format_version(spaces),
         )
         self._writer = self.rotation.open_first(self._options)
         try:

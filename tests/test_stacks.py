@@ -1,0 +1,238 @@
+"""Stacks of frames: each frame is stored once, and every stack comes back exactly, whatever the environment does."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.wrappers import FrameStackObservation
+from mcap.reader import make_reader
+
+from tupli_mcap import FormatError, RecordEpisodes, Recording
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.imagecodecs import StackCodec
+from tupli_mcap.recording.repair import recover_recording
+from tupli_mcap.recording.rewrite import rewrite_recording
+from tupli_mcap.recording.rows import even_rows
+from tupli_mcap.recording.verify import verify_recording
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+Array = np.ndarray[Any, Any]
+H, W = 30, 20
+
+
+class Screen(gym.Env[Any, Any]):
+    """Noise of `shape`, episodes of 23 steps."""
+
+    def __init__(self, shape: tuple[int, ...] = (H, W), *, as_dict: bool = False) -> None:
+        picture = spaces.Box(0, 255, shape, np.uint8)
+        self.observation_space = (
+            spaces.Dict({"see": picture, "x": spaces.Box(-1, 1, (2,))}) if as_dict else picture
+        )
+        self.action_space = spaces.Discrete(3)
+        self._random = np.random.default_rng(3)
+
+    def _observe(self) -> Any:
+        def picture(space: spaces.Box) -> Array:
+            return self._random.integers(0, 256, space.shape).astype(np.uint8)
+
+        if isinstance(self.observation_space, spaces.Dict):
+            return {"see": picture(self.observation_space["see"]), "x": np.zeros(2, np.float32)}  # type: ignore[arg-type]
+        return picture(self.observation_space)  # type: ignore[arg-type]
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._t = 0
+        return self._observe(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._t += 1
+        return self._observe(), 1.0, self._t == 23, False, {}
+
+
+class Odd(gym.Wrapper[Any, Any, Any, Any]):
+    """Stacks that are none: now and then of other frames, skipped, repeated, or changed after they were seen."""
+
+    def step(self, action: Any) -> Any:
+        stack, *rest = self.env.step(action)
+        kind = self.unwrapped._random.integers(6)  # type: ignore[attr-defined]
+        if kind == 0:
+            stack = stack[::-1].copy()
+        elif kind == 1:
+            stack[1, 0, 0] ^= 1
+        elif kind == 2:
+            stack[:] = stack[-1]
+        elif kind == 3:
+            self.env.step(action)
+        return stack, *rest
+
+
+def record(env: gym.Env[Any, Any], path: Path, steps: int, **options: Any) -> tuple[list[Any], list[Any]]:
+    """Records; the states and the final states as the environment gave them."""
+    states, finals = [], []
+    with RecordEpisodes(env, path, **options) as recorder:
+        recorder.action_space.seed(1)
+        state, _ = recorder.reset(seed=1)
+        for _ in range(steps):
+            states.append(state)
+            state, _, terminal, _, _ = recorder.step(recorder.action_space.sample())
+            if terminal:
+                finals.append(state)
+                state, _ = recorder.reset()
+    return states, finals
+
+
+def stored(path: Path) -> list[int]:
+    """Bytes of the images, as any reader of MCAP sees them."""
+    with path.open("rb") as file:
+        return [
+            len(message.data) for _, _, message in make_reader(file).iter_messages(topics=["/image/state"])
+        ]
+
+
+@pytest.mark.parametrize("shape", [(H, W), (H, W, 1), (H, W, 3)])
+@pytest.mark.parametrize("padding", ["reset", "zero"])
+def test_each_frame_is_stored_once(tmp_path: Path, shape: tuple[int, ...], padding: str) -> None:
+    path = tmp_path / "r.mcap"
+    states, finals = record(FrameStackObservation(Screen(shape), 4, padding_type=padding), path, 300)
+    with Recording(path) as recording:
+        assert recording.metadata["format_version"] == "2"
+        assert np.array_equal(recording.read().states, np.array(states))
+        assert np.array_equal(recording.episodes[3].final_state, finals[3])
+        assert np.array_equal(recording.episodes[3][5:9].states, np.array(states[74:78]))
+        assert recording.observation_space == spaces.Box(0, 255, (4, *shape), np.uint8)
+        layout = recording.layout
+        assert layout is not None and layout.stacks == ["state"]
+        chunks = len(recording._store.chunks(recording._topics["/image/state"]))
+    assert verify_recording(path).ok
+    frames = [size // int(np.prod(shape)) for size in stored(path)]
+    episodes = 300 // 23 + 1
+    assert sum(frames) <= 300 + 3 * (chunks + episodes) < 2 * 300
+    assert min(frames) == 1 and max(frames) == 4
+
+
+def test_stacks_that_are_none_come_back_too(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    states, _ = record(Odd(FrameStackObservation(Screen(), 5)), path, 400)
+    with Recording(path) as recording:
+        assert np.array_equal(recording.read().states, np.array(states))
+    assert verify_recording(path).ok
+
+
+def test_leaves_of_a_dict(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    states, _ = record(FrameStackObservation(Screen(as_dict=True), 3), path, 60)
+    with Recording(path) as recording:
+        found = recording.read().states
+        assert recording.layout.stacks == ["state_see"]  # type: ignore[union-attr]
+    assert np.array_equal(found["see"], np.array([state["see"] for state in states]))
+    assert np.array_equal(found["x"], np.array([state["x"] for state in states]))
+
+
+def test_without_the_wrapper_nothing_is_a_stack(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    states, _ = record(Screen((4, H, W)), path, 30)
+    with Recording(path) as recording:
+        assert recording.metadata["format_version"] == "1"
+        assert recording.layout.stacks == []  # type: ignore[union-attr]
+        assert np.array_equal(recording.read().states, np.array(states))
+
+
+def test_sub_environments(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    env = RecordVector(SyncVectorEnv([lambda: FrameStackObservation(Screen(), 4)] * 3), path)
+    taken: list[list[Array]] = [[], [], []]
+    states, _ = env.reset(seed=1)
+    for t in range(200):
+        for i in range(3):
+            if t % 24 != 23:  # the step after an end is a reset
+                taken[i].append(states[i].copy())
+        states = env.step(env.action_space.sample())[0]
+    env.close()
+    with Recording(path) as recording:
+        for i in range(3):
+            mine = np.concatenate([e.states for e in recording.episodes if e.env == i])
+            assert np.array_equal(mine, np.array(taken[i]))
+
+
+def test_killed_appended_rewritten_and_repaired(tmp_path: Path) -> None:
+    path, killed = tmp_path / "r.mcap", tmp_path / "killed.mcap"
+    env = RecordEpisodes(FrameStackObservation(Screen(), 4), path, chunk_size=4000)
+    states = []
+    state, _ = env.reset(seed=1)
+    for t in range(100):
+        states.append(state)
+        state, _, terminal, _, _ = env.step(0)
+        if terminal:
+            state, _ = env.reset()
+        if t == 60:
+            shutil.copy(path, killed)
+            shutil.copy(f"{path}.journal", f"{killed}.journal")
+    env.close()
+    with Recording(killed) as recording:
+        assert np.array_equal(recording.read().states, np.array(states[:61]))
+    more, _ = record(FrameStackObservation(Screen(), 4), killed, 50, mode="a")
+    assert not Path(f"{killed}.journal").exists()
+    expected = np.array(states[:61] + more)
+    rewritten, repaired = tmp_path / "rewritten.mcap", tmp_path / "repaired.mcap"
+    with Recording(killed) as recording:
+        rewrite_recording(recording, rewritten)
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(killed.read_bytes()[:-100])
+    recover_recording(damaged, repaired)
+    for one in (killed, rewritten, repaired):
+        with Recording(one) as recording:
+            assert recording.metadata["format_version"] == "2"
+            assert np.array_equal(recording.read().states, expected)
+        assert verify_recording(one).ok
+        assert sum(size // (H * W) for size in stored(one)) < 2.5 * len(expected)
+
+
+def test_a_chunk_that_holds_no_stacks_is_a_format_error() -> None:
+    layout = StepLayout(spaces.Box(0, 255, (3, 4, 5), np.uint8), spaces.Discrete(2), stacks=["state"])
+    (leaf,) = layout.images
+    image = layout.image_messages["state"]
+    codec = StackCodec(leaf, image)
+    rows = np.zeros(6, image.dtype)
+    rows["fixed"] = np.frombuffer(image.body[8:], np.uint8)
+    rows["#opcode"], rows["#length"] = 5, image.dtype.itemsize - 9
+    frames = np.random.default_rng(0).integers(0, 256, (8, 4, 5)).astype(np.uint8)
+    rows["data"] = [frames[i : i + 3] for i in range(6)]
+    raw = even_rows(1, 0, rows.tobytes(), rows)
+    encoded = codec.encode(raw)
+    data = bytes(encoded.data)
+    assert len(data) < len(raw.data) and bytes(codec.decode(data, 6, "here")) == raw.data
+    assert codec.encode(encoded) is encoded
+    second = int(encoded.offsets[1])
+    wrong = {
+        "1 to 3 frames": data[second:],
+        "found 6|found 5|in .* bytes": data + data[-(BODY + 60) :],
+        "picture of 1 frames": data[: second + BODY + 28] + b"\x09" + data[second + BODY + 29 :],
+    }
+    for cut in range(0, len(data), 7):
+        with pytest.raises(FormatError, match="here: "):
+            codec.decode(data[:cut], 6, "here")
+    with pytest.raises(FormatError, match="here: row 0 expected 1 to 3 frames"):
+        codec.decode(wrong["1 to 3 frames"], 5, "here")
+    for count in (5, 7):
+        with pytest.raises(FormatError, match="here: expected"):
+            codec.decode(data, count, "here")
+    with pytest.raises(FormatError, match="at most"):
+        codec.decode(data, 1 << 40, "here")
+    for at in range(
+        second, second + int(encoded.offsets[2]) - second
+    ):  # any byte of a row: an error, or that byte
+        broken = bytearray(data)
+        broken[at] ^= 1
+        try:
+            found = np.frombuffer(codec.decode(bytes(broken), 6, "here"), image.dtype)
+        except FormatError:
+            continue
+        assert len(found) == 6
