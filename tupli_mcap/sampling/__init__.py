@@ -5,7 +5,7 @@ from tupli_mcap.sampling.deltas import DeltaWindow, DeltaWindows, Unit
 from tupli_mcap.sampling.draws import Numbers, Order, Sampler
 from tupli_mcap.sampling.index import ListedEpisodes
 from tupli_mcap.sampling.items import Items
-from tupli_mcap.sampling.recorded import RecordedSteps
+from tupli_mcap.sampling.recorded import RecordedSteps, steps_of
 from tupli_mcap.sampling.steps import FIELDS, MemorySteps, SamplingError, Steps
 from tupli_mcap.sampling.transitions import Transition, Transitions
 from tupli_mcap.sampling.windows import Pad, Window, Windows
@@ -30,4 +30,5 @@ __all__ = [
     "Unit",
     "Window",
     "Windows",
+    "steps_of",
 ]

@@ -20,7 +20,7 @@ from tupli_mcap.sampling.index import ListedEpisodes, StepIndex
 from tupli_mcap.sampling.kinds import EPISODE, final_rows, image_rows, step_rows
 from tupli_mcap.sampling.steps import checked_fields, rows_of_runs
 
-__all__ = ["CACHE_BYTES", "THREADS", "RecordedSteps"]
+__all__ = ["CACHE_BYTES", "THREADS", "RecordedSteps", "steps_of"]
 
 CACHE_BYTES = 512 << 20
 THREADS = min(4, os.cpu_count() or 1)
@@ -149,6 +149,10 @@ class RecordedSteps:
         return len(self) if size == 0 else int(len(self) * self.cache_bytes / 2 / size)
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
+        n = len(self)
+        if len(rows) and (rows.min() < 0 or rows.max() >= n):
+            wrong = rows[(rows < 0) | (rows >= n)][0]
+            raise IndexError(f"expected steps from 0 to {n - 1}, found {wrong}")
         listed = rows if self._wanted is None else self._wanted[rows]
         return self._columns(
             fields,
@@ -279,3 +283,16 @@ def _times(values: list[Any]) -> Array:
     if (signed < 0).any():
         raise FormatError(f"expected times of steps below 2**63 ns, found {values[0].max()}")
     return signed
+
+
+def steps_of(
+    recording: Recording, *, cache_bytes: int = CACHE_BYTES, threads: int = THREADS
+) -> RecordedSteps:
+    """All steps of one recording, for `Windows(steps_of(recording), 32)` and the like.
+
+    Raises:
+        RecordingError: it has no step yet.
+    """
+    numbers, lengths = (recording.index[name].astype(np.int64) for name in ("episode", "length"))
+    listed = ListedEpisodes(recording.name, numbers, lengths)
+    return RecordedSteps([listed], lambda _: recording, cache_bytes=cache_bytes, threads=threads)
