@@ -33,7 +33,7 @@ _CHUNK_HEAD = struct.Struct(
     "<BQQQQII"
 )  # opcode, length, start, end, uncompressed size, crc, compression length
 
-
+_ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
 _TIME, _TIME_OFFSET = struct.Struct("<Q"), 15  # in a Message record
 
 
@@ -278,8 +278,8 @@ class ChunkStore:
                 f"{self._source.name}: chunk {i} expected {n} rows of {dtype.itemsize} bytes, found {len(data)} bytes"
             )
         rows = np.frombuffer(data, dtype)
-        good = (rows["#opcode"] == 5).all() and (rows["#length"] == dtype.itemsize - 9).all()
-        if not (good and (rows["#channel"] == row["channel"]).all()):
+        head = _ROW_HEAD.pack(5, dtype.itemsize - 9, row["channel"])
+        if np.ndarray(n, f"V{len(head)}", data, strides=dtype.itemsize).tobytes() != head * n:
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
         kept.rows = rows
         return rows

@@ -16,7 +16,7 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.pieces import Pieces, Runs, final_runs
+from tupli_mcap.recording.pieces import Pieces, Runs, final_runs, items, items_dtype
 
 __all__ = ["FIELDS", "ColumnReader", "Columns"]
 
@@ -135,10 +135,11 @@ class ColumnReader:
     def _tasks(
         self, runs: Runs, names: Sequence[str], out: Mapping[str, Any], dtype: Any, keep: bool
     ) -> list[Callable[[], None]]:
-        targets = [(name, out[name]) for name in names]
+        targets = [(name, items(out[name])) for name in names]
+        item_dtype = items_dtype(dtype)
 
         def copy(pieces: Pieces) -> None:
-            pieces.copy(self._store.rows(pieces.chunk, dtype, keep=keep), targets)
+            pieces.copy(self._store.rows(pieces.chunk, dtype, keep=keep).view(item_dtype), targets)
 
         return [partial(copy, pieces) for pieces in Pieces.of(runs, self._store)]
 
