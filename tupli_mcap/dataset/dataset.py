@@ -159,7 +159,8 @@ class TupliDataset(RandomAccess):
         """List the episodes anew and write their columns to a directory, as plain arrays that everything is read from
         then, mapped into memory; where they are there and fresh, they are used as they are.
 
-        The directory has a `.npy` file a leaf (`np.load(file, mmap_mode="r")` reads it), and `manifest.json`.
+        The directory has a `.npy` file a leaf (`np.load(file, mmap_mode="r")` reads it), and `manifest.json`; see
+        docs/columns.md.
         Columns are fresh if the query gives the same episodes, of the same lengths, in the same order, with an
         equal tuple filter, and no recording's size or time of change differs; a change that keeps both is not
         noticed. Anything else is written anew: no half of it is ever used, and a killed process leaves the old
