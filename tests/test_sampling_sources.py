@@ -345,3 +345,16 @@ def test_seconds_that_recordings_say_and_times_recorded(tmp_path: Path) -> None:
         assert np.abs(found["time"][:-2] - times[first : last + 1]).max() <= 200_000  # ns, of the tolerance
         assert found["time"][-2:].tolist() == [times[first], times[last]]
         assert found.masks["time"].tolist() == [True] * len(deltas) + [False] * 2
+
+
+@pytest.mark.parametrize("cache_bytes", [0, 1 << 22])
+def test_stacks_of_frames(tmp_path: Path, cache_bytes: int) -> None:
+    path = tmp_path / "s.mcap"
+    env = gym.wrappers.FrameStackObservation(
+        Sampler(spaces.Box(0, 255, (9, 8), np.uint8), spaces.Discrete(3)), 4
+    )
+    with RecordEpisodes(env, path, chunk_size=4000) as recorder:
+        roll(recorder, 40)
+    steps = TupliDataset.from_files(path).with_cache(cache_bytes).steps
+    check(steps, [path])
+    check(pickle.loads(pickle.dumps(steps)), [path])
