@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -178,6 +176,30 @@ def test_a_shuffle_mixes_chunks_and_reads_each_about_once(dataset: TupliDataset)
     assert numbers(other) != numbers(stream) == numbers(stream)
     stream.set_epoch(1)
     assert numbers(stream) != numbers(other)
+
+
+def test_a_batch_comes_from_a_worker_in_one_piece(each_space: TupliDataset) -> None:
+    windows = each_space.windows(4, pad="zero")
+    loader = DataLoader(StreamDataset(windows, 7, shuffle=False), None, num_workers=1, collate_fn=collate)
+    for i, batch in enumerate(loader):
+        assert type(batch) is dict
+        assert same(as_numpy(batch), windows[i * 7 : i * 7 + 7].asdict())
+        assert batch["rewards"].untyped_storage().data_ptr() == batch["mask"].untyped_storage().data_ptr()
+
+
+def doubled(samples: Any) -> Any:
+    """A collate function that changes the batch, also deep inside."""
+    batch = collate(samples)
+    batch["states"]["speed"] = batch["states"]["speed"].double() * 2
+    batch["rewards"] *= 2
+    return batch
+
+
+def test_what_a_collate_function_changes_in_a_worker_arrives(dataset: TupliDataset) -> None:
+    windows = dataset.windows(2)
+    batch = next(iter(DataLoader(MapDataset(windows), 5, num_workers=1, collate_fn=doubled)))
+    assert torch.equal(batch["states"]["speed"], torch.from_numpy(windows[:5].states["speed"]).double() * 2)
+    assert torch.equal(batch["rewards"], torch.from_numpy(windows[:5].rewards) * 2)
 
 
 def test_a_seed_of_none_draws_from_pytorch(dataset: TupliDataset) -> None:
@@ -398,15 +420,28 @@ def test_two_ranks_share_an_epoch(tmp_path: Path) -> None:
 # ---- what goes wrong
 
 
-def test_a_worker_that_is_killed_is_told(dataset: TupliDataset) -> None:
-    loader = DataLoader(stream_of(dataset, 0), batch_size=None, num_workers=1, collate_fn=collate)
-    batches = iter(loader)
-    next(batches)
-    os.kill(batches._workers[0].pid, signal.SIGKILL)
-    with pytest.raises(
-        RuntimeError, match=r"DataLoader worker \(pid.* (is killed by signal|exited unexpectedly)"
-    ):
-        list(batches)
+KILLED = """
+import os, signal, sys
+from torch.utils.data import DataLoader
+from tupli_mcap import TupliDataset
+from tupli_mcap.torch import StreamDataset, collate
+
+stream = StreamDataset(TupliDataset.from_files(sys.argv[1]).windows(2), 8, seed=0)
+batches = iter(DataLoader(stream, None, num_workers=1, collate_fn=collate))
+next(batches)
+os.kill(batches._workers[0].pid, signal.SIGKILL)
+list(batches)
+"""
+
+
+def test_a_worker_that_is_killed_is_told(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", SPACES["box"], 400)
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, path], capture_output=True, text=True, timeout=200, check=False
+    )
+    assert done.returncode == 1
+    assert "RuntimeError: DataLoader worker (pid " in done.stderr
+    assert ") is killed by signal: Killed." in done.stderr or "exited unexpectedly" in done.stderr
 
 
 def test_a_damaged_file_is_told_by_workers(tmp_path: Path) -> None:

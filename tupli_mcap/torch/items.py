@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from torch.utils.data import get_worker_info
 
 from tupli_mcap.sampling import Items, SamplingError
+from tupli_mcap.torch.packed import packed
 from tupli_mcap.torch.tensors import tensors
 
 __all__ = ["WORKER_CACHE_BYTES", "ReadItems", "check_state"]
@@ -33,12 +34,14 @@ class ReadItems:
 
     def read(self, index: Any) -> dict[str, Any]:
         """The columns of an item (an integer), or of several (an array of them), by name."""
-        if get_worker_info() is not None and self._limited_in != os.getpid():
+        if get_worker_info() is None:
+            found: dict[str, Any] = tensors(self.items[index].asdict())
+            return found
+        if self._limited_in != os.getpid():
             self._limited_in = os.getpid()
             if isinstance(self.items.source, Caching):
                 self.items.source.limit(self._worker_cache_bytes, 1)
-        found: dict[str, Any] = tensors(self.items[index].asdict())
-        return found
+        return packed(self.items[index].asdict())
 
 
 def check_state(state: Any, identity: str, expected: Mapping[str, Any]) -> None:
