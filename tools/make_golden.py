@@ -123,7 +123,7 @@ def painting(episode: int, t: int) -> Any:
     return np.arange(2 * 5 * 3, dtype=np.uint8).reshape(2, 5, 3) + np.uint8(40 * episode + 7 * t)
 
 
-def stored_png(picture: Any, form: str) -> bytes:
+def stored_png(picture: Any, form: str = "png") -> bytes:
     """A PNG that is not compressed: what a compressor writes changes with its version."""
     height, width, _ = picture.shape
     lines = b"".join(b"\0" + row.tobytes() for row in picture)
@@ -215,6 +215,18 @@ def stacked(path: Path) -> list[Log]:
         windows = [np.stack(frames[i : i + 3]) for i in range(len(frames) - 2)]
         *episode["states"], episode["final_state"] = windows
     return episodes
+
+
+def png_images(path: Path) -> list[Log]:
+    env = Played(CAMERA, picture, ENDS)
+    with (
+        mock.patch("tupli_mcap.recording.pngcodec.encode_pixels", stored_png),
+        RecordEpisodes(
+            env, path, image_format="png", compression="none", attachments={}, chunk_size=400
+        ) as recorder,
+    ):
+        roll(recorder, env, [3, 4, 2], action)
+    return expected(env)
 
 
 def dict_with_images(path: Path) -> list[Log]:
@@ -480,6 +492,7 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "frames": frames,
     "unfinished_frames": unfinished_frames,
     "stacked": stacked,
+    "png_images": png_images,
 }
 
 

@@ -79,6 +79,13 @@ KINDS = {
         threaded=True,
     ),
     "stacked": Kind(spaces.Box(0, 255, (4, 90, 70), np.uint8), (20_000, 60_000), threaded=True, window=True),
+    "png": Kind(_IMAGE, (700, 2000, 20_000), options={"image_format": "png"}),
+    "png frames": Kind(
+        spaces.Box(0, 255, (80, 80, 3), np.uint8),
+        (20_000, 60_000),
+        threaded=True,
+        options={"image_format": "png"},
+    ),
     "info": Kind(_BOX, options={"record_info": True}),
     "info and text": Kind(_TEXT, _SMALL, options={"record_info": ["t"]}),
     "metadata": Kind(_BOX, options={"metadata_callback": True}),

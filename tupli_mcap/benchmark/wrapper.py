@@ -36,6 +36,7 @@ _RECORDING_OPTIONS = (
     "durability",
     "frames",
     "frame_format",
+    "image_format",
     "max_bytes",
     "max_seconds",
 )
@@ -68,7 +69,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         metadata_callback: called with every recorded step; its last result becomes the episode's metadata.
         rl_tuple_cls: the class of the tuples that the callback is given. Recorded are the values themselves.
         recording_options: for `RecordEpisodes`: record_info, step_callback, reward_space, compression,
-            chunk_size, flush_seconds, durability, frames, frame_format, max_bytes, max_seconds.
+            chunk_size, flush_seconds, durability, frames, frame_format, image_format, max_bytes, max_seconds.
 
     Subclasses that keep data outside of the environment override `_serialize` and `_deserialize`.
     Not thread-safe.

@@ -6,7 +6,8 @@ from typing import Any
 
 from tupli_mcap.errors import MissingExtraError
 from tupli_mcap.live.target import Target
-from tupli_mcap.messages.layout import RECORD_HEADER
+from tupli_mcap.messages.layout import IMAGE_SCHEMA, RECORD_HEADER
+from tupli_mcap.recording.imagecodecs import CODEC
 from tupli_mcap.recording.watching import NewSteps, Watcher
 from tupli_mcap.recording.writer import RecordingWriter
 
@@ -59,9 +60,12 @@ class FoxgloveView:
         container = self._writer.container
         for channel in container.channels.values():
             schema = container.schemas[channel.schema_id]
+            name, text = schema.name, schema.data
+            if CODEC in channel.metadata:  # what is shown comes out of the journal, as pixels
+                name, text = "sensor_msgs/msg/Image", IMAGE_SCHEMA.encode()
             self._channels[channel.id] = self._sdk.Channel(
                 channel.topic,
-                schema=self._sdk.Schema(name=schema.name, encoding=schema.encoding, data=schema.data),
+                schema=self._sdk.Schema(name=name, encoding=schema.encoding, data=text),
                 message_encoding="cdr",
                 metadata=dict(channel.metadata),
                 context=self._context,

@@ -19,8 +19,12 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.container import Rows
+from tupli_mcap.recording.pictures import ImageFormat
+from tupli_mcap.recording.pngcodec import PngCodec
 
-__all__ = ["ImageCodec", "image_codecs", "uses_codecs"]
+__all__ = ["CODEC", "ImageCodec", "StackCodec", "image_codecs", "image_format", "uses_codecs"]
+
+CODEC = "codec"  # key of the metadata of an image channel
 
 Array = np.ndarray[Any, Any]
 _LENGTH = struct.Struct("<Q")  # of a Message record, after its opcode
@@ -41,20 +45,42 @@ class ImageCodec(Protocol):
 
 
 def image_codecs(layout: StepLayout, channels: Mapping[int, Channel]) -> dict[int, ImageCodec]:
-    """The codecs of the channels that have one, by channel id."""
+    """The codecs of the channels that have one, by channel id.
+
+    Raises:
+        FormatError: a channel names a codec that this version does not know.
+    """
     found: dict[int, ImageCodec] = {}
-    stacks = {leaf.name: leaf for leaf in layout.images if leaf.kind == "stack"}
+    leaves = {leaf.name: leaf for leaf in layout.images}
     for number, channel in channels.items():
-        _, image, _ = channel.topic.rpartition("/image/")
-        leaf = stacks.get(channel.metadata.get("leaf", ""))
-        if image and leaf is not None:
-            found[number] = StackCodec(leaf, layout.image_messages[leaf.name])
+        leaf = leaves.get(channel.metadata.get("leaf", ""))
+        if leaf is None or "/image/" not in channel.topic:
+            continue
+        name = channel.metadata.get(CODEC, "stack" if leaf.kind == "stack" else "raw")
+        if name != "raw":
+            found[number] = _codec(name, leaf, layout.image_messages[leaf.name], channel.topic)
     return found
+
+
+def _codec(name: str, leaf: Leaf, layout: ImageLayout, topic: str) -> ImageCodec:
+    """A lossy codec would be made here, too."""
+    if name == "stack" and leaf.kind == "stack":
+        return StackCodec(leaf, layout)
+    if name == "png" and leaf.kind == "image":
+        return PngCodec(leaf, layout)
+    raise FormatError(
+        f"{topic}: expected images as 'png' or none of the name, found {name!r:.40}; update tupli-mcap"
+    )
+
+
+def image_format(channels: Mapping[int, Channel]) -> ImageFormat:
+    """The format of the images in a recording with these channels."""
+    return "png" if any(channel.metadata.get(CODEC) == "png" for channel in channels.values()) else "raw"
 
 
 def uses_codecs(channels: Mapping[int, Channel]) -> bool:
     """True if a recording with these channels has format version 2."""
-    return any("stacks" in channel.metadata for channel in channels.values())
+    return any("stacks" in channel.metadata or CODEC in channel.metadata for channel in channels.values())
 
 
 class StackCodec:

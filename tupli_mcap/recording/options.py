@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording.durability import Durability, check_durability
+from tupli_mcap.recording.pictures import ImageFormat
 from tupli_mcap.system import refused
 
 __all__ = ["Mode", "WriterOptions", "check_options"]
@@ -35,6 +36,7 @@ class WriterOptions(NamedTuple):
     durability: Durability = "os"
     cameras: tuple[str, ...] = ()
     format_version: str = "1"
+    image_format: ImageFormat = "raw"
 
 
 def check_options(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:

@@ -11,16 +11,21 @@ from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
 
 __all__ = [
     "FrameFormat",
+    "ImageFormat",
     "Picture",
     "check_format",
+    "check_image_format",
     "check_picture",
     "decode_picture",
+    "decode_pixels",
     "encode_picture",
+    "encode_pixels",
     "format_of",
     "resized",
 ]
 
 FrameFormat = Literal["png", "jpeg"]
+ImageFormat = Literal["raw", "png"]  # of image leaves of the state
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 """uint8, height x width x 3: red, green, blue."""
 
@@ -97,6 +102,51 @@ def decode_picture(data: bytes | memoryview, where: str) -> Picture:
         raise
     except Exception as err:  # Pillow's decoders raise many kinds
         raise FormatError(f"{where}: expected a PNG or a JPEG, found {bytes(data[:16])!r}: {err}") from err
+
+
+def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
+    """uint8 pixels, height x width x 1, 3 or 4, as a PNG that gives them back exactly."""
+    flat = pixels[:, :, 0] if pixels.shape[2] == 1 else pixels
+    out = io.BytesIO()
+    _pillow().fromarray(np.ascontiguousarray(flat)).save(out, "PNG", compress_level=1)
+    return out.getvalue()
+
+
+def decode_pixels(data: bytes, shape: tuple[int, ...], where: str) -> np.ndarray[Any, Any]:
+    """The pixels of a PNG, of this shape.
+
+    Raises:
+        FormatError: it is no PNG, or of another size, depth or kind.
+        MissingExtraError: Pillow is not installed.
+    """
+    image_module = _pillow()
+    height, width, channels = shape
+    expected = (width, height), {1: "L", 3: "RGB", 4: "RGBA"}[channels]
+    try:
+        with image_module.open(io.BytesIO(data), formats=("PNG",)) as image:
+            if (image.size, image.mode) != expected:
+                raise FormatError(f"{where}: expected a PNG of {expected}, found {image.size, image.mode}")
+            return np.asarray(image).reshape(shape)
+    except FormatError:
+        raise
+    except Exception as err:  # Pillow's decoders raise many kinds
+        raise FormatError(f"{where}: expected a PNG, found {bytes(data[:16])!r}: {err}") from err
+
+
+def check_image_format(name: str) -> ImageFormat:
+    """A format of images of states that can be written here.
+
+    Raises:
+        RecordingError: it is neither "raw" nor "png".
+        MissingExtraError: Pillow is not installed.
+    """
+    for known in get_args(ImageFormat):
+        if name == known:
+            if known == "png":
+                _pillow()
+            found: ImageFormat = known
+            return found
+    raise RecordingError(f"image_format: expected 'raw' or 'png', found {name!r:.40}")
 
 
 def format_of(data: bytes | memoryview) -> FrameFormat | None:

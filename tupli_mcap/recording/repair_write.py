@@ -21,7 +21,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import record
-from tupli_mcap.recording.imagecodecs import image_codecs, uses_codecs
+from tupli_mcap.recording.imagecodecs import image_codecs, image_format, uses_codecs
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_frames import OldCameras, kept_frames
@@ -98,7 +98,15 @@ class RepairWriter:
         cameras = OldCameras.of(self._gathered, len(old.steps), vector)
         envs = len(old.steps) if vector else None
         store.codecs = image_codecs(layout, channels)
-        new = register_channels(self._container, "the repaired recording", layout, envs, info, cameras.names)
+        new = register_channels(
+            self._container,
+            "the repaired recording",
+            layout,
+            envs,
+            info,
+            cameras.names,
+            image_format(channels),
+        )
         self._container.define_channels()
         rows: dict[int, int] = {}  # first row of each episode in the new file
         dtype = layout.step_message.dtype if layout.constant else None

@@ -20,7 +20,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
-from tupli_mcap.recording.imagecodecs import image_codecs
+from tupli_mcap.recording.imagecodecs import image_codecs, image_format
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.reader import Recording
@@ -289,7 +289,7 @@ class _Rewriter:
         if new is not None and new.camera not in found:
             vector = source.num_envs if source.is_vector else None
             where = (self._container, source.name, source.layout, vector, None, (new.camera,))
-            found[new.camera] = register_channels(*where).cameras
+            found[new.camera] = register_channels(*where, image_format(self._contents.channels)).cameras
         return found
 
     def _frames(self, rows: Any) -> None:

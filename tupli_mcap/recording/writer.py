@@ -168,6 +168,7 @@ class RecordingWriter:
             num_envs if vector else None,
             info_schema,
             self.options.cameras,
+            self.options.image_format,
         )
         self._make_stores(self._areas())
         # after the journal: a file that has channels and no end has one

@@ -22,7 +22,7 @@ from tupli_mcap.recording.events import TERMINAL, TIMEOUT
 from tupli_mcap.recording.framing import CAMERA, FrameRecorder, check_every, check_render_mode
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
 from tupli_mcap.recording.options import Mode, WriterOptions
-from tupli_mcap.recording.pictures import FrameFormat, check_format
+from tupli_mcap.recording.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.recording.rotation import Rotation
 from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
@@ -68,6 +68,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         frames: True records what `env.render()` gives of every state, a number n every n-th and the last one; the
             environment must be made with render_mode="rgb_array".
         frame_format: "png" (exact) or "jpeg" (faster; smaller for photographs, not for drawings).
+        image_format: of the images in states, both exact. "raw": pixels, which the chunk's compression makes small;
+            "png": each image as a PNG (extra `frames`), smaller for photographs, and some 20 times slower.
         live: shows the rollout while it is recorded: "rerun" (starts the viewer if none listens at 127.0.0.1:9876),
             "rerun+http://host:port/proxy" (one that is running), "foxglove" or "foxglove://127.0.0.1:8765" (a server
             to connect Foxglove to). A viewer that is missing, slow or closed changes nothing about the recording.
@@ -104,11 +106,13 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         durability: Durability = "os",
         frames: bool | int = False,
         frame_format: FrameFormat = "png",
+        image_format: ImageFormat = "raw",
         live: str | None = None,
         max_bytes: int | None = None,
         max_seconds: float | None = None,
     ) -> None:
         super().__init__(env)
+        image_format = check_image_format(image_format)
         every = check_every(frames)
         if every:
             check_render_mode(env.render_mode)
@@ -135,7 +139,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             flush_seconds,
             durability=durability,
             cameras=(CAMERA,) if every else (),
-            format_version=format_version(spaces),
+            format_version=format_version(spaces, image_format),
+            image_format=image_format,
         )
         self._writer = self.rotation.open_first(self._options)
         try:

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 
 from tupli_mcap.messages.step import StepLayout, can_stack
+from tupli_mcap.recording.pictures import ImageFormat
 
 __all__ = ["format_version", "with_stacks"]
 
@@ -27,6 +28,6 @@ def with_stacks(env: Any, spaces: StepLayout) -> StepLayout:
     return StepLayout(spaces.observation_space, spaces.action_space, spaces.reward_space, stacks=stacks)
 
 
-def format_version(spaces: StepLayout) -> str:
+def format_version(spaces: StepLayout, images: ImageFormat) -> str:
     """The least version of the format that has what these spaces need."""
-    return "2" if spaces.stacks else "1"
+    return "2" if spaces.stacks or (images != "raw" and spaces.images) else "1"

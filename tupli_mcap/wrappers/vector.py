@@ -22,7 +22,7 @@ from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.framing import CAMERA, VectorFrames, check_every, check_render_mode
 from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
 from tupli_mcap.recording.options import Mode, WriterOptions
-from tupli_mcap.recording.pictures import FrameFormat, check_format
+from tupli_mcap.recording.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.recording.rotation import Rotation
 from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.vector_infos import final_info_of, info_of
@@ -72,10 +72,12 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         live: str | None = None,
         frames: bool | int = False,
         frame_format: FrameFormat = "png",
+        image_format: ImageFormat = "raw",
         max_bytes: int | None = None,
         max_seconds: float | None = None,
     ) -> None:
         super().__init__(env)
+        image_format = check_image_format(image_format)
         every = check_every(frames)
         if every:
             check_render_mode(getattr(env, "render_mode", None))
@@ -110,7 +112,8 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             flush_seconds,
             durability=durability,
             cameras=(CAMERA,) if every else (),
-            format_version=format_version(spaces),
+            format_version=format_version(spaces, image_format),
+            image_format=image_format,
         )
         self._writer = self.rotation.open_first(self._options)
         try:

@@ -1,0 +1,179 @@
+"""Images of states as PNG: every pixel comes back, viewers see pictures, and damage is found."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Sampler
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+from mcap.reader import make_reader
+from PIL import Image
+
+from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.options import WriterOptions
+from tupli_mcap.recording.pngcodec import PngCodec
+from tupli_mcap.recording.repair import recover_recording
+from tupli_mcap.recording.rewrite import rewrite_recording
+from tupli_mcap.recording.rows import even_rows
+from tupli_mcap.recording.verify import verify_recording
+from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.replay.render import render
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+SPACE = spaces.Dict(
+    {
+        "grey": spaces.Box(0, 255, (7, 5, 1), np.uint8),
+        "seen": spaces.Box(0, 255, (80, 90, 3), np.uint8),
+        "mask": spaces.Box(0, 255, (6, 6, 4), np.uint8),
+        "x": spaces.Box(-1, 1, (2,)),
+    }
+)
+
+
+def play(env: gym.Env[Any, Any], steps: int) -> list[Any]:
+    states = []
+    state, _ = env.reset(seed=1)
+    for _ in range(steps):
+        states.append(state)
+        state, _, terminal, timeout, _ = env.step(env.action_space.sample())
+        if terminal or timeout:
+            state, _ = env.reset()
+    return states
+
+
+def check(path: Path, states: list[Any]) -> None:
+    with Recording(path) as recording:
+        assert recording.metadata["format_version"] == "2"
+        for threads in (1, 2):
+            found = recording.read(threads=threads).states
+            for key in SPACE:
+                assert np.array_equal(found[key], np.array([state[key] for state in states]))
+    assert verify_recording(path).ok
+
+
+@pytest.mark.parametrize("compression", ["zstd", "none"])
+def test_every_pixel_comes_back(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(
+        Sampler(SPACE, spaces.Discrete(2), length=9), path, image_format="png", compression=compression
+    ) as env:
+        states = play(env, 80)
+    check(path, states)
+    with path.open("rb") as file:
+        shown = list(make_reader(file).iter_messages(topics=["/image/state_seen"]))
+    assert len(shown) == 80
+    for state, (schema, channel, message) in zip(states, shown, strict=True):
+        assert schema is not None and schema.name == "sensor_msgs/msg/CompressedImage"
+        assert channel.metadata["codec"] == "png"
+        picture = Image.open(io.BytesIO(message.data[message.data.index(b"\x89PNG") :]))
+        assert np.array_equal(np.asarray(picture), state["seen"])
+
+
+def test_killed_appended_rewritten_and_repaired(tmp_path: Path) -> None:
+    path, killed = tmp_path / "r.mcap", tmp_path / "killed.mcap"
+    env = RecordEpisodes(Sampler(SPACE, spaces.Discrete(2), length=9), path, image_format="png")
+    states = play(env, 60)
+    shutil.copy(path, killed)
+    shutil.copy(f"{path}.journal", f"{killed}.journal")
+    env.close()
+    check(killed, states)
+    with RecordEpisodes(Sampler(SPACE, spaces.Discrete(2), length=9), killed, mode="a") as env:
+        states += play(env, 30)  # in the format that the file has
+    check(killed, states)
+    rewritten, damaged, repaired = (
+        tmp_path / f"{name}.mcap" for name in ("rewritten", "damaged", "repaired")
+    )
+    with Recording(killed) as recording:
+        rewrite_recording(recording, rewritten)
+    check(rewritten, states)
+    damaged.write_bytes(killed.read_bytes()[:-100])
+    recover_recording(damaged, repaired)
+    check(repaired, states)
+
+
+def test_a_file_without_steps_keeps_its_version(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    RecordingWriter(path, WriterOptions(keep_empty=True)).close()
+    with pytest.raises(RecordingError, match="begun in format version 1, holds no step"):
+        RecordEpisodes(Sampler(SPACE, spaces.Discrete(2), length=9), path, mode="a", image_format="png")
+    with RecordEpisodes(Sampler(SPACE, spaces.Discrete(2), length=9), path, mode="a") as env:
+        play(env, 3)
+    with Recording(path) as recording:
+        assert recording.metadata["format_version"] == "1"
+
+
+def test_rendered_frames_can_be_added(tmp_path: Path) -> None:
+    path, target = tmp_path / "r.mcap", tmp_path / "seen.mcap"
+
+    def make() -> gym.Env[Any, Any]:
+        return gym.wrappers.AddRenderObservation(gym.make("CartPole-v1", render_mode="rgb_array"))
+
+    with RecordEpisodes(make(), path, image_format="png", attachments={}) as env:
+        states = play(env, 4)
+    render(path, target, env=make())
+    with Recording(target) as recording:
+        assert recording.cameras == ("render",)
+        assert np.array_equal(recording.read().states, np.array(states))
+    assert verify_recording(target).ok
+
+
+def test_sub_environments(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    inner = SyncVectorEnv([lambda: Sampler(SPACE, spaces.Discrete(2), length=50)] * 2)
+    env = RecordVector(inner, path, image_format="png")
+    states, _ = env.reset(seed=1)
+    taken = []
+    for _ in range(30):
+        taken.append(states["seen"].copy())
+        states = env.step(env.action_space.sample())[0]
+    env.close()
+    with Recording(path) as recording:
+        for i in range(2):
+            assert np.array_equal(recording.episodes[i].states["seen"], np.array(taken)[:, i])
+
+
+def test_another_format_is_refused_before_a_file_is_made(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="image_format: expected 'raw' or 'png', found 'jpeg'"):
+        RecordEpisodes(Sampler(SPACE, SPACE, length=3), tmp_path / "r.mcap", image_format="jpeg")  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_chunk_of_other_pictures_is_a_format_error() -> None:
+    layout = StepLayout(spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Discrete(2))
+    (leaf,) = layout.images
+    image = layout.image_messages["state"]
+    rows = np.zeros(3, image.dtype)
+    rows["fixed"] = np.frombuffer(image.body[8:], np.uint8)
+    rows["#opcode"], rows["#length"] = 5, image.dtype.itemsize - 9
+    rows["data"] = np.random.default_rng(0).integers(0, 256, (3, 4, 5, 3))
+    codec = PngCodec(leaf, image)
+    encoded = codec.encode(even_rows(1, 0, rows.tobytes(), rows))
+    data = bytes(encoded.data)
+    found = np.frombuffer(codec.decode(data, 3, "here"), image.dtype)
+    assert np.array_equal(found["data"], rows["data"])
+    assert codec.encode(encoded) is encoded
+    with pytest.raises(FormatError, match="here: expected 2 images, found more"):
+        codec.decode(data, 2, "here")
+    with pytest.raises(FormatError, match="here: expected 4 images, found 3"):
+        codec.decode(data, 4, "here")
+    with pytest.raises(FormatError, match="at most"):
+        codec.decode(data, 1 << 40, "here")
+    other = StepLayout(spaces.Box(0, 255, (5, 4, 3), np.uint8), spaces.Discrete(2))
+    with pytest.raises(FormatError, match="here: expected a PNG of"):
+        PngCodec(other.images[0], other.image_messages["state"]).decode(data, 3, "here")
+    for at in range(0, len(data), 3):
+        broken = bytearray(data)
+        broken[at] ^= 0x41
+        try:
+            pixels = np.frombuffer(codec.decode(bytes(broken), 3, "here"), image.dtype)
+        except FormatError:
+            continue
+        assert len(pixels) == 3

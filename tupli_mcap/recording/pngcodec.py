@@ -1,0 +1,77 @@
+"""Images as a PNG each: `sensor_msgs/msg/CompressedImage`, which viewers show and which gives every pixel back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.recording.cameras import EncodedFrame, decode_frame, encode_frame
+from tupli_mcap.recording.claims import MAX_CHUNK
+from tupli_mcap.recording.container import Rows
+from tupli_mcap.recording.logs import iter_records
+from tupli_mcap.recording.pictures import decode_pixels, encode_pixels
+
+__all__ = ["PngCodec"]
+
+
+class PngCodec:
+    """An `ImageCodec`: the rows of an image leaf, each of them a PNG. It needs Pillow."""
+
+    def __init__(self, leaf: Leaf, layout: ImageLayout) -> None:
+        self._leaf = leaf
+        self._dtype = layout.dtype
+        self._fixed = np.frombuffer(layout.body[8:], np.uint8)
+
+    def _is_raw(self, data: Any, count: int) -> bool:
+        """Whether these are the rows of a journal."""
+        if len(data) != count * self._dtype.itemsize:
+            return False
+        return bool((np.frombuffer(data, self._dtype)["fixed"] == self._fixed).all())
+
+    def encode(self, rows: Rows) -> Rows:
+        count = len(rows.offsets)
+        if not self._is_raw(rows.data, count):
+            return rows
+        records = []
+        for row in np.frombuffer(rows.data, self._dtype):
+            time_ns = int(row["sec"]) * 10**9 + int(row["nanosec"])
+            body = encode_frame(self._leaf.name, EncodedFrame(time_ns, "png", encode_pixels(row["data"])))
+            times = int(row["#log_time"]), int(row["#publish_time"])
+            head = RECORD_HEADER.pack(5, BODY - 9 + len(body), rows.channel, int(row["#sequence"]), *times)
+            records.append(head + CDR_HEADER + body)
+        offsets = np.zeros(count, np.uint64)
+        np.cumsum([len(record) for record in records[:-1]], out=offsets[1:])
+        return rows._replace(data=b"".join(records), offsets=offsets)
+
+    def decode(self, data: Any, count: int, where: str) -> Any:
+        size = count * self._dtype.itemsize
+        if size > MAX_CHUNK:
+            raise FormatError(f"{where}: expected at most {MAX_CHUNK} bytes of images, found {size}")
+        if self._is_raw(data, count):
+            return data
+        out = np.zeros(count, self._dtype)
+        out["fixed"] = self._fixed
+        view, found = memoryview(data), 0
+        for start, end, channel, sequence, log_time in iter_records(view):
+            if found == count:
+                raise FormatError(f"{where}: expected {count} images, found more")
+            row = out[found]
+            frame, name = decode_frame(view[start + BODY : end])
+            if (name, frame.form) != (self._leaf.name, "png"):
+                raise FormatError(
+                    f"{where}: expected a png of {self._leaf.name!r}, found {frame.form!r:.20} of {name!r:.40}"
+                )
+            row["#opcode"], row["#length"], row["#channel"] = 5, self._dtype.itemsize - 9, channel
+            row["#sequence"], row["#log_time"] = sequence, log_time
+            row["#publish_time"] = RECORD_HEADER.unpack_from(view, start)[5]
+            row["#cdr"] = int.from_bytes(view[start + BODY - 4 : start + BODY], "little")
+            row["sec"], row["nanosec"] = divmod(frame.time_ns, 10**9)
+            row["data"] = decode_pixels(frame.data, self._leaf.shape, where)
+            found += 1
+        if found != count:
+            raise FormatError(f"{where}: expected {count} images, found {found}")
+        return out.view(np.uint8)
