@@ -201,7 +201,7 @@ class Order:
         batch_size: numbers in a batch; the last one has what is left.
         shuffle: False: in their order. "exact": any order is as likely as any other. "blocks": items wait in a
             buffer that is filled block (chunk) by block, in random order, and leave it at random: few chunks are in
-            use at a time, and each is read about once an epoch, also where the cache holds only some of them.
+            use at a time, and each is read once or twice an epoch, also where the cache holds only some of them.
         seed: an integer from 0; None takes one of the system's. Each epoch has an order of its own.
         drop_last: leave out a last batch that is not full.
         buffer: how many items' worth of blocks are in use at a time; by default 65,536, or as many as half the cache
@@ -235,7 +235,8 @@ class Order:
         if buffer is not None:
             self.buffer = checked_count(buffer, 1, "a buffer")
         else:
-            self.buffer = max(1, min(_BUFFER, getattr(items.source, "room", _BUFFER)))
+            room = getattr(items.source, "room", len(items.source))
+            self.buffer = max(1, min(_BUFFER, room * self._n // len(items.source)))
         self._runs = items.block_runs() if shuffle == "blocks" else None
         if not len(self):
             raise SamplingError(
