@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from benchmarks import catalog, reading, recording, startup, viewing, watching
+from benchmarks import catalog, columns, reading, recording, startup, viewing, watching
 from benchmarks.measure import Line, Run
 from rich.console import Console
 from rich.markup import escape
@@ -27,6 +27,8 @@ CASES: dict[str, Callable[[Run], Iterator[Line]]] = {
     "live": watching.live,
     "size": recording.file_size,
     "read": reading.read_cartpole,
+    "read-hdf5": columns.read_hdf5,
+    "materialized": columns.materialized,
     "window": reading.window,
     "list": reading.listing,
     "filter": catalog.filter_catalog,
