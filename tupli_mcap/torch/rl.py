@@ -1,0 +1,134 @@
+"""Transitions for TorchRL: TensorDicts with the keys it expects, in a storage that reads what is sampled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.sampling import SamplingError, Transitions
+from tupli_mcap.torch.items import check_state
+from tupli_mcap.torch.tensors import tensors
+
+try:
+    from tensordict import NonTensorStack, TensorDict
+    from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer
+    from torchrl.data.replay_buffers.storages import Storage
+except ImportError as err:
+    raise MissingExtraError(
+        "tupli_mcap.torch.rl needs TorchRL, which is not installed; pip install 'tupli-mcap[torchrl]'"
+    ) from err
+
+__all__ = ["RecordedStorage", "replay_buffer"]
+
+
+class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
+    """The transitions of a dataset, by number, read when they are sampled; nothing can be written.
+
+        RecordedStorage(dataset.transitions())
+
+    A TensorDict of B transitions has the keys "observation", "action", "episode" (its place in the query), and under
+    "next": "observation", "reward", "done", "terminated", "truncated", the last four of shape (B, 1). "truncated" (and
+    "done") is also True where an episode was interrupted, or goes on with a step that a tuple filter left out: the
+    following row is not its next step. A Dict space gives a nested TensorDict, a Tuple space one with the keys "0",
+    "1", ..., and values that differ in size are non-tensor data. A pickled copy opens the files itself.
+
+    Raises:
+        SamplingError: these are no transitions over one step; TorchRL has `MultiStepTransform` for more.
+    """
+
+    def __init__(self, transitions: Transitions) -> None:
+        if not isinstance(transitions, Transitions) or transitions.n_step != 1:
+            raise SamplingError(f"expected dataset.transitions() over one step, found {transitions!r:.80}")
+        super().__init__(max_size=len(transitions))
+        self._transitions = transitions
+
+    def __len__(self) -> int:
+        return len(self._transitions)
+
+    def get(self, index: Any) -> TensorDict:
+        """The transitions of an integer, a slice, or a tensor, an array or a list of integers, read together."""
+        if isinstance(index, tuple) and len(index) == 1:
+            (index,) = index
+        if isinstance(index, torch.Tensor):
+            index = index.numpy()
+        if isinstance(index, slice):
+            index = np.arange(*index.indices(len(self)))
+        numbers = np.asarray(index, np.int64)
+        found = self._read(numbers.reshape(-1))
+        return found.reshape(numbers.shape)
+
+    def _read(self, numbers: np.ndarray[Any, Any]) -> TensorDict:
+        columns = tensors(self._transitions[numbers].asdict())
+        breaks = torch.from_numpy(np.isin(numbers, self._transitions.source.breaks))
+        terminated = columns["terminals"]
+        truncated = columns["timeouts"] | (breaks & ~terminated)
+        following = {
+            "observation": _nested(columns["next_states"], len(numbers)),
+            "reward": _nested(columns["rewards"], len(numbers), flags=True),
+            "done": (terminated | truncated)[:, None],
+            "terminated": terminated[:, None],
+            "truncated": truncated[:, None],
+        }
+        given = {
+            "observation": _nested(columns["states"], len(numbers)),
+            "action": _nested(columns["actions"], len(numbers)),
+            "episode": columns["episodes"],
+            "next": TensorDict(following, [len(numbers)]),
+        }
+        return TensorDict(given, [len(numbers)])
+
+    def contains(self, item: Any) -> bool:
+        """Whether there is a transition of that number."""
+        return 0 <= int(item) < len(self)
+
+    def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
+        """Refused.
+
+        Raises:
+            SamplingError: always.
+        """
+        raise SamplingError("expected to read only: a RecordedStorage is what has been recorded")
+
+    def _empty(self) -> None:
+        self.set(None, None)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Says which transitions these are."""
+        return {"items": self._transitions.identity}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Checks that the state is one of the same transitions.
+
+        Raises:
+            SamplingError: it is another's.
+        """
+        check_state(state_dict, self._transitions.identity, {})
+
+
+def replay_buffer(transitions: Transitions, batch_size: int, **options: Any) -> TensorDictReplayBuffer:
+    """A replay buffer that samples recorded transitions, and that nothing can be added to.
+
+    Args:
+        transitions: `dataset.transitions()`.
+        options: of `TensorDictReplayBuffer`, such as a sampler, `prefetch` or a transform.
+    """
+    given = {"writer": ImmutableDatasetWriter(), "collate_fn": _as_it_is, **options}
+    return TensorDictReplayBuffer(storage=RecordedStorage(transitions), batch_size=batch_size, **given)
+
+
+def _as_it_is(batch: TensorDict) -> TensorDict:
+    return batch
+
+
+def _nested(column: Any, rows: int, *, flags: bool = False) -> Any:
+    """A column as what a TensorDict holds; with `flags`, numbers have a last dimension of their own."""
+    if isinstance(column, tuple):
+        column = {str(i): part for i, part in enumerate(column)}
+    if isinstance(column, dict):
+        return TensorDict({key: _nested(part, rows, flags=flags) for key, part in column.items()}, [rows])
+    if isinstance(column, list):
+        return NonTensorStack(*column)
+    return column[:, None] if flags and column.ndim == 1 else column
