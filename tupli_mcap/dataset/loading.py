@@ -12,11 +12,11 @@ import numpy as np
 from tupli_mcap.dataset.columns import FieldBuilder, pick
 from tupli_mcap.dataset.selection import TupleSelector
 from tupli_mcap.dataset.sources import Source
-from tupli_mcap.errors import NotFoundError
 from tupli_mcap.messages.common import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
+from tupli_mcap.sampling import ListedEpisodes, index
 from tupli_mcap.schema import EpisodeHeader
 
 __all__ = ["Selected", "empty_column", "positions_of", "read_columns"]
@@ -142,18 +142,13 @@ def empty_column(field: str) -> Any:
 
 
 def positions_of(recording: Recording, headers: Sequence[EpisodeHeader]) -> tuple[Array, Array]:
-    """Where the episodes are in the recording, and how many steps of each are listed (int64)."""
-    places = {number: i for i, number in enumerate(recording.index["episode"].tolist())}
-    positions = np.array([places.get(header.episode, -1) for header in headers], np.int64)
-    lengths = np.array([header.n_tuples for header in headers], np.int64)
-    gone = np.flatnonzero(positions < 0)
-    short = np.flatnonzero(recording.index["length"][positions] < lengths) if not len(gone) else gone
-    if len(short):
-        raise NotFoundError(
-            f"{recording.name}: episode {headers[int(short[0])].episode} was listed, but is not there as it "
-            "was: the file has been changed since; call load() to list the episodes anew"
-        )
-    return positions, lengths
+    """Where the episodes are in the recording, and how many steps of each are listed (int64).
+
+    Raises:
+        NotFoundError: one of them is not there any more, or is shorter.
+    """
+    listed = ListedEpisodes.of(recording.name, headers)
+    return index.positions_of(recording, listed), listed.lengths
 
 
 def _blocks(lengths: Array, step_bytes: int) -> Iterator[slice]:

@@ -205,9 +205,7 @@ def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
 
 def _listed(headers: Sequence[EpisodeHeader]) -> Iterator[ListedEpisodes]:
     for name, group in itertools.groupby(headers, key=lambda header: header.recording):
-        found = [(header.episode, header.n_tuples) for header in group]
-        numbers, lengths = np.array(found, np.int64).reshape(-1, 2).T
-        yield ListedEpisodes(name, numbers, lengths)
+        yield ListedEpisodes.of(name, group)
 
 
 def _own(column: Any) -> Any:

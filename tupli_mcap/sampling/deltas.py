@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tupli_mcap.sampling.items import Items
+from tupli_mcap.sampling.items import StepItems
 from tupli_mcap.sampling.steps import SamplingError, Steps
 from tupli_mcap.sampling.windows import shaped_rows
 
@@ -43,7 +43,7 @@ class DeltaWindow:
         return self.values[key]
 
 
-class DeltaWindows(Items[DeltaWindow]):
+class DeltaWindows(StepItems[DeltaWindow]):
     """The values around each step, by the number of the step, as LeRobot's delta_timestamps give them.
 
     Values are of the step's own episode, and between the cuts of a tuple filter.
@@ -78,16 +78,6 @@ class DeltaWindows(Items[DeltaWindow]):
         self.deltas = given if unit == "clock" else _in_steps(given, unit, step_seconds)
         self._lasts = steps.breaks
         self._firsts = np.concatenate([[0], self._lasts[:-1] + 1])
-        self._episode_ends = np.cumsum(steps.episode_lengths)
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def steps_of(self, items: Array) -> Array:
-        return items
-
-    def counts(self) -> Array:
-        return self.source.episode_lengths
 
     def _one(self, item: int) -> DeltaWindow:
         return self._read(np.array([item]), single=True)
@@ -110,7 +100,7 @@ class DeltaWindows(Items[DeltaWindow]):
                 column = columns[KEYS[key]]
                 values[key] = column if single else shaped_rows(column, rows.shape)
                 masks[key] = mask[0] if single else mask
-        episodes = self._episode_ends.searchsorted(steps, side="right")
+        episodes = self._episodes(steps)
         ordered = {key: values[key] for key in self.deltas}
         return DeltaWindow(ordered, masks, *((steps[0], episodes[0]) if single else (steps, episodes)))
 

@@ -17,6 +17,7 @@ from tupli_mcap.recording.chunks import ChunkCache, ChunkStore
 from tupli_mcap.recording.stored import StoredSteps
 from tupli_mcap.sampling.files import FileOfMany, OpenFiles
 from tupli_mcap.sampling.segments import Segments, SegmentsBuilder
+from tupli_mcap.schema import EpisodeHeader
 
 __all__ = ["ListedEpisodes", "StepIndex", "positions_of"]
 
@@ -29,6 +30,13 @@ class ListedEpisodes(NamedTuple):
     recording: str
     numbers: Array
     lengths: Array
+
+    @classmethod
+    def of(cls, recording: str, headers: Iterable[EpisodeHeader]) -> ListedEpisodes:
+        """The episodes of a recording as they are listed."""
+        found = [(header.episode, header.n_tuples) for header in headers]
+        numbers, lengths = np.array(found, np.int64).reshape(-1, 2).T
+        return cls(recording, numbers, lengths)
 
 
 def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
@@ -16,11 +17,21 @@ if TYPE_CHECKING:
     from tupli_mcap.sampling.batches import Batches
     from tupli_mcap.sampling.draws import Numbers, Order, Sampler, Shuffle, Weights
 
-__all__ = ["Items", "checked_count"]
+__all__ = ["Items", "Parts", "StepItems", "checked_count"]
 
 Array = np.ndarray[Any, Any]
 T = TypeVar("T")
 _MANY = 1 << 20
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Columns of one item or of a batch, and facts about them, by name; None where not asked for."""
+
+    def asdict(self) -> dict[str, Any]:
+        """What there is, by name, without what was not asked for."""
+        named = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return {name: value for name, value in named if value is not None}
 
 
 class Items(ABC, Generic[T]):
@@ -156,6 +167,27 @@ class Items(ABC, Generic[T]):
             blocks.append(found[cuts])
         begin = np.concatenate(starts)
         return begin, np.diff(begin, append=len(self)), np.concatenate(blocks)
+
+
+class StepItems(Items[T]):
+    """Items of which each step has one, by the number of the step."""
+
+    def __init__(self, steps: Steps, parameters: Sequence[object]) -> None:
+        super().__init__(steps, parameters)
+        self._episode_ends = np.cumsum(steps.episode_lengths)
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def steps_of(self, items: Array) -> Array:
+        return items
+
+    def counts(self) -> Array:
+        return self.source.episode_lengths
+
+    def _episodes(self, steps: Array) -> Array:
+        """The places of the steps' episodes in the query."""
+        return self._episode_ends.searchsorted(steps, side="right")
 
 
 def checked_count(value: object, least: int, what: str) -> int:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from tupli_mcap.sampling.items import Items, checked_count
+from tupli_mcap.sampling.items import Parts, StepItems, checked_count
 from tupli_mcap.sampling.steps import SamplingError, Steps, checked_fields, map_arrays
 
 __all__ = ["TRANSITION_FIELDS", "Transition", "Transitions"]
@@ -18,7 +18,7 @@ TRANSITION_FIELDS = ("states", "actions", "rewards", "next_states", "terminals",
 
 
 @dataclass(frozen=True)
-class Transition:
+class Transition(Parts):
     """One transition, or columns of B transitions; columns are nested as the space is, None where not asked for.
 
     states, actions: where the transition starts.
@@ -43,13 +43,8 @@ class Transition:
     terminals: Any = None
     timeouts: Any = None
 
-    def asdict(self) -> dict[str, Any]:
-        """What there is, by name, without what was not asked for."""
-        named = ((field.name, getattr(self, field.name)) for field in fields(self))
-        return {name: value for name, value in named if value is not None}
 
-
-class Transitions(Items[Transition]):
+class Transitions(StepItems[Transition]):
     """The transition that starts at each step, by the number of the step.
 
     With `n_step`, a transition is of as many steps, or of fewer where its episode (or the run of steps that a tuple
@@ -74,21 +69,11 @@ class Transitions(Items[Transition]):
             raise SamplingError(f"expected a discount from 0 to 1, found {discount!r:.80}")
         self.discount = float(discount)
         self.fields = tuple(checked_fields(fields, TRANSITION_FIELDS))
-        self._episode_ends = np.cumsum(steps.episode_lengths)
         varying = steps.layout is not None and any(leaf.kind == "variable" for leaf in steps.layout.reward)
         if self.n_step > 1 and varying and "rewards" in self.fields:
             raise SamplingError(
                 "expected rewards that can be summed, found some of variable size; take n_step=1"
             )
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def steps_of(self, items: Array) -> Array:
-        return items
-
-    def counts(self) -> Array:
-        return self.source.episode_lengths
 
     def _one(self, item: int) -> Transition:
         return Transition(**{name: _first(part) for name, part in self._read(np.array([item])).items()})
@@ -116,7 +101,7 @@ class Transitions(Items[Transition]):
             "mask": ~unknown,
             "discounts": np.where(terminals, 0.0, self.discount**counts),
             "steps": rows,
-            "episodes": self._episode_ends.searchsorted(rows, side="right"),
+            "episodes": self._episodes(rows),
             **columns,
         }
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
-from tupli_mcap.sampling.items import Items, checked_count
+from tupli_mcap.sampling.items import Items, Parts, checked_count
 from tupli_mcap.sampling.steps import FIELDS, SamplingError, Steps, checked_fields, map_arrays
 
 __all__ = ["Pad", "Window", "Windows", "shaped_rows"]
@@ -20,7 +20,7 @@ FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 
 
 @dataclass(frozen=True)
-class Window:
+class Window(Parts):
     """Columns of one window, of shape (T, ...), or of B windows, of shape (B, T, ...); None where not asked for.
 
     They are nested as the space is; values that differ in size are in a list (of B lists). `mask` (bool, (B, T)) is
@@ -38,11 +38,6 @@ class Window:
     timeouts: Any = None
     next_states: Any = None
     times: Any = None
-
-    def asdict(self) -> dict[str, Any]:
-        """What there is, by name, without what was not asked for."""
-        named = ((field.name, getattr(self, field.name)) for field in fields(self))
-        return {name: value for name, value in named if value is not None}
 
 
 class Windows(Items[Window]):
