@@ -32,7 +32,7 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording import VerifyReport, rewrite
+from tupli_mcap.recording import VerifyReport, rewrite, transfer
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
@@ -235,25 +235,25 @@ def test_other_files(tmp_path: Path) -> None:
 # ---- contents that are consistent, but wrong
 
 
-class Forger(rewrite._Rewriter):
-    """Rewrites a recording with a mistake, as a faulty writer would: CRCs and summary are right."""
+class Forger(transfer.Target):
+    """What a recording is rewritten to with a mistake, as a faulty writer would: CRCs and summary are right."""
 
     mistake = ""
 
-    def run(self, *args: Any) -> None:
-        container, index = self._container, self._index
-        add_chunk, add = container.add_chunk, index.add
-
-        def chunk(rows: Any) -> None:
-            topic = container.channels[rows.channel].topic
-            add_chunk(self.changed(topic, rows))
+    def __init__(self, container: Container) -> None:
+        super().__init__(container)
+        add = self.index.add
 
         def row(values: EpisodeRow, metadata: str) -> None:
             add(self.changed_row(values), metadata)
 
-        container.add_chunk = chunk  # type: ignore[method-assign]
-        index.add = row  # type: ignore[method-assign]
-        super().run(*args)
+        self.index.add = row  # type: ignore[method-assign, assignment]
+
+    def copy_first(self, *_: Any) -> int:
+        return 0
+
+    def add_chunk(self, rows: Any) -> None:
+        super().add_chunk(self.changed(self.container.channels[rows.channel].topic, rows))
 
     def changed(self, topic: str, rows: Any) -> Any:
         data = bytearray(rows.data)
@@ -299,6 +299,14 @@ class Forger(rewrite._Rewriter):
         return row
 
 
+def forge(recording: Recording, container: Container, mistake: str) -> None:
+    """Rewrites a recording with a mistake."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rewrite, "Target", Forger)
+        patch.setattr(Forger, "mistake", mistake)
+        rewrite.write(recording, container, dict(recording.metadata), None, {}, signed=False)
+
+
 MISTAKES = {
     "step": "does not count from the one before",
     "episode": "is not numbered as its episode",
@@ -326,9 +334,7 @@ def test_a_faulty_writer_is_found_out(mistake: str, tmp_path: Path) -> None:
     target = tmp_path / "b.mcap"
     fd = os.open(target, os.O_RDWR | os.O_CREAT)
     with Recording(path) as recording:
-        forger = Forger(recording, Container(fd, str(target), "zstd"))
-        forger.mistake = mistake
-        forger.run(None, {}, None)
+        forge(recording, Container(fd, str(target), "zstd"), mistake)
     os.close(fd)
     report = verify_recording(target)
     assert not report.ok
@@ -340,9 +346,7 @@ def test_a_rewriter_without_a_mistake_is_not(mistake: str, tmp_path: Path) -> No
     path = record(tmp_path / "a.mcap", steps=60, length=20)
     fd = os.open(tmp_path / "b.mcap", os.O_RDWR | os.O_CREAT)
     with Recording(path) as recording:
-        forger = Forger(recording, Container(fd, "b.mcap", "zstd"))
-        forger.mistake = mistake
-        forger.run(None, {}, None)
+        forge(recording, Container(fd, "b.mcap", "zstd"), mistake)
     os.close(fd)
     assert verify_recording(tmp_path / "b.mcap").problems == []
     assert IndexBuilder().count == 0

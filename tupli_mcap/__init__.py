@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tupli_mcap.benchmark import TupliEnvWrapper
-    from tupli_mcap.dataset import TupliDataset
+    from tupli_mcap.dataset import TupliDataset, filter_recording
     from tupli_mcap.errors import (
         FilterError,
         FormatError,
@@ -28,8 +28,10 @@ if TYPE_CHECKING:
         Step,
         VerifyReport,
         journal_path,
+        merge_recordings,
         recover_recording,
         rewrite_recording,
+        split_recording,
         verify_recording,
         write_recording,
     )
@@ -53,7 +55,7 @@ if TYPE_CHECKING:
 # Where each public name lives; imported on first use, so that `import tupli_mcap` stays quick.
 _HOMES = {
     "benchmark": ["TupliEnvWrapper"],
-    "dataset": ["TupliDataset"],
+    "dataset": ["TupliDataset", "filter_recording"],
     "errors": [
         "FilterError",
         "FormatError",
@@ -73,7 +75,9 @@ _HOMES = {
         "RecoveryReport",
         "Step",
         "journal_path",
+        "merge_recordings",
         "recover_recording",
+        "split_recording",
         "VerifyReport",
         "rewrite_recording",
         "verify_recording",
@@ -132,9 +136,12 @@ __all__ = [
     "TupliStorage",
     "UntrustedError",
     "VerifyReport",
+    "filter_recording",
     "journal_path",
+    "merge_recordings",
     "recover_recording",
     "rewrite_recording",
+    "split_recording",
     "verify_recording",
     "write_recording",
 ]

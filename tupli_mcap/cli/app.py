@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from tupli_mcap.cli import (
+    curating,
     doctor,
     plotting,
     recordings,
@@ -153,6 +154,7 @@ storages.register(app)
 sharing.register(app)
 trusting.register(app)
 repair.register(app)
+curating.register(app)
 viewing.register(app)
 rendering.register(app)
 

@@ -12,6 +12,7 @@ from tupli_mcap.recording.reader import RecordedBenchmark, Recording
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.handmade import EpisodeData, write_recording
+    from tupli_mcap.recording.merge import MergeReport, Part, merge_recordings, split_recording
     from tupli_mcap.recording.repair import RecoveryReport, recover_recording
     from tupli_mcap.recording.rewrite import rewrite_recording
     from tupli_mcap.recording.verify import Problem, VerifyReport, verify_recording
@@ -19,11 +20,15 @@ if TYPE_CHECKING:
 # Imported on first use: who records or reads needs none of them.
 _HOMES = {
     "EpisodeData": "handmade",
+    "MergeReport": "merge",
+    "Part": "merge",
     "Problem": "verify",
     "RecoveryReport": "repair",
     "VerifyReport": "verify",
+    "merge_recordings": "merge",
     "recover_recording": "repair",
     "rewrite_recording": "rewrite",
+    "split_recording": "merge",
     "verify_recording": "verify",
     "write_recording": "handmade",
 }
@@ -33,6 +38,8 @@ __all__ = [
     "Episode",
     "EpisodeData",
     "Episodes",
+    "MergeReport",
+    "Part",
     "Problem",
     "RecordedBenchmark",
     "Recording",
@@ -40,8 +47,10 @@ __all__ = [
     "Step",
     "VerifyReport",
     "journal_path",
+    "merge_recordings",
     "recover_recording",
     "rewrite_recording",
+    "split_recording",
     "verify_recording",
     "write_recording",
 ]

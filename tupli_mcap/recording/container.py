@@ -119,6 +119,11 @@ class Container:
         ] = {}  # of the channels whose rows are written otherwise than they come
         self._announced: set[int] = set()
 
+    @property
+    def compression(self) -> Compression:
+        """Of the chunks that are added."""
+        return self._compression
+
     def write(self, data: bytes) -> None:
         """Appends bytes; on failure the file keeps only whole records."""
         start = self.position

@@ -1,0 +1,420 @@
+"""Merged, split and filtered recordings: everything comes along, exact, and chunks are copied where they can be."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import same
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from typer.testing import CliRunner
+
+from tupli_mcap import (
+    F,
+    FilterError,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    SpaceError,
+    filter_recording,
+    merge_recordings,
+    split_recording,
+    verify_recording,
+)
+from tupli_mcap.cli.app import app
+from tupli_mcap.recording.source import PathSource
+from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+SPACES = {
+    "box": spaces.Box(-9, 9, (40,), np.float64),
+    "text": spaces.Dict({"note": spaces.Text(300), "x": spaces.Discrete(5)}),
+    "stack": spaces.Box(0, 255, (20, 20), np.uint8),
+    "image": spaces.Dict({"see": spaces.Box(0, 255, (20, 20, 3), np.uint8), "x": spaces.Box(-1, 1, (2,))}),
+}
+
+
+class Sampled(gym.Env[Any, Any]):
+    """Samples of a space, in episodes of 1 to 9 steps, some cut short; pictures where they are wanted."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, kind: str, render_mode: str | None = None) -> None:
+        self.observation_space, self.action_space = SPACES[kind], spaces.Discrete(9)
+        self.render_mode = render_mode
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.observation_space.seed(int(self.np_random.integers(1 << 30)))
+        self._left = int(self.np_random.integers(1, 10))
+        return self.observation_space.sample(), {"left": self._left}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._left -= 1
+        ends = self._left == 0
+        info = {"left": self._left, "note": "n" * self._left}
+        return (
+            self.observation_space.sample(),
+            float(self.np_random.normal()),
+            ends and action < 5,
+            ends,
+            info,
+        )
+
+    def render(self) -> Any:
+        return np.full((8, 8, 3), self._left * 20, np.uint8)
+
+
+class Score(EpisodeMetadataCallback):
+    def __init__(self) -> None:
+        self.count = 0
+        self.reset()
+
+    def reset(self) -> None:
+        self.steps = 0
+
+    def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+        self.steps += 1
+        self.count += self.steps == 1
+        return {"score": self.count, "steps": self.steps}
+
+
+def record(
+    path: Path, kind: str = "box", *, steps: int = 150, seed: int = 1, frames: int = 0, **options: Any
+) -> Path:
+    options = {
+        "attachments": {},
+        "chunk_size": 2000,
+        "metadata_callback": Score(),
+        "record_info": True,
+        **options,
+    }
+    inner: gym.Env[Any, Any] = Sampled(kind, "rgb_array")
+    if kind == "stack":  # each frame is stored once
+        inner = gym.wrappers.FrameStackObservation(inner, 3)
+    env = RecordEpisodes(inner, path, frames=frames, **options)
+    with env:
+        env.action_space.seed(seed)
+        env.reset(seed=seed, options={"at": seed})
+        for _ in range(steps):
+            _, _, terminal, timeout, _ = env.step(env.action_space.sample())
+            if terminal or timeout:
+                env.reset()
+    return path
+
+
+def record_vector(path: Path, *, steps: int = 150, seed: int = 1) -> Path:
+    venv = SyncVectorEnv([lambda: Sampled("image")] * 2, autoreset_mode=AutoresetMode.NEXT_STEP)
+    with RecordVector(venv, path, attachments={}, record_info=True, metadata_callback=Score()) as env:
+        env.action_space.seed(seed)
+        env.reset(seed=seed)
+        for _ in range(steps):
+            env.step(env.action_space.sample())
+    return path
+
+
+def facts(recording: Recording, numbers: Sequence[int] | None = None) -> list[dict[str, Any]]:
+    """All there is about the episodes, but their numbers and rows."""
+    return [
+        {
+            "env": e.env, "end": e.end, "return": e.return_, "seed": e.seed, "options": e.options,
+            "reset_info": e.reset_info, "metadata": e.metadata, "final": e.final_state,
+            "steps": [tuple(step) for step in e], "continued": e.start.continued,
+            "frames": [(int(step), e.frames.encoded(i).data) for i, step in enumerate(e.frames.steps)],
+        }
+        for e in recording.episodes
+        if numbers is None or e.number in numbers
+    ]  # fmt: skip
+
+
+def chunks_of(path: Path) -> list[bytes]:
+    """The chunk records of a recording, as they are in the file."""
+    with Recording(path) as recording:
+        source = PathSource(path)
+        found = [source.read(int(row["offset"]), int(row["length"])) for row in recording._contents.table]
+        source.close()
+        return found
+
+
+def assert_sound(path: Path) -> None:
+    report = verify_recording(path)
+    assert report.problems == []
+    assert report.ok
+
+
+class TestMerge:
+    @pytest.mark.parametrize("kind", SPACES)
+    def test_everything_comes_along(self, tmp_path: Path, kind: str) -> None:
+        paths = [record(tmp_path / f"{i}.mcap", kind, seed=i, frames=3 * (i % 2)) for i in range(3)]
+        report = merge_recordings(paths, tmp_path / "all.mcap")
+        assert_sound(report.path)
+        opened = [Recording(path) for path in paths]
+        with Recording(report.path) as merged:
+            assert same(facts(merged), [fact for one in opened for fact in facts(one)])
+            assert len({merged.uuid, *(one.uuid for one in opened)}) == 4
+            assert [e.number for e in merged.episodes] == list(range(len(merged)))
+            times = [t for one in opened for t in one.read(fields=["times"]).times.tolist()]
+            assert merged.read(fields=["times"]).times.tolist() == times
+            assert (report.episodes, report.steps, report.held) == (len(merged), merged.num_steps, 0)
+            assert merged.metadata["next_episode"] == str(len(merged))
+        assert report.size == report.path.stat().st_size
+        first = chunks_of(paths[0])
+        copied = sum(chunk in chunks_of(report.path) for chunk in first)
+        assert copied >= report.copied > 1
+
+    @pytest.mark.parametrize("formats", [("raw", "png"), ("png", "raw")])
+    def test_images_of_another_format(self, tmp_path: Path, formats: tuple[str, str]) -> None:
+        paths = [
+            record(tmp_path / f"{i}.mcap", "image", seed=i, image_format=form)
+            for i, form in enumerate(formats)
+        ]
+        report = merge_recordings(paths, tmp_path / "all.mcap")
+        assert_sound(report.path)
+        with Recording(report.path) as merged:
+            assert same(facts(merged), [fact for path in paths for fact in facts(Recording(path))])
+
+    def test_vector_recordings(self, tmp_path: Path) -> None:
+        paths = [record_vector(tmp_path / f"{i}.mcap", seed=i) for i in range(2)]
+        report = merge_recordings(paths, tmp_path / "all.mcap")
+        assert_sound(report.path)
+        with Recording(report.path) as merged:
+            expected = [fact for path in paths for fact in facts(Recording(path))]
+            for env in range(2):
+                mine = [fact for fact in facts(merged) if fact["env"] == env]
+                assert same(mine, [fact for fact in expected if fact["env"] == env])
+
+    def test_they_come_in_the_order_of_their_times(self, tmp_path: Path) -> None:
+        first, second = record(tmp_path / "b.mcap", seed=1), record(tmp_path / "a.mcap", seed=2)
+        report = merge_recordings([second, first], tmp_path / "all.mcap")
+        with Recording(report.path) as merged:
+            assert same(facts(merged), facts(Recording(first)) + facts(Recording(second)))
+
+    def test_recordings_made_at_the_same_time(self, tmp_path: Path) -> None:
+        """Times are held, values stay."""
+        envs = [
+            RecordEpisodes(Sampled("box"), tmp_path / f"{i}.mcap", attachments={}, record_info=True)
+            for i in range(2)
+        ]
+        for env in envs:
+            env.reset(seed=1)
+        for _ in range(60):
+            for env in envs:
+                if any(env.step(0)[2:4]):
+                    env.reset()
+        for env in envs:
+            env.close()
+        with pytest.warns(UserWarning, match="rows of .* have the time of the row ahead of them"):
+            report = merge_recordings([env.path for env in envs], tmp_path / "all.mcap")
+        assert report.held > 60
+        assert_sound(report.path)
+        with Recording(report.path) as merged:
+            assert same(facts(merged), [fact for env in envs for fact in facts(Recording(env.path))])
+
+    def test_merged_again_appended_and_filtered(self, tmp_path: Path) -> None:
+        paths = [record(tmp_path / f"{i}.mcap", seed=i) for i in range(3)]
+        merge_recordings(paths[:2], tmp_path / "two.mcap")
+        merge_recordings([tmp_path / "two.mcap", paths[2]], tmp_path / "all.mcap")
+        before = sum(len(Recording(path)) for path in paths)
+        record(tmp_path / "all.mcap", seed=5, mode="a")
+        assert_sound(tmp_path / "all.mcap")
+        with Recording(tmp_path / "all.mcap") as recording:
+            assert len(recording) > before
+            assert [e.number for e in recording.episodes] == list(range(len(recording)))
+
+    def test_attachments(self, tmp_path: Path) -> None:
+        one = record(tmp_path / "1.mcap", attachments={"a": ("text/plain", b"1"), "c": ("text/plain", b"3")})
+        two = record(tmp_path / "2.mcap", attachments={"b": ("text/plain", b"2"), "c": ("text/plain", b"3")})
+        merge_recordings([one, two], tmp_path / "all.mcap")
+        with Recording(tmp_path / "all.mcap") as merged:
+            found = {name: merged.read_attachment(name) for name in merged.attachments}
+        assert found == {"a": b"1", "b": b"2", "c": b"3"}
+        other = record(tmp_path / "3.mcap", attachments={"c": ("text/plain", b"?")})
+        with pytest.raises(RecordingError, match=r"3\.mcap: its attachment 'c' differs"):
+            merge_recordings([one, other], tmp_path / "no.mcap")
+        assert not (tmp_path / "no.mcap").exists()
+
+    def test_the_environment_comes_along(self, tmp_path: Path) -> None:
+        paths = []
+        for i in range(2):
+            env = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / f"{i}.mcap")
+            with env:
+                env.reset(seed=i)
+                env.step(0)
+            paths.append(env.path)
+        merge_recordings(paths, tmp_path / "all.mcap")
+        with Recording(tmp_path / "all.mcap") as merged:
+            made = merged.benchmark.make_env()
+            assert made.spec is not None
+            assert made.spec.id == "CartPole-v1"
+
+    def test_what_does_not_fit_is_refused(self, tmp_path: Path) -> None:
+        one, text = record(tmp_path / "1.mcap"), record(tmp_path / "t.mcap", "text")
+        image, vector = record(tmp_path / "i.mcap", "image"), record_vector(tmp_path / "v.mcap")
+        named = record(tmp_path / "n.mcap", record_info=["left"])
+        benchmark = record(tmp_path / "b.mcap", benchmark_id="b" * 64)
+        copy = tmp_path / "copy.mcap"
+        copy.write_bytes(one.read_bytes())
+        goal = tmp_path / "all.mcap"
+        for others, kind, words in (
+            (
+                [one, text],
+                SpaceError,
+                r"t\.mcap: expected the observation_space of .*1\.mcap, Box.*, found Dict",
+            ),
+            (
+                [image, vector],
+                SpaceError,
+                "expected a single environment, as in .*, found 2 sub-environments",
+            ),
+            ([one, named], RecordingError, "records /info with other fields"),
+            ([one, benchmark], RecordingError, "expected a recording of benchmark none"),
+            ([one, copy], RecordingError, r"copy\.mcap holds episode 0 of .*1\.mcap again"),
+            ([], RecordingError, "expected recordings with episodes to merge, found none"),
+        ):
+            with pytest.raises(kind, match=words):
+                merge_recordings(others, goal)
+            assert not goal.exists()
+        with pytest.raises(RecordingError, match="is one of the recordings to merge"):
+            merge_recordings([one, named], one, overwrite=True)
+        with pytest.raises(RecordingError, match="exists; choose another path"):
+            merge_recordings([one], image)
+
+
+class TestSplit:
+    @pytest.mark.parametrize("kind", SPACES)
+    def test_by_episodes(self, tmp_path: Path, kind: str) -> None:
+        path = record(tmp_path / "run.mcap", kind, frames=2)
+        parts = split_recording(path, tmp_path / "part.mcap", episodes=12)
+        names = [part.path.name for part in parts]
+        assert names == ["part.mcap", *(f"part_{i:04}.mcap" for i in range(1, len(names)))]
+        found: list[Any] = []
+        for part in parts:
+            assert_sound(part.path)
+            with Recording(part.path) as recording:
+                assert (len(recording), recording.num_steps) == (part.episodes, part.steps)
+                assert [recording.episodes[i].number for i in (0, -1)] == [part.first, part.last]
+                found += facts(recording)
+        with Recording(path) as recording:
+            assert same(found, facts(recording))
+        assert {part.episodes for part in parts[:-1]} == {12}
+        assert parts[0].copied > 0
+        assert len({Recording(part.path).uuid for part in parts}) == len(parts) > 2
+
+    def test_by_bytes(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "run.mcap", steps=1500, record_info=False)
+        parts = split_recording(path, tmp_path / "part.mcap", max_bytes=100_000)
+        assert len(parts) > 3
+        assert all(part.size < 130_000 for part in parts)
+        assert sum(part.steps for part in parts) == 1500
+        merge_recordings([part.path for part in parts], tmp_path / "all.mcap")
+        assert same(facts(Recording(tmp_path / "all.mcap")), facts(Recording(path)))
+
+    def test_vector_recordings(self, tmp_path: Path) -> None:
+        path = record_vector(tmp_path / "run.mcap")
+        for part in split_recording(path, tmp_path / "part.mcap", episodes=20):
+            assert_sound(part.path)
+            numbers = range(part.first, part.last + 1)
+            assert same(facts(Recording(part.path)), facts(Recording(path), numbers))
+
+    def test_nothing_is_replaced(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "run.mcap")
+        (tmp_path / "part_0003.mcap").write_bytes(b"mine")
+        with pytest.raises(RecordingError, match=r"part_0003\.mcap exists; delete it"):
+            split_recording(path, tmp_path / "part.mcap", episodes=5)
+        with pytest.raises(RecordingError, match=r"run\.mcap exists"):
+            split_recording(path, path, episodes=5)
+        with pytest.raises(RecordingError, match="how many episodes or how many bytes"):
+            split_recording(path, tmp_path / "new.mcap")
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["part_0003.mcap", "run.mcap"]
+
+
+class TestFilter:
+    @pytest.mark.parametrize("kind", SPACES)
+    def test_what_it_is_true_of_comes_along(self, tmp_path: Path, kind: str) -> None:
+        path = record(tmp_path / "run.mcap", kind, frames=2)
+        report = filter_recording(path, tmp_path / "some.mcap", "metadata.score < 20 and n_tuples > 2")
+        assert_sound(report.path)
+        with Recording(path) as recording, Recording(report.path) as kept:
+            numbers = [e.number for e in recording.episodes if e.metadata["score"] < 20 and len(e) > 2]
+            assert [e.number for e in kept.episodes] == numbers
+            assert same(facts(kept), facts(recording, numbers))
+            assert kept.uuid == recording.uuid
+            assert (report.episodes, report.left_out) == (len(numbers), len(recording) - len(numbers))
+
+    @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+    def test_chunks_before_the_first_change_are_copied(self, tmp_path: Path, compression: str) -> None:
+        path = record(tmp_path / "run.mcap", steps=400, compression=compression)
+        with Recording(path) as recording:
+            last = recording.episodes[-1].metadata["score"]
+            steps = recording._topics["/step"]
+            channels = recording._contents.table["channel"].tolist()
+        report = filter_recording(
+            path, tmp_path / "some.mcap", F("metadata.score") < last, compression=compression
+        )
+        assert_sound(report.path)
+        there = set(chunks_of(report.path))
+        mine = [
+            chunk in there
+            for chunk, channel in zip(chunks_of(path), channels, strict=True)
+            if channel == steps
+        ]
+        assert len(mine) > 10
+        assert all(mine[:-2])
+        assert not mine[-1]
+
+    def test_damage_is_not_handed_on(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "run.mcap", steps=400)
+        data = bytearray(path.read_bytes())
+        with Recording(path) as recording:
+            row = recording._contents.table[3]
+        data[int(row["offset"]) + int(row["length"]) // 2] ^= 1
+        path.write_bytes(data)
+        with pytest.raises(RecordingError.__base__ or Exception, match="damaged|does not fit|cannot be"):
+            filter_recording(path, tmp_path / "some.mcap", "n_tuples > 0")
+        assert not (tmp_path / "some.mcap").exists()
+
+    def test_errors(self, tmp_path: Path) -> None:
+        path, other = record(tmp_path / "run.mcap"), record(tmp_path / "other.mcap")
+        with pytest.raises(RecordingError, match=r"has no episode that .*n_tuples.* is true of"):
+            filter_recording(path, tmp_path / "no.mcap", F("n_tuples") > 99)
+        with pytest.raises(FilterError, match="colour"):
+            filter_recording(path, tmp_path / "no.mcap", "colour = 3")
+        with pytest.raises(RecordingError, match="is the recording itself"):
+            filter_recording(path, path, "n_tuples > 1", overwrite=True)
+        with pytest.raises(RecordingError, match="exists; choose another path"):
+            filter_recording(path, other, "n_tuples > 1")
+        assert filter_recording(path, other, "n_tuples > 1", overwrite=True).size == other.stat().st_size
+
+
+def test_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for i in range(2):
+        record(Path(f"{i}.mcap"), seed=i)
+
+    def run(*arguments: str, code: int = 0) -> str:
+        done = CliRunner().invoke(app, arguments)
+        assert done.exit_code == code, done.output
+        return done.output
+
+    said = json.loads(run("merge", "0.mcap", "1.mcap", "-o", "all.mcap", "--dry-run", "--json"))
+    assert (said["dry_run"], said["recordings"], said["steps"], said["size"]) == (True, 2, 300, 0)
+    assert not Path("all.mcap").exists()
+    assert "300 steps" in run("merge", "0.mcap", "1.mcap", "-o", "all.mcap")
+    assert "exists" in run("merge", "0.mcap", "1.mcap", "-o", "all.mcap", code=1)
+    run("merge", "0.mcap", "1.mcap", "-o", "all.mcap", "--force")
+    dry = json.loads(run("split", "all.mcap", "-o", "part.mcap", "--episodes", "30", "--dry-run", "--json"))
+    assert not Path("part.mcap").exists()
+    assert "part_0001.mcap" in run("split", "all.mcap", "-o", "part.mcap", "--episodes", "30")
+    assert [Path(part["path"]).exists() for part in dry["recordings"]] == [True] * len(dry["recordings"])
+    assert "either --episodes or --max-bytes" in run("split", "all.mcap", "-o", "x.mcap", code=2)
+    kept = json.loads(run("filter", "all.mcap", "n_tuples > 3", "-o", "some.mcap", "--json"))
+    assert (kept["path"], kept["episodes"]) == ("some.mcap", len(Recording("some.mcap")))
+    assert "would write" in run("filter", "all.mcap", "n_tuples > 3", "-o", "none.mcap", "--dry-run")
+    assert not Path("none.mcap").exists()
+    run("filter", "all.mcap", "colour = 1", "-o", "none.mcap", code=2)

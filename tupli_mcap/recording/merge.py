@@ -1,0 +1,302 @@
+"""Several recordings as one, and one as several."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+import uuid
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import RecordingError, SpaceError
+from tupli_mcap.recording.channels import register_channels
+from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.imagecodecs import image_format
+from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.replacing import replacing
+from tupli_mcap.recording.rewrite import camera_channels, define, write
+from tupli_mcap.recording.rotation import series
+from tupli_mcap.recording.signed import STATEMENTS
+from tupli_mcap.recording.transfer import Target, Transfer
+from tupli_mcap.recording.writer import LAST_ROW
+
+__all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]
+
+_ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
+_SPACES = ("observation_space", "action_space", "reward_space")
+
+
+class MergeReport(NamedTuple):
+    """What a merge wrote, or would write.
+
+    held: rows whose time was changed: it was before that of the row ahead, which a file does not allow.
+    copied: chunks that were copied as they are. size: bytes; 0 where nothing was written.
+    """
+
+    path: Path
+    recordings: int
+    episodes: int
+    steps: int
+    held: int = 0
+    copied: int = 0
+    size: int = 0
+
+
+class Part(NamedTuple):
+    """A file of a recording that was split, or would be: `first` to `last` are numbers of episodes."""
+
+    path: Path
+    episodes: int
+    steps: int
+    first: int
+    last: int
+    copied: int = 0
+    size: int = 0
+
+
+def merge_recordings(
+    sources: Sequence[str | os.PathLike[str]],
+    target: str | os.PathLike[str],
+    *,
+    compression: str = "zstd",
+    overwrite: bool = False,
+    dry_run: bool = False,
+) -> MergeReport:
+    """Writes one recording, with a UUID of its own, of the episodes of several, in the order in which these were begun.
+
+    Everything comes along: infos, frames, images, final states, metadata, attachments; but no signature and no
+    certificate, which would not hold. Episodes are numbered anew. Times within a channel never decrease: where
+    recordings were made at the same time, those of the later one are held. The environment and the labels are the
+    first one's.
+
+    Raises:
+        SpaceError: they have different spaces, dtypes, or numbers of sub-environments.
+        RecordingError: one cannot be read, holds episodes of another one again, or belongs to another benchmark;
+            attachments of one name differ; the target exists (and not `overwrite`) or cannot be written.
+        FormatError: one is damaged.
+    """
+    target = Path(target)
+    with contextlib.ExitStack() as stack:
+        opened = [stack.enter_context(Recording(source)) for source in sources]
+        _check_target(target, opened, overwrite=overwrite)
+        found = sorted((r for r in opened if len(r)), key=lambda r: int(r.index["start_time"].min()))
+        if not found:
+            raise RecordingError("expected recordings with episodes to merge, found none")
+        _check_alike(found)
+        attachments = _attachments(found)
+        report = MergeReport(
+            target, len(found), sum(map(len, found)), sum(recording.num_steps for recording in found)
+        )
+        if dry_run:
+            return report
+        with replacing(target) as (fd, _):
+            merged = _merge(found, Container(fd, str(target), compression), attachments)
+    if merged.held:
+        warnings.warn(
+            f"{merged.held:,} rows of {target} have the time of the row ahead of them, which was later than theirs: "
+            "some of the recordings were made at the same time",
+            UserWarning,
+            stacklevel=2,
+        )
+    return report._replace(held=merged.held, copied=merged.copied, size=target.stat().st_size)
+
+
+def _merge(
+    sources: Sequence[Recording], container: Container, attachments: Mapping[str, tuple[str, bytes]]
+) -> Target:
+    now, first = time.time_ns(), sources[0]
+    shifts = np.cumsum([0, *(recording._contents.next_episode for recording in sources)])
+    container.start(f"tupli-mcap {version('tupli-mcap')}")
+    container.add_metadata(RECORDING_METADATA, _metadata(first, next_episode=int(shifts[-1])))
+    for name, (media_type, data) in attachments.items():
+        container.add_attachment(name, media_type, data, now)
+    target = Target(container)
+    define(first, target)
+    for recording in sources[1:]:
+        _define_missing(recording, container)
+    container.define_channels()
+    ids = {channel.topic: channel.id for channel in container.channels.values()}
+    for recording, shift in zip(sources, shifts.tolist(), strict=False):
+        channels = {i: ids.get(topic, i) for topic, i in recording._topics.items()}
+        cameras = {
+            name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
+            for name, pairs_of in camera_channels(recording, container).items()
+        }
+        Transfer(recording, target, cameras, channels=channels, shift=shift).run(recording.index)
+    target.finish(now)
+    return target
+
+
+def _metadata(source: Recording, *, next_episode: int) -> dict[str, str]:
+    return {
+        "uuid": uuid.uuid4().hex,
+        "format_version": source.metadata["format_version"],
+        "library": f"tupli-mcap {version('tupli-mcap')}",
+        "created_ns": str(time.time_ns()),
+        "benchmark_id": source.benchmark_id,
+        "next_episode": str(next_episode),
+    }
+
+
+def _define_missing(source: Recording, container: Container) -> None:
+    """The channels of infos and cameras that the recordings before have not."""
+    info = None
+    if "/info" in source._topics:
+        channel = source._contents.channels[source._topics["/info"]]
+        text = source._contents.schemas[channel.schema_id].data.decode()
+        info = text, {key: value for key, value in channel.metadata.items() if key != "crc"}
+    vector = source.num_envs if source.is_vector else None
+    images = image_format(container.channels)  # a recording has one, whatever the others have
+    register_channels(container, source.name, source.layout, vector, info, source.cameras, images)
+
+
+def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool) -> None:
+    if target.exists():
+        if any(source.path is not None and target.samefile(source.path) for source in sources):
+            raise RecordingError(f"{target} is one of the recordings to merge; write to another path")
+        if not overwrite:
+            raise RecordingError(f"{target} exists; choose another path, or overwrite it")
+
+
+def _check_alike(sources: Sequence[Recording]) -> None:
+    first = sources[0]
+    description = first.layout.to_metadata()
+    seen = {(first.uuid, int(number)): first.name for number in first.index["episode"]}
+    rows = sum(recording.num_steps for recording in sources)
+    if rows > LAST_ROW:
+        raise RecordingError(f"expected at most {LAST_ROW} steps in a recording, found {rows}; merge fewer")
+    for other in sources[1:]:
+        found = other.layout.to_metadata()
+        for name in _SPACES:
+            if found[name] != description[name]:
+                raise SpaceError(
+                    f"{other.name}: expected the {name} of {first.name}, {getattr(first.layout, name)}, found "
+                    f"{getattr(other.layout, name)}; only recordings of the same spaces can be merged"
+                )
+        for name in sorted(description.keys() | found.keys()):
+            if found.get(name) != description.get(name):
+                raise SpaceError(
+                    f"{other.name}: expected {name} as in {first.name}, {description.get(name)!s:.200}, found "
+                    f"{found.get(name)!s:.200}; steps of other layouts cannot be in one recording"
+                )
+        if (other.is_vector, other.num_envs) != (first.is_vector, first.num_envs):
+            raise SpaceError(
+                f"{other.name}: expected {_envs(first)}, as in {first.name}, found {_envs(other)}"
+            )
+        if other.benchmark_id != first.benchmark_id:
+            raise RecordingError(
+                f"{other.name}: expected a recording of benchmark {first.benchmark_id or 'none'}, as {first.name} is, "
+                f"found {other.benchmark_id or 'none'}"
+            )
+        for number in other.index["episode"].tolist():
+            before = seen.setdefault((other.uuid, number), other.name)
+            if before != other.name:
+                raise RecordingError(f"{other.name} holds episode {number} of {before} again; leave one out")
+
+
+def _envs(recording: Recording) -> str:
+    return f"{recording.num_envs} sub-environments" if recording.is_vector else "a single environment"
+
+
+def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
+    """Those of all recordings, without statements that would no longer hold."""
+    found: dict[str, tuple[str, bytes]] = {}
+    digests = {name: digest for recording in sources for name, digest in _digest(recording)}
+    if len(set(digests.values())) > 1:
+        one, other = list(digests)[:2]
+        warnings.warn(
+            f"{other} carries another environment than {one}, or another version of it; the first one is kept",
+            UserWarning,
+            stacklevel=3,
+        )
+    with_environment = next((r for r in sources if _ENVIRONMENT[0] in r.attachments), None)
+    for recording in sources:
+        for name, info in recording.attachments.items():
+            if name in STATEMENTS or (name in _ENVIRONMENT and recording is not with_environment):
+                continue
+            data = recording.read_attachment(name)
+            if found.setdefault(name, (info.media_type, data))[1] != data and name != "labels.json":
+                raise RecordingError(
+                    f"{recording.name}: its attachment {name!r} differs from that of a recording before; a merged "
+                    "recording can have one of a name only"
+                )
+    return found
+
+
+def _digest(recording: Recording) -> Iterator[tuple[str, str]]:
+    if _ENVIRONMENT[0] in recording.attachments:
+        yield recording.name, recording.benchmark.record.digest
+
+
+def split_recording(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    episodes: int | None = None,
+    max_bytes: int | None = None,
+    compression: str = "zstd",
+    dry_run: bool = False,
+) -> list[Part]:
+    """Writes the episodes of a recording to `target`, and to target_0001, … beside it, each with a UUID of its own.
+
+    Episodes keep their numbers, and everything comes along but signature and certificate, which would not hold.
+
+    Args:
+        episodes: in each file.
+        max_bytes: of each file, as far as steps take as many bytes as on average; one episode at least.
+
+    Raises:
+        RecordingError: neither limit is given, or both; the source cannot be read; a target exists or cannot be
+            written.
+        FormatError: the source is damaged.
+    """
+    if (episodes is None) == (max_bytes is None) or (episodes or max_bytes or 0) < 1:
+        raise RecordingError(
+            "expected how many episodes or how many bytes go into a file, at least 1 of either"
+        )
+    target = Path(target)
+    with Recording(source) as recording:
+        groups = _groups(recording, episodes, max_bytes)
+        paths = [target.with_stem(f"{target.stem}_{i:04}") if i else target for i in range(len(groups))]
+        taken = [path for path in (target, *series(target)[1].values()) if os.path.lexists(path)]
+        if taken:
+            raise RecordingError(f"{taken[0]} exists; delete it, or choose another path")
+        parts = []
+        for path, numbers in zip(paths, groups, strict=True):
+            lengths = recording.index["length"][np.isin(recording.index["episode"], numbers)]
+            part = Part(path, len(numbers), int(lengths.sum()), int(numbers[0]), int(numbers[-1]))
+            parts.append(part if dry_run else _write_part(recording, part, numbers.tolist(), compression))
+    return parts
+
+
+def _groups(recording: Recording, episodes: int | None, max_bytes: int | None) -> list[np.ndarray]:
+    """Numbers of episodes, by file."""
+    numbers, lengths = recording.index["episode"].astype(np.int64), recording.index["length"].astype(np.int64)
+    if not len(numbers):
+        raise RecordingError(f"{recording.name} has no episodes to split")
+    if episodes is not None:
+        return [numbers[at : at + episodes] for at in range(0, len(numbers), episodes)]
+    attached = sum(info.size for info in recording.attachments.values())
+    share = max(1, recording.size - attached) / int(lengths.sum())
+    room, groups, begin, filled = max(1, (max_bytes or 0) - attached), [], 0, 0.0
+    for i, size in enumerate((lengths * share).tolist()):
+        if filled and filled + size > room:
+            groups.append(numbers[begin:i])
+            begin, filled = i, 0.0
+        filled += size
+    return [*groups, numbers[begin:]]
+
+
+def _write_part(recording: Recording, part: Part, numbers: list[int], compression: str) -> Part:
+    metadata = _metadata(recording, next_episode=recording._contents.next_episode)
+    with replacing(part.path) as (fd, _):
+        container = Container(fd, str(part.path), compression)
+        copied = write(recording, container, metadata, numbers, {}, signed=False, left_out=STATEMENTS)
+    return part._replace(copied=copied, size=part.path.stat().st_size)
