@@ -1,0 +1,147 @@
+"""d3rlpy's datasets over recorded steps; `tools/test-d3rlpy` runs what needs d3rlpy in an environment of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from test_sampling import SPACES, record
+
+from tupli_mcap import F, RecordEpisodes, TupliDataset
+from tupli_mcap.sampling import SamplingError
+
+
+@pytest.fixture
+def cartpole(tmp_path: Path) -> TupliDataset:
+    """Terminal, timed out and interrupted episodes."""
+    for i in range(2):
+        env = gym.make("CartPole-v1", max_episode_steps=20)
+        with RecordEpisodes(env, tmp_path / f"{i}.mcap", chunk_size=4096) as recorder:
+            recorder.action_space.seed(i)
+            recorder.reset(seed=i)
+            for _ in range(500):
+                if any(recorder.step(recorder.action_space.sample())[2:4]):
+                    recorder.reset()
+    return TupliDataset.from_files([tmp_path / "0.mcap", tmp_path / "1.mcap"]).with_cache(20_000)
+
+
+def same_batch(one: Any, other: Any) -> None:
+    for name in (
+        "observations",
+        "actions",
+        "rewards",
+        "next_observations",
+        "next_actions",
+        "terminals",
+        "intervals",
+    ):
+        first, second = getattr(one, name), getattr(other, name)
+        assert type(first) is type(second)
+        for a, b in zip(
+            *((part if isinstance(part, list) else [part]) for part in (first, second)), strict=True
+        ):
+            assert a.dtype == b.dtype
+            assert np.array_equal(a, b), name
+    for a, b in zip(one.transitions, other.transitions, strict=True):
+        assert np.array_equal(a.rewards_to_go, b.rewards_to_go)
+
+
+@pytest.mark.d3rlpy
+@pytest.mark.parametrize("cut", [False, True])
+def test_samples_are_those_of_an_mdp_dataset(cartpole: TupliDataset, cut: bool) -> None:
+    from tupli_mcap.torch.d3rlpy import mdp_dataset, replay_buffer
+
+    dataset = cartpole.with_tuple_filter(F("step") != 5) if cut else cartpole
+    whole, lazy = mdp_dataset(dataset), replay_buffer(dataset)
+    assert lazy.transition_count == whole.transition_count == len(lazy.buffer)
+    assert lazy.size() == whole.size()
+    assert lazy.dataset_info == whole.dataset_info
+    for draw in ("sample_transition_batch", "sample_trajectory_batch"):
+        batches = []
+        for buffer in (whole, lazy):
+            np.random.seed(3)
+            batches.append(getattr(buffer, draw)(32, *([6] if "trajectory" in draw else [])))
+        if "trajectory" in draw:
+            for name in (
+                "observations",
+                "actions",
+                "rewards",
+                "returns_to_go",
+                "terminals",
+                "timesteps",
+                "masks",
+            ):
+                assert np.array_equal(getattr(batches[0], name), getattr(batches[1], name)), name
+        else:
+            same_batch(*batches)
+    for one, other in zip(whole.episodes, lazy.episodes, strict=True):
+        assert np.array_equal(one.observations, other.observations)
+        assert (one.terminated, one.size()) == (other.terminated, other.size())
+        assert one.compute_return() == other.compute_return()
+
+
+@pytest.mark.d3rlpy
+@pytest.mark.parametrize("name", ["nested", "image"])
+def test_nested_observations_are_lists(name: str, tmp_path: Path) -> None:
+    from d3rlpy.dataset import FrameStackTransitionPicker, MultiStepTransitionPicker
+
+    from tupli_mcap.torch.d3rlpy import mdp_dataset, replay_buffer
+
+    dataset = TupliDataset.from_files(record(tmp_path / "a.mcap", SPACES[name], 60))
+    pickers: list[Any] = [None, MultiStepTransitionPicker(3, 0.9)]
+    if name == "image":
+        pickers = [None, FrameStackTransitionPicker(2)]
+    for picker in pickers:
+        batches = []
+        for buffer in (
+            mdp_dataset(dataset, transition_picker=picker),
+            replay_buffer(dataset, transition_picker=picker),
+        ):
+            np.random.seed(1)
+            batches.append(buffer.sample_transition_batch(16))
+        same_batch(*batches)
+
+
+@pytest.mark.d3rlpy
+def test_an_algorithm_trains_on_what_is_read(cartpole: TupliDataset) -> None:
+    import d3rlpy
+
+    from tupli_mcap.torch.d3rlpy import replay_buffer
+
+    algorithm = d3rlpy.algos.DiscreteCQLConfig(
+        batch_size=16, observation_scaler=d3rlpy.preprocessing.StandardObservationScaler()
+    ).create()
+    algorithm.fit(
+        replay_buffer(cartpole), n_steps=20, n_steps_per_epoch=10, show_progress=False, save_interval=100,
+        logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+    )  # fmt: skip
+    assert algorithm.predict(cartpole.observations[:3]).shape == (3,)
+
+
+@pytest.mark.d3rlpy
+def test_what_d3rlpy_does_not_have(tmp_path: Path, cartpole: TupliDataset) -> None:
+    from tupli_mcap.torch.d3rlpy import mdp_dataset, replay_buffer
+
+    texts = TupliDataset.from_files(record(tmp_path / "text.mcap", spaces.Text(5), 20))
+    with pytest.raises(SamplingError, match="expected states of a fixed size"):
+        replay_buffer(texts)
+    with pytest.raises(SamplingError, match="expected at least one step, found an empty dataset"):
+        mdp_dataset(texts.with_episode_filter(F("n_tuples") > 100))
+    buffer = replay_buffer(cartpole)
+    with pytest.raises(SamplingError, match="expected to read only"):
+        buffer.append_episode(buffer.episodes[0])
+
+
+def test_without_d3rlpy_the_extra_is_named() -> None:
+    pytest.importorskip("torch")
+    code = "import sys; sys.modules['d3rlpy'] = None\nimport tupli_mcap.torch.d3rlpy"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "MissingExtraError: tupli_mcap.torch.d3rlpy needs d3rlpy" in done.stderr
+    assert "pip install 'tupli-mcap[d3rlpy]'" in done.stderr

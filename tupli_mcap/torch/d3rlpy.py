@@ -1,0 +1,303 @@
+"""Datasets for d3rlpy: in memory, or read as they are sampled.
+
+An episode of d3rlpy's is a run of steps that follow each other: an episode, or what a tuple filter leaves of it between
+two cuts. Observations are an array, or a list of the arrays in a Dict or Tuple space; d3rlpy makes float32 of batches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.dataset import TupliDataset
+from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.sampling import SamplingError, Steps
+
+try:
+    from d3rlpy.constants import ActionSpace
+    from d3rlpy.dataset import (
+        BasicTransitionPicker,
+        Episode,
+        MDPDataset,
+        ReplayBuffer,
+        Signature,
+        Transition,
+        TransitionMiniBatch,
+    )
+except ImportError as err:
+    raise MissingExtraError(
+        "tupli_mcap.torch.d3rlpy needs d3rlpy, which is not installed; pip install 'tupli-mcap[d3rlpy]'"
+    ) from err
+
+__all__ = ["RecordedBuffer", "RecordedEpisode", "RecordedReplayBuffer", "mdp_dataset", "replay_buffer"]
+
+Array = np.ndarray[Any, Any]
+_FIELDS = ("states", "actions", "rewards")
+
+
+def mdp_dataset(dataset: TupliDataset, **options: Any) -> MDPDataset:
+    """The whole dataset in memory, as d3rlpy's MDPDataset; `options` are its other arguments.
+
+    Raises:
+        SamplingError: the dataset is empty, or d3rlpy has no such spaces.
+    """
+    steps = dataset.steps
+    kind, size = _actions_of(steps)
+    rows = np.arange(len(steps))
+    columns = steps.read([*_FIELDS, "terminals"], rows)
+    cut = np.zeros(len(rows), np.bool_)
+    cut[steps.breaks] = True
+    return MDPDataset(
+        observations=_observations(columns["states"]),
+        actions=_two_dimensional(columns["actions"]),
+        rewards=_two_dimensional(columns["rewards"]).astype(np.float32),
+        terminals=columns["terminals"].astype(np.float32),
+        timeouts=(cut & ~columns["terminals"]).astype(np.float32),
+        **{"action_space": kind, "action_size": size, **options},
+    )
+
+
+def replay_buffer(dataset: TupliDataset, **options: Any) -> RecordedReplayBuffer:
+    """A replay buffer that reads what is sampled, within the dataset's cache; it keeps the rewards (4 bytes a step).
+
+    The same random numbers give the same batches as `mdp_dataset`. A batch of transitions is read at once;
+    trajectories, and transitions of another picker than d3rlpy's basic one, are read episode by episode.
+
+    Args:
+        options: `transition_picker` and `trajectory_slicer` of d3rlpy's ReplayBuffer, ...
+
+    Raises:
+        SamplingError: the dataset is empty, or d3rlpy has no such spaces.
+    """
+    return RecordedReplayBuffer(dataset.steps, **options)
+
+
+class RecordedEpisode:
+    """An episode as d3rlpy's `EpisodeBase`, read when it is asked for something; its columns are not kept."""
+
+    def __init__(self, buffer: RecordedBuffer, number: int) -> None:
+        self._buffer = buffer
+        self._number = number
+        self._rows = np.arange(buffer.firsts[number], buffer.firsts[number] + buffer.sizes[number])
+        self.terminated = bool(buffer.terminated[number])
+
+    @property
+    def observations(self) -> Any:
+        """(L, ...), or a list of such arrays."""
+        return _observations(self._buffer.steps.read(["states"], self._rows)["states"])
+
+    @property
+    def actions(self) -> Array:
+        """(L, A)."""
+        return _two_dimensional(self._buffer.steps.read(["actions"], self._rows)["actions"])
+
+    @property
+    def rewards(self) -> Array:
+        """(L, 1), float32."""
+        return self._buffer.rewards[self._rows]
+
+    @property
+    def observation_signature(self) -> Signature:
+        return self._buffer.signatures[0]
+
+    @property
+    def action_signature(self) -> Signature:
+        return self._buffer.signatures[1]
+
+    @property
+    def reward_signature(self) -> Signature:
+        return self._buffer.signatures[2]
+
+    def size(self) -> int:
+        return len(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def compute_return(self) -> float:
+        return float(np.sum(self.rewards))
+
+    @property
+    def transition_count(self) -> int:
+        """One less where the episode did not end: the action after its last step is not known."""
+        return len(self._rows) - (not self.terminated)
+
+    def whole(self) -> Episode:
+        """The episode in memory."""
+        return Episode(self.observations, self.actions, self.rewards, self.terminated)
+
+    def serialize(self) -> dict[str, Any]:
+        found: dict[str, Any] = self.whole().serialize()
+        return found
+
+    @classmethod
+    def deserialize(cls, serializedData: dict[str, Any]) -> Episode:  # noqa: N803  # d3rlpy's name
+        return Episode.deserialize(serializedData)
+
+
+class _Episodes(Sequence[RecordedEpisode]):
+    def __init__(self, buffer: RecordedBuffer) -> None:
+        self._buffer = buffer
+
+    def __len__(self) -> int:
+        return len(self._buffer.firsts)
+
+    def __getitem__(self, i: Any) -> Any:
+        if isinstance(i, slice):
+            return [self[k] for k in range(*i.indices(len(self)))]
+        return RecordedEpisode(self._buffer, range(len(self))[i])
+
+    def __iter__(self) -> Iterator[RecordedEpisode]:
+        return (self[i] for i in range(len(self)))
+
+
+class RecordedBuffer:
+    """Recorded transitions by number, as d3rlpy's `BufferProtocol`; nothing can be appended."""
+
+    def __init__(self, steps: Steps) -> None:
+        rows = np.arange(len(steps))
+        self.steps = steps
+        flags = steps.read(["rewards", "terminals"], rows)
+        self.rewards = _two_dimensional(flags["rewards"]).astype(np.float32)
+        self.firsts = np.concatenate([[0], steps.breaks[:-1] + 1])
+        self.sizes = steps.breaks - self.firsts + 1
+        self.terminated = flags["terminals"][steps.breaks]
+        self.transition_ends = np.cumsum(self.sizes - ~self.terminated)
+        one = steps.read(["states", "actions"], rows[:1])
+        states = _observations(one["states"])
+        self.signatures = (
+            _signature(states if isinstance(states, list) else [states]),
+            _signature([_two_dimensional(one["actions"])]),
+            _signature([self.rewards[:1]]),
+        )
+
+    def append(self, episode: Any, index: int) -> None:
+        """Refused.
+
+        Raises:
+            SamplingError: always.
+        """
+        raise SamplingError(
+            "expected to read only: this buffer is what has been recorded; d3rlpy's MixedReplayBuffer adds another one"
+        )
+
+    @property
+    def episodes(self) -> Sequence[RecordedEpisode]:
+        return _Episodes(self)
+
+    @property
+    def transition_count(self) -> int:
+        return int(self.transition_ends[-1])
+
+    def __len__(self) -> int:
+        return self.transition_count
+
+    def __getitem__(self, index: int) -> tuple[RecordedEpisode, int]:
+        number, place = self.places(np.array([range(len(self))[index]]))
+        return RecordedEpisode(self, int(number[0])), int(place[0])
+
+    def places(self, indices: Array) -> tuple[Array, Array]:
+        """The episode of each transition, and its place in it."""
+        numbers = self.transition_ends.searchsorted(indices, side="right")
+        before = self.transition_ends[numbers] - (self.sizes - ~self.terminated)[numbers]
+        return numbers, indices - before
+
+    def transitions(self, indices: Array) -> list[Transition]:
+        """Transitions as `BasicTransitionPicker` makes them, read together."""
+        numbers, places = self.places(indices)
+        rows = self.firsts[numbers] + places
+        last = self.firsts[numbers] + self.sizes[numbers] - 1
+        over = rows == last  # then the episode is terminated
+        both = np.concatenate([rows, np.minimum(rows + 1, last)])
+        columns = self.steps.read(["states", "actions"], both)
+        states, actions = _observations(columns["states"]), _two_dimensional(columns["actions"])
+        for part in [*(states if isinstance(states, list) else [states]), actions]:
+            part[len(rows) :][over] = 0
+        n = len(rows)
+        return [
+            Transition(
+                observation=_row(states, i),
+                action=actions[i],
+                reward=self.rewards[rows[i]],
+                next_observation=_row(states, n + i),
+                next_action=actions[n + i],
+                terminal=float(over[i]),
+                interval=1,
+                rewards_to_go=self.rewards[rows[i] : last[i] + 1],
+            )
+            for i in range(n)
+        ]
+
+
+class RecordedReplayBuffer(ReplayBuffer):  # type: ignore[misc]  # untyped
+    """A `ReplayBuffer` of recorded steps; see `replay_buffer`."""
+
+    def __init__(self, steps: Steps, **options: Any) -> None:
+        kind, size = _actions_of(steps)
+        buffer = RecordedBuffer(steps)
+        observation, action, reward = buffer.signatures
+        given = {
+            "observation_signature": observation,
+            "action_signature": action,
+            "reward_signature": reward,
+            "action_space": kind,
+            "action_size": size,
+        }
+        super().__init__(buffer, **{**given, **options})
+
+    def sample_transition(self) -> Transition:
+        if type(self._transition_picker) is not BasicTransitionPicker:
+            return super().sample_transition()
+        return self._buffer.transitions(np.array([np.random.randint(self.transition_count)]))[0]
+
+    def sample_transition_batch(self, batch_size: int) -> TransitionMiniBatch:
+        """A batch of transitions, read together."""
+        if type(self._transition_picker) is not BasicTransitionPicker:
+            return super().sample_transition_batch(batch_size)
+        drawn = np.array([np.random.randint(self.transition_count) for _ in range(batch_size)])
+        return TransitionMiniBatch.from_transitions(self._buffer.transitions(drawn))
+
+
+def _actions_of(steps: Steps) -> tuple[ActionSpace, int]:
+    """d3rlpy's kind of the action space, and its size."""
+    if steps.layout is None or not len(steps):
+        raise SamplingError("expected at least one step, found an empty dataset; look at its filters")
+    space = steps.layout.action_space
+    if isinstance(space, spaces.Discrete) and space.start == 0:
+        return ActionSpace.DISCRETE, int(space.n)
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        return ActionSpace.CONTINUOUS, space.shape[0]
+    raise SamplingError(
+        f"expected Discrete actions from 0, or a Box of one dimension, found {space}: d3rlpy has no other"
+    )
+
+
+def _observations(column: Any) -> Any:
+    """An array, or a list of the arrays in a nested column."""
+    parts = list(_arrays(column))
+    return parts[0] if isinstance(column, np.ndarray) else parts
+
+
+def _arrays(column: Any) -> Iterator[Array]:
+    if isinstance(column, dict | tuple):
+        for part in column.values() if isinstance(column, dict) else column:
+            yield from _arrays(part)
+    elif isinstance(column, np.ndarray):
+        yield _two_dimensional(column)
+    else:
+        raise SamplingError("expected states of a fixed size, found some that vary: d3rlpy has arrays only")
+
+
+def _two_dimensional(column: Array) -> Array:
+    return column[:, None] if column.ndim == 1 else column
+
+
+def _signature(parts: Sequence[Array]) -> Signature:
+    return Signature(dtype=[part.dtype for part in parts], shape=[part.shape[1:] for part in parts])
+
+
+def _row(states: Any, i: int) -> Any:
+    return [part[i] for part in states] if isinstance(states, list) else states[i]
