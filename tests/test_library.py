@@ -173,8 +173,8 @@ def test_headers_are_like_any_other_model(root: Path) -> None:
 
 def test_a_copy_under_a_new_uuid_is_no_copy(root: Path) -> None:
     """What the benchmark fills storages with."""
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-    from benchmarks.library import fill, template
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from tools.bench.library import fill, template
 
     data = template(root.parent / "template.mcap", 20)
     fill(root, data, 3)

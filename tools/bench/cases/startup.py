@@ -9,7 +9,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 
-from benchmarks.measure import OURS, Line, Run, alternate, at_most, check, seconds_of
+from tools.bench.contenders import OURS
+from tools.bench.measure import Run, alternate, check, seconds_of
+from tools.bench.targets import Target, at_most
 
 _GYMNASIUM = "import gymnasium"
 _IMPORTS = {
@@ -22,20 +24,19 @@ _HELP = f"{OURS} --help"
 _CLI = "import sys; from tupli_mcap.cli import main; sys.argv = ['tupli-mcap', '--help']; main()"
 
 
-def startup(run: Run) -> Iterator[Line]:
+def startup(run: Run) -> Iterator[Target]:
     """`import tupli_mcap` against `import gymnasium`; the names of one's own work, and `tupli-mcap --help`."""
     codes = {"gymnasium": _GYMNASIUM, **_IMPORTS, _HELP: _CLI}
     sides = {name: _process(code) for name, code in codes.items()}
     alternate(sides, 1)  # compiles what is not compiled yet
     values = alternate(sides, max(run.rounds, 7))
     floor = min(values["gymnasium"])
-    yield Line("start-up", "gymnasium", _GYMNASIUM, "s", values["gymnasium"])
-    for name, code in _IMPORTS.items():
-        found = min(values[name]) / floor
-        words, met = at_most(1.3, "min/min") if name == OURS else ("", lambda _: None)
-        yield Line("start-up", name, code, "s", values[name], found, words, met(found))
-    least = min(values[_HELP])
-    yield Line("start-up", _HELP, "a process", "s", values[_HELP], None, "min <= 0.4 s", least <= 0.4)
+    others = ", ".join(
+        f"{name.partition(', ')[2]} {min(values[name]) / floor:.2f}" for name in list(_IMPORTS)[1:]
+    )
+    note = f"smallest of {len(values[OURS])} processes; with the names for {others}"
+    yield at_most("import tupli_mcap, over import gymnasium", 1.3, min(values[OURS]) / floor, note, "x")
+    yield at_most("tupli-mcap --help", 0.4, min(values[_HELP]), "smallest of the processes", "s")
 
 
 def _process(code: str) -> Callable[[], float]:

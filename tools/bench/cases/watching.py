@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import statistics
 import subprocess
 import sys
 import time
@@ -16,23 +17,22 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from benchmarks.measure import Line, Run, alternate, at_most, check, seconds_of
-from benchmarks.workloads import Workload, cartpole, screens
+from tools.bench.measure import Run, alternate, check, ratio, seconds_of
+from tools.bench.targets import Target, at_most
+from tools.bench.workloads import WORKLOADS, Workload, reference
 
 _LIMIT = 1.10
 _LISTENER = Path(__file__).with_name("listener.py")
 
 
-def live(run: Run) -> Iterator[Line]:
+def live(run: Run) -> Iterator[Target]:
     """CartPole under a random policy, and an environment that returns a screen of 210 x 160 x 3 at once."""
-    long, screen_steps = 4 * run.steps, max(run.steps // 3, 1000)
-    for workload, steps in ((cartpole(long), long), (screens(), screen_steps)):
-        yield from _compare(run, workload, steps)
+    for name, steps in (("cartpole", 200_000), ("images", 20_000)):
+        data = reference(name, run.part(steps, 1000))
+        yield from _compare(run, WORKLOADS[name], len(data.lengths))
 
 
-def _compare(run: Run, workload: Workload, steps: int) -> Iterator[Line]:
-    episodes = workload.reference(steps).episodes_for(steps) if workload.name == "cartpole" else steps // 1000
-    case = f"live view, {workload.name}"
+def _compare(run: Run, workload: Workload, episodes: int) -> Iterator[Target]:
     with _viewers() as places:
         sides: dict[str, str | None] = {"no view": None}
         for name, port in places.items():
@@ -46,12 +46,11 @@ def _compare(run: Run, workload: Workload, steps: int) -> Iterator[Line]:
         for call in calls.values():
             call()
         values = alternate(calls, run.rounds)
-    yield Line(case, "no view", f"RecordEpisodes; {episodes:,} episodes", "µs/step", values["no view"])
-    words, met = at_most(_LIMIT, "with/without")
+    bare = statistics.median(values["no view"])
     for name in places:
-        shares = sorted(a / b for a, b in zip(values[name], values["no view"], strict=True))
-        found = shares[len(shares) // 2]
-        yield Line(case, name, "RecordEpisodes(live=)", "µs/step", values[name], found, words, met(found))
+        note = f"{statistics.median(values[name]):.2f} µs a step; {bare:.2f} without"
+        found = ratio(values[name], values["no view"])
+        yield at_most(f"live view of {workload.name}, {name}, over none", _LIMIT, found, note, "x")
 
 
 def _seconds(run: Run, workload: Workload, episodes: int, name: str, target: str | None) -> float:

@@ -8,44 +8,43 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import ours
-from benchmarks.measure import OURS, Line, Run, alternate, at_most, check, naming, ratio, seconds_of
-from benchmarks.workloads import cartpole
+from tools.bench.contenders.ours import Ours
+from tools.bench.measure import Run, alternate, check, ratio, seconds_of
+from tools.bench.targets import Target, at_most
+from tools.bench.workloads import WORKLOADS, reference
 
-INSTALL_RERUN = "not installed: pip install -e '.[rerun]'"
+INSTALL_RERUN = "rerun-sdk is not installed"
 _ROWS = 65_536
 
 
-def replay_cartpole(run: Run) -> Iterator[Line]:
+def replay_cartpole(run: Run) -> Iterator[Target]:
     """`.rrd` files of one recording; reading it, blueprint, card and overview are counted on our side only."""
-    case, unit, bare = "replay CartPole", "s", "send_columns"
+    what = "replay of CartPole as a file for Rerun, over the same columns sent by hand"
     try:
         import rerun
     except ImportError:
-        yield Line(case, bare, "the same columns, from memory", unit, note=INSTALL_RERUN)
+        yield at_most(what, 1.5, None, INSTALL_RERUN)
         return
     from tupli_mcap import viewer
 
     path = run.fresh("replay.mcap")
-    reference = ours.record_with_reference(cartpole(run.read_steps), path, run.read_steps)
+    data = reference("cartpole", run.part(1_000_000))
+    Ours().record(WORKLOADS["cartpole"], path, len(data.lengths))
     columns = _columns(path)
 
     def mine() -> float:
         goal = run.fresh("ours.rrd")
         seconds = seconds_of(lambda: viewer.save(path, goal))
-        return _checked(OURS, goal, columns, seconds)
+        return _checked("tupli-mcap", goal, columns, seconds)
 
     def by_hand() -> float:
         goal = run.fresh("bare.rrd")
         seconds = seconds_of(lambda: _send(rerun, columns, goal))
-        return _checked(bare, goal, columns, seconds)
+        return _checked("send_columns", goal, columns, seconds)
 
-    values = alternate({OURS: mine, bare: by_hand}, max(run.rounds, 5))
-    target, met = at_most(1.5)
-    found = ratio(values[OURS], values[bare])
-    yield Line(case, OURS, f"tupli_mcap.viewer.save, {reference.steps:,} steps in a file", unit, values[OURS])
-    does = "the same columns from memory, 65,536 rows a call, nothing else"
-    yield Line(case, bare, does, unit, values[bare], found, target, met(found))
+    values = alternate({"ours": mine, "bare": by_hand}, max(run.rounds, 5))
+    note = f"{data.steps:,} steps; reading, blueprint, card and overview are counted on this side only"
+    yield at_most(what, 1.5, ratio(values["ours"], values["bare"]), note, "x")
 
 
 def _columns(path: Path) -> dict[str, Any]:
@@ -101,13 +100,10 @@ def _checked(side: str, goal: Path, columns: dict[str, Any], seconds: float) -> 
         if "Scalars:scalars" in batch.schema.names and "step" in batch.schema.names:
             values = batch.column("Scalars:scalars").flatten().to_numpy(zero_copy_only=False)
             found.setdefault(chunk.entity_path, []).append((batch.column("step")[0].as_py(), values))
-    with naming(side):
-        for entity in ("/state", "/action", "/reward", "/return"):
-            parts = [values for _, values in sorted(found.get(entity, []), key=lambda part: part[0])]
-            check(bool(parts), f"nothing at {entity}")
-            check(
-                np.array_equal(np.concatenate(parts), columns[entity].reshape(-1)),
-                f"other values at {entity}",
-            )
+    for entity in ("/state", "/action", "/reward", "/return"):
+        parts = [values for _, values in sorted(found.get(entity, []), key=lambda part: part[0])]
+        check(bool(parts), f"{side}: nothing at {entity}")
+        same = np.array_equal(np.concatenate(parts), columns[entity].reshape(-1))
+        check(same, f"{side}: other values at {entity}")
     goal.unlink()
     return seconds

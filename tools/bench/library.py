@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measure import check
+from tools.bench.measure import check
 
 __all__ = ["add", "fill", "template"]
 

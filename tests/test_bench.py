@@ -1,0 +1,171 @@
+"""The benchmark itself: it runs, what it writes is whole, and nobody's wrong result is timed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from tools.bench import report, workloads  # noqa: E402
+from tools.bench.contenders import OURS, make  # noqa: E402
+from tools.bench.data import check_same  # noqa: E402
+from tools.bench.fleet import NoAnswerError, Process  # noqa: E402
+from tools.bench.measure import WrongResultError  # noqa: E402
+from tools.bench.worker import Worker  # noqa: E402
+
+SIDES = (OURS, "HDF5 by hand", ".npy, mapped")
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a quick run of some parts writes."""
+    pytest.importorskip("h5py")
+    output = tmp_path_factory.mktemp("bench")
+    (output / "front.md").write_text(f"before\n\n{report.BEGIN}\nold\n{report.END}\n\nafter\n")
+    command = [sys.executable, "-m", "tools.bench", "--quick", "--output", str(output)]
+    command += ["--readme", str(output / "front.md")]
+    command += [part for side in SIDES for part in ("--with", side)]
+    command += [part for name in ("floats", "growth", "noise") for part in ("--only", name)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
+    assert done.returncode == 0, done.stderr
+    return output
+
+
+class TestQuickRun:
+    def test_every_cell_has_a_figure_or_a_reason(self, quick: Path) -> None:
+        results = json.loads((quick / "results.json").read_text())
+        assert results["failures"] == []
+        for work, found in results["matrix"].items():
+            for operation, row in found["cells"].items():
+                loading = {"HDF5 by hand"} if operation.startswith("epoch") else set()
+                assert set(row) == set(SIDES) - loading
+                for side, cell in row.items():
+                    assert bool(cell["values"]) != bool(cell["cannot"]), (work, operation, side)
+            assert all(cell["values"] for cell in (row[OURS] for row in found["cells"].values()))
+
+    def test_growth_has_all_sizes(self, quick: Path) -> None:
+        growth = json.loads((quick / "results.json").read_text())["growth"]
+        for points in growth.values():
+            assert [point["steps"] // 1000 for point in points][:1] == [1]
+            assert {"record", "list", "read", "window", "bytes", "memory"} <= set(points[0])
+
+    def test_pages_and_pictures(self, quick: Path) -> None:
+        page = (quick / "README.md").read_text()
+        assert all(f"| **{side}** |" in page or f"| {side} |" in page for side in SIDES)
+        assert "| size of 256 incompressible bytes a step, over these bytes | <= 1.3 x |" in page
+        for name in ("floats", "growth"):
+            assert f"({name}.svg)" in page
+            assert ET.parse(quick / f"{name}.svg").getroot().tag.endswith("svg")
+
+    def test_the_block_replaces_the_old_one(self, quick: Path) -> None:
+        front = (quick / "front.md").read_text()
+        assert front.startswith("before\n\n" + report.BEGIN)
+        assert front.endswith(report.END + "\n\nafter\n")
+        assert "old" not in front
+
+    def test_drawn_anew_it_is_the_same(self, quick: Path) -> None:
+        before = {path.name: path.read_bytes() for path in quick.iterdir()}
+        command = [sys.executable, "-m", "tools.bench", "--render", "--output", str(quick)]
+        subprocess.run(command, cwd=ROOT, capture_output=True, timeout=120, check=True)
+        assert {path.name: path.read_bytes() for path in quick.iterdir()} == before
+
+
+class TestChecks:
+    @pytest.fixture
+    def worker(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Worker:
+        monkeypatch.setenv(workloads.DATA, str(tmp_path))
+        made = Worker(".npy, mapped")
+        request = {"do": "build", "work": "floats", "path": str(tmp_path / "run"), "steps": 2000}
+        assert made.answer(request)["value"]["steps"] == 2000
+        return made
+
+    @pytest.mark.parametrize("do", ["read", "field", "episode", "window", "filter"])
+    def test_wrong_actions_are_not_timed(self, worker: Worker, tmp_path: Path, do: str) -> None:
+        ask = {"work": "floats", "path": str(tmp_path / "run")}
+        assert worker.answer({"do": do, **ask})["value"] > 0
+        actions = np.load(tmp_path / "run" / "actions.npy", mmap_mode="r+")
+        actions[:] += 1e-3
+        del actions
+        worker._sessions.clear()
+        assert worker.answer({"do": do, **ask}) == {"failed": "WrongResultError: other actions"}
+
+    def test_wrong_lengths_are_not_timed(self, worker: Worker, tmp_path: Path) -> None:
+        np.save(tmp_path / "run" / "lengths.npy", np.array([999, 1001]))
+        answer = worker.answer({"do": "list", "work": "floats", "path": str(tmp_path / "run")})
+        assert answer == {"failed": "WrongResultError: other lengths"}
+
+    def test_a_narrower_type_is_told_from_another_value(self) -> None:
+        wanted = {"rewards": np.array([0.1, 0.2])}
+        assert not check_same({"rewards": np.array([0.1, 0.2])}, wanted)
+        assert check_same({"rewards": np.array([0.1, 0.2], np.float32)}, wanted)
+        with pytest.raises(WrongResultError, match="other rewards"):
+            check_same({"rewards": np.array([0.1, 0.3], np.float32)}, wanted)
+        with pytest.raises(WrongResultError, match="no rewards"):
+            check_same({}, wanted)
+
+    @pytest.mark.parametrize("name", ["cartpole", "floats", "dict", "noise"])
+    def test_a_rollout_is_what_the_data_say(
+        self, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The data are computed from the tables; the recorder sees the environment."""
+        monkeypatch.setenv(workloads.DATA, str(tmp_path))
+        work = workloads.WORKLOADS[name]
+        data = workloads.reference(name, 2500)
+        _, steps = make(OURS).record(work, tmp_path / "run.mcap", len(data.lengths))
+        found, lengths = make(OURS).read(tmp_path / "run.mcap")
+        assert steps == data.steps >= 2500
+        assert not check_same(found, data.leaves)
+        assert lengths is not None
+        assert lengths.tolist() == data.lengths.tolist()
+
+
+class TestFleet:
+    def test_a_contender_that_dies_is_said_to(self, tmp_path: Path) -> None:
+        process = Process(".npy, mapped", tmp_path)
+        try:
+            assert process.ask("versions")["versions"]["numpy"] == np.__version__
+            assert process._process is not None
+            os.kill(process._process.pid, 9)
+            process._process.wait()
+            assert process.ask("versions")["versions"]  # another one was started
+            with pytest.raises(NoAnswerError, match=r"took more than 0 s \(build\)"):
+                process.ask("build", 0.001, work="floats", path=str(tmp_path / "a"), steps=100_000)
+            assert not process.alive
+        finally:
+            process.stop()
+
+    def test_a_contender_that_is_not_installed(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("tools.bench.fleet.ROOT", tmp_path)
+        with pytest.raises(NoAnswerError, match="not installed: run tools/setup-venv-peers"):
+            Process("PyTupli", tmp_path).ask("versions")
+
+    def test_a_failure_is_in_the_table(self) -> None:
+        cells: dict[str, Any] = {}
+        for operation in report.OPERATIONS:
+            values = [] if operation == "read" else [2.0, 4.0]
+            cells[operation] = {
+                OURS: {"values": [4.0, 8.0], "cannot": "", "failed": ""},
+                "mcap": {
+                    "values": values,
+                    "cannot": "",
+                    "failed": "" if values else "WrongResultError: other actions",
+                },
+            }
+        table = report.table(
+            "floats", {"built": {OURS: {"steps": 100}, "mcap": {"steps": 50}}, "cells": cells}
+        )
+        row = next(line for line in table.splitlines() if line.startswith("| mcap"))
+        assert "failed<sup>1</sup>" in row
+        assert "<sup>1</sup> mcap: WrongResultError: other actions." in table
+        assert row.count("⚡2.0x") == sum(not op.higher for op in report.OPERATIONS.values())
+        assert "slower ones fewer, which favours them: mcap 50" in table

@@ -1,0 +1,156 @@
+"""tupli-mcap: recordings as they are, and their columns materialized."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tools.bench.contenders.base import CannotError, Contender, Session
+from tools.bench.data import Array, flat
+from tools.bench.measure import Stopwatch
+from tools.bench.workloads import STEPS, Workload
+
+
+def leaves(found: Any) -> dict[str, Any]:
+    """The leaves of columns, an episode or a window."""
+    return flat(found.states) | {name: getattr(found, name) for name in STEPS}
+
+
+class _Episodes(Session):
+    def __init__(self, path: Path) -> None:
+        from tupli_mcap import Recording
+
+        self._recording = Recording(path)
+        super().__init__(self._recording.index["length"].astype(np.int64))
+
+    def episode(self, number: int) -> dict[str, Any]:
+        return leaves(self._recording.episodes[number])
+
+    def window(self, number: int, start: int, length: int) -> dict[str, Any]:
+        return leaves(self._recording.episodes[number][start : start + length])
+
+    def close(self) -> None:
+        self._recording.close()
+
+
+class Ours(Contender):
+    """`RecordEpisodes`, `Recording`, `TupliDataset` and `tupli_mcap.torch`."""
+
+    def wrap(self, env: Any, work: Workload, path: Path) -> Any:
+        from tupli_mcap import RecordEpisodes
+
+        return RecordEpisodes(env, path)
+
+    def append(self, work: Workload, path: Path, episodes: int) -> tuple[float, int]:
+        from tupli_mcap import RecordEpisodes
+
+        env, watch = work.make(), Stopwatch()
+        with watch:
+            recorder = RecordEpisodes(env, path, mode="a")
+            steps = work.rollout(recorder, episodes)
+            recorder.close()
+        return watch.seconds, steps
+
+    def listing(self, path: Path) -> Array:
+        from tupli_mcap import Recording
+
+        with Recording(path) as recording:
+            return np.array([len(episode) for episode in recording.episodes])
+
+    def read(self, path: Path) -> tuple[dict[str, Any], Array | None]:
+        from tupli_mcap import Recording
+
+        with Recording(path) as recording:
+            columns = recording.read()
+        return leaves(columns), columns.episode_lengths
+
+    def field(self, path: Path) -> Array:
+        from tupli_mcap import Recording
+
+        with Recording(path) as recording:
+            actions: Array = recording.read(fields=["actions"]).actions
+            return actions
+
+    def open(self, path: Path) -> Session:
+        return _Episodes(path)
+
+    def dataset(self, path: Path) -> Any:
+        """The recording as a dataset."""
+        from tupli_mcap import TupliDataset
+
+        return TupliDataset.from_files(path)
+
+    def select(self, path: Path, least: float) -> dict[str, Any]:
+        from tupli_mcap import F
+
+        chosen = self.dataset(path).with_episode_filter(F("episode_return") >= least)
+        return dict(zip(("states", *STEPS), chosen.convert_to_numpy(), strict=True)) | _flat_states(chosen)
+
+    def loader_parts(self, path: Path, length: int, stride: int) -> tuple[Any, Any]:
+        """A map-style dataset of windows for PyTorch, and what its DataLoader collates with."""
+        from tupli_mcap.torch import MapDataset, collate
+
+        windows = self.dataset(path).windows(length, stride, fields=("states", "actions", "rewards"))
+        return MapDataset(windows), collate
+
+
+def _flat_states(dataset: Any) -> dict[str, Any]:
+    return flat(dataset.observations)
+
+
+class _Mapped(Session):
+    """Episodes are runs of steps of the dataset."""
+
+    def __init__(self, dataset: Any) -> None:
+        self._steps = dataset.steps
+        super().__init__(self._steps.episode_lengths)
+        self._starts = np.cumsum(self.lengths) - self.lengths
+
+    def episode(self, number: int) -> dict[str, Any]:
+        return self.window(number, 0, int(self.lengths[number]))  # type: ignore[index]
+
+    def window(self, number: int, start: int, length: int) -> dict[str, Any]:
+        first = int(self._starts[number]) + start
+        found = self._steps.read(("states", *STEPS), np.arange(first, first + length))
+        return flat(found.pop("states")) | found
+
+
+class Materialized(Ours):
+    """The same recording, whose columns were written once as files that are mapped into memory."""
+
+    note = "recorded as above, then `dataset.materialize(...)`; that is not counted as recording"
+
+    def record(self, work: Workload, path: Path, episodes: int) -> tuple[float, int]:
+        path.mkdir()
+        found = super().record(work, path / "run.mcap", episodes)
+        if work.table == "mission":
+            raise CannotError("texts are not materialized")
+        self._at(path)
+        return found
+
+    def _at(self, path: Path) -> Any:
+        return super().dataset(path / "run.mcap").materialize(path / "columns")
+
+    def append(self, work: Workload, path: Path, episodes: int) -> tuple[float, int]:
+        raise CannotError("columns are written anew")
+
+    def dataset(self, path: Path) -> Any:
+        return self._at(path)
+
+    def read(self, path: Path) -> tuple[dict[str, Any], Array | None]:
+        steps = self._at(path).steps
+        found = steps.read(("states", *STEPS), np.arange(len(steps)))
+        return flat(found.pop("states")) | found, steps.episode_lengths
+
+    def field(self, path: Path) -> Array:
+        steps = self._at(path).steps
+        actions: Array = steps.read(("actions",), np.arange(len(steps)))["actions"]
+        return actions
+
+    def listing(self, path: Path) -> Array:
+        raise CannotError("as above")
+
+    def open(self, path: Path) -> Session:
+        return _Mapped(self._at(path))
