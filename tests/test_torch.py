@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import pickle
 import subprocess
@@ -19,7 +20,7 @@ from hypothesis import strategies as st
 from test_sampling import SPACES, record
 
 from tupli_mcap import F, FormatError, RecordEpisodes, Recording, TupliDataset
-from tupli_mcap.sampling import SamplingError
+from tupli_mcap.sampling import DeltaWindows, Order, Sampler, SamplingError
 
 torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader, DistributedSampler, default_collate  # noqa: E402
@@ -202,6 +203,23 @@ def test_what_a_collate_function_changes_in_a_worker_arrives(dataset: TupliDatas
     assert torch.equal(batch["rewards"], torch.from_numpy(windows[:5].rewards) * 2)
 
 
+@pytest.mark.parametrize("loaded", [False, True])
+def test_a_worker_keeps_to_its_own_budget(tmp_path: Path, loaded: bool) -> None:
+    dataset = TupliDataset.from_files(record(tmp_path / "a.mcap", SPACES["image"], 100))
+    if loaded:
+        _ = dataset.rewards
+    stream = StreamDataset(dataset.windows(2), 16, worker_cache_bytes=SMALL)
+
+    def told(batch: Any) -> int:
+        steps: Any = dataset.steps
+        recorded: Any = steps._rest if loaded else steps
+        return int(recorded.cache_bytes)
+
+    in_worker = list(DataLoader(stream, None, num_workers=1, collate_fn=told))
+    assert set(in_worker) == {SMALL}
+    assert told(None) > SMALL
+
+
 def test_a_seed_of_none_draws_from_pytorch(dataset: TupliDataset) -> None:
     stream = StreamDataset(dataset.windows(2), 16, worker_cache_bytes=SMALL)
     torch.manual_seed(3)
@@ -274,6 +292,15 @@ def test_transitions_with_several_steps(dataset: TupliDataset) -> None:
     assert sorted(all_of(batches)) == list(range(len(items)))
 
 
+def test_deltas_are_nested(dataset: TupliDataset) -> None:
+    items = DeltaWindows(dataset.steps, {"state": [-1, 0], "action": range(3)})
+    batch = next(iter(DataLoader(MapDataset(items), 8, num_workers=1, collate_fn=collate)))
+    expected = items[:8]
+    assert same(
+        as_numpy(batch), {name: getattr(expected, name) for name in ("values", "masks", "steps", "episodes")}
+    )
+
+
 # ---- resuming
 
 
@@ -328,6 +355,30 @@ def test_a_shuffled_map_resumes(dataset: TupliDataset, workers: int) -> None:
     resumed = loader()
     resumed.load_state_dict(state)
     assert numbers(resumed) == rest != []
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("kind", ["exact", "blocks", "weights"])
+def test_orders_and_samplers_resume(dataset: TupliDataset, workers: int, kind: Any) -> None:
+    windows = dataset.windows(2)
+
+    def loader() -> Any:
+        numbers: Any = Order(windows, 64, shuffle=kind, seed=4) if kind != "weights" else None
+        if numbers is None:
+            numbers = Sampler(windows, 64, weights=np.arange(len(windows)), seed=4)
+        return StatefulDataLoader(
+            MapDataset(windows), batch_sampler=numbers, num_workers=workers, collate_fn=collate
+        )
+
+    first = loader()
+    batches = iter(first)
+    for _ in range(3):
+        next(batches)
+    state = pickle.loads(pickle.dumps(first.state_dict()))
+    rest = numbers(itertools.islice(batches, 4))
+    resumed = loader()
+    resumed.load_state_dict(state)
+    assert numbers(itertools.islice(resumed, 4)) == rest != []
 
 
 def test_state_dicts_without_a_loader(dataset: TupliDataset) -> None:

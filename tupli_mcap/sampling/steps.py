@@ -108,6 +108,11 @@ class MemorySteps:
     def blocks(self, rows: Array) -> Array:
         return rows // _BLOCK
 
+    def limit(self, cache_bytes: int, threads: int) -> None:
+        """Keeps to another budget for what is not in memory."""
+        if hasattr(self._rest, "limit"):
+            self._rest.limit(cache_bytes, threads)
+
 
 def checked_fields(fields: Sequence[str], known: Sequence[str] = FIELDS) -> list[str]:
     """The fields, one name as a list of one.
