@@ -283,6 +283,19 @@ def test_vector_recordings_and_storages(tmp_path: Path) -> None:
     assert victim not in {header.id for header in fewer.preview()}
 
 
+def test_recordings_behind_a_url(tmp_path: Path) -> None:
+    path = tmp_path / "0.mcap"
+    record(path, gym.make("CartPole-v1"), 100)
+    written = []
+    for change in (0, 0, 50):
+        if change:
+            record(path, gym.make("CartPole-v1"), change, mode="a")
+        dataset = TupliDataset.from_files(f"file://{path}").materialize(tmp_path / "columns")
+        assert same(dataset.observations, Recording(path).read().states)
+        written.append(token(tmp_path / "columns"))
+    assert written[0] == written[1] != written[2]
+
+
 def test_a_recording_that_is_still_written(tmp_path: Path) -> None:
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "0.mcap") as env:
         roll(env, 100)
@@ -396,6 +409,12 @@ def breaks_descend(directory: Path) -> None:
     np.save(directory / "break.npy", np.load(directory / "break.npy")[::-1].copy())
 
 
+def a_break_less(directory: Path) -> None:
+    breaks = np.load(directory / "break.npy")
+    breaks[-1] -= 1
+    np.save(directory / "break.npy", breaks)
+
+
 def lengths_differ(directory: Path) -> None:
     np.save(directory / "episode_length.npy", np.load(directory / "episode_length.npy") + 1)
 
@@ -413,6 +432,7 @@ def lengths_differ(directory: Path) -> None:
         (newer, "expected columns of version 1, found 9; update tupli-mcap"),
         (no_spaces, "manifest.json"),
         (breaks_descend, "breaks that ascend"),
+        (a_break_less, "expected a break at every end of an episode"),
         (lengths_differ, "expected 700 steps of all episodes"),
     ],
 )

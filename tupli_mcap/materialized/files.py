@@ -21,7 +21,7 @@ from tupli_mcap.system import refused
 __all__ = ["BytesWriter", "ColumnWriter", "map_array", "map_bytes", "sha256_of"]
 
 _MOST_HEADER = 4096
-_BUFFER = 1 << 20
+_BUFFER = 1 << 16  # of each of perhaps hundreds of files
 
 
 class BytesWriter:

@@ -22,7 +22,6 @@ MAPPED_FIELDS = (*FIELDS, "steps")
 _BLOCK = 4096  # steps
 
 Array = np.ndarray[Any, Any]
-Take = Callable[[Any, Array | None], Any]
 
 
 class _Runs(NamedTuple):
@@ -65,7 +64,6 @@ class MappedSteps:
         """Columns of some steps, by field, as of any `Steps`; also "steps" (int64, counted from 0 in each episode).
 
         Raises:
-            IndexError: there is no such step.
             SamplingError: there is no such field.
         """
         return {field: self._field(field, rows) for field in checked_fields(fields, MAPPED_FIELDS)}
