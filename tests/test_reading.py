@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import roll, same
+from environments import Sampler, roll, same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -58,6 +58,19 @@ def test_episodes_in_any_order(vector: Recording, by_episode: list[Any], data: s
             assert same(getattr(found, field), np.concatenate(parts))
         else:
             assert len(getattr(found, field)) == 0
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1), (3,), (2, 0, 3), (2, 3)])
+@pytest.mark.parametrize("steps", [20, 3000])
+def test_values_of_any_shape(tmp_path: Path, shape: tuple[int, ...], steps: int) -> None:
+    space = gym.spaces.Dict({"a": gym.spaces.Box(-9, 9, shape, np.float16), "b": gym.spaces.MultiBinary(5)})
+    env = Sampler(space, gym.spaces.Box(0, 9, shape, np.int16))
+    with RecordEpisodes(env, tmp_path / "a.mcap", chunk_size=4096) as recorder:
+        taken = roll(recorder, steps)
+    columns = Recording(tmp_path / "a.mcap").read()
+    assert same(columns.states["a"], np.array([step[0]["a"] for step in taken]))
+    assert same(columns.states["b"], np.array([step[0]["b"] for step in taken]))
+    assert same(columns.actions, np.array([step[1] for step in taken]))
 
 
 def record(path: Path, steps: int = 500, **options: Any) -> None:

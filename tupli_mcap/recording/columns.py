@@ -23,6 +23,7 @@ __all__ = ["FIELDS", "ColumnReader", "Columns"]
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
 _TIME = "#log_time"
 Array = np.ndarray[Any, Any]
+_MANY_ROWS = 1000  # fewer are copied before they have been looked at in another way
 _FEW_TASKS = 4  # fewer are done before a thread pool has started
 
 
@@ -128,18 +129,25 @@ class ColumnReader:
             return [None] * total
         return np.empty((total, *leaf.shape), self._layout.dtypes[leaf.name])
 
-    def _image_channels(self, name: str, channels: Array) -> Array:
+    def _image_channels(self, name: str, channels: Array | Sequence[int]) -> Array:
         found, places = np.unique(channels, return_inverse=True)
-        return np.array([self._images[name][channel] for channel in found.tolist()], np.int64)[places]
+        images: Array = np.array([self._images[name][channel] for channel in found.tolist()], np.int64)[
+            places
+        ]
+        return images
 
     def _tasks(
         self, runs: Runs, names: Sequence[str], out: Mapping[str, Any], dtype: Any, keep: bool
     ) -> list[Callable[[], None]]:
-        targets = [(name, items(out[name])) for name in names]
-        item_dtype = items_dtype(dtype)
+        targets = [(name, out[name]) for name in names]
+        item_dtype = None
+        if len(targets[0][1]) >= _MANY_ROWS:
+            targets = [(name, items(column)) for name, column in targets]
+            item_dtype = items_dtype(dtype)
 
         def copy(pieces: Pieces) -> None:
-            pieces.copy(self._store.rows(pieces.chunk, dtype, keep=keep).view(item_dtype), targets)
+            rows = self._store.rows(pieces.chunk, dtype, keep=keep)
+            pieces.copy(rows if item_dtype is None else rows.view(item_dtype), targets)
 
         return [partial(copy, pieces) for pieces in Pieces.of(runs, self._store)]
 

@@ -20,26 +20,27 @@ _FEW = 4  # so many pieces are copied one by one
 
 
 class Runs(NamedTuple):
-    """Consecutive rows of a channel each, which go to the columns one run after the other; all arrays are int64."""
+    """Consecutive rows of a channel each, which go to the columns one run after the other; int64 arrays, or lists."""
 
-    channels: Array
-    first: Array
-    steps: Array
-
-    @classmethod
-    def one(cls, channel: int, first: int, steps: int) -> Runs:
-        return cls(*(np.array([value], np.int64) for value in (channel, first, steps)))
+    channels: Array | Sequence[int]
+    first: Array | Sequence[int]
+    steps: Array | Sequence[int]
 
     @property
-    def starts(self) -> Array:
-        """Where each run goes to in the columns."""
-        starts: Array = np.cumsum(self.steps) - self.steps
-        return starts
+    def few(self) -> bool:
+        """Whether arrays would take longer than these runs are worth: a window, an episode."""
+        return len(self.first) <= _FEW
 
     def each(self) -> Iterator[tuple[int, int, int, int]]:
         """Channel, first row, number of rows, and where they go, of one run after the other."""
-        parts = (self.channels, self.first, self.steps, self.starts)
-        return zip(*(part.tolist() for part in parts), strict=True)
+        place = 0
+        for channel, first, steps in zip(*map(_listed, self), strict=True):
+            yield channel, first, steps, place
+            place += steps
+
+
+def _listed(part: Array | Sequence[int]) -> Sequence[int]:
+    return part.tolist() if isinstance(part, np.ndarray) else part
 
 
 def runs_of(episodes: Array, channels: Sequence[int]) -> Runs:
@@ -73,12 +74,12 @@ def _joined(channels: Array, first: Array, steps: Array) -> Runs:
 
 
 class Pieces(NamedTuple):
-    """Parts of a chunk: `steps[i]` rows from `begin[i]` on (ascending), which go to `out[i]` on. All int64."""
+    """Parts of a chunk: `steps[i]` rows from `begin[i]` on, which go to `out[i]` on. int64, or lists where few."""
 
     chunk: int
-    begin: Array
-    steps: Array
-    out: Array
+    begin: Array | Sequence[int]
+    steps: Array | Sequence[int]
+    out: Array | Sequence[int]
 
     @classmethod
     def of(cls, runs: Runs, store: ChunkStore) -> list[Pieces]:
@@ -87,10 +88,13 @@ class Pieces(NamedTuple):
         Raises:
             FormatError: there are no such rows.
         """
-        starts, found = runs.starts, []
-        for channel in np.unique(runs.channels).tolist():
-            chosen = np.flatnonzero(runs.channels == channel)
-            located = store.locate(channel, runs.first[chosen], runs.steps[chosen])
+        if runs.few:
+            return _of_few(runs, store)
+        channels, first, steps = map(np.asarray, runs)
+        starts, found = np.cumsum(steps) - steps, []
+        for channel in np.unique(channels).tolist():
+            chosen = np.flatnonzero(channels == channel)
+            located = store.locate(channel, first[chosen], steps[chosen])
             if not len(located.chunk):
                 continue
             # Within its run, a piece comes after those before it.
@@ -101,13 +105,14 @@ class Pieces(NamedTuple):
         return found
 
     def copy(self, rows: Array, targets: Sequence[tuple[str, Array]]) -> None:
-        """Copies fields of the chunk's rows to columns; both as `items_dtype` and `items` have them."""
+        """Copies fields of the chunk's rows to columns of the same shape."""
         if len(self.begin) <= _FEW:
-            for begin, steps, out in zip(*(part.tolist() for part in self[1:]), strict=True):
+            for begin, steps, out in zip(self.begin, self.steps, self.out, strict=True):
                 for name, target in targets:
                     target[out : out + steps] = rows[name][begin : begin + steps]
             return
-        source, places = _indexes(self.begin, self.steps), _indexes(self.out, self.steps)
+        begins, steps, outs = (np.asarray(part) for part in (self.begin, self.steps, self.out))
+        source, places = _indexes(begins, steps), _indexes(outs, steps)
         if isinstance(source, slice) or len(targets) == 1:
             for name, target in targets:
                 target[places] = rows[name][source]
@@ -115,6 +120,17 @@ class Pieces(NamedTuple):
         picked = rows.take(source)  # whole rows: one walk through the chunk instead of one a field
         for name, target in targets:
             target[places] = picked[name]
+
+
+def _of_few(runs: Runs, store: ChunkStore) -> list[Pieces]:
+    found: dict[int, tuple[list[int], list[int], list[int]]] = {}
+    for channel, first, steps, out in runs.each():
+        for chunk, begin, end in store.spans(channel, first, steps):
+            parts = found.setdefault(chunk, ([], [], []))
+            for part, value in zip(parts, (begin, end - begin, out), strict=True):
+                part.append(value)
+            out += end - begin
+    return [Pieces(chunk, *parts) for chunk, parts in found.items()]
 
 
 def _by_chunk(chunks: Array, begin: Array, steps: Array, out: Array) -> list[Pieces]:

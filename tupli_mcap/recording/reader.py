@@ -455,7 +455,7 @@ class Recording:
                 f"{self.name}: expected steps from 0 to {row['length']}, found {start}:{stop}"
             )
         channel = self._step_channels[int(row["env"])]
-        run = Runs.one(channel, int(row["first_row"]) + start, count)
+        run = Runs([channel], [int(row["first_row"]) + start], [count])
         columns = Columns(np.array([count]))
         for field, values in self._reader.read(run, count, fields, 1, True, images).items():
             setattr(columns, field, values)
