@@ -17,9 +17,10 @@ from environments import same
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_readme import run_python
 from test_sampling import SPACES, record
 
-from tupli_mcap import F, FormatError, RecordEpisodes, Recording, TupliDataset
+from tupli_mcap import F, FormatError, Recording, TupliDataset
 from tupli_mcap.sampling import DeltaWindows, Order, Sampler, SamplingError
 
 torch = pytest.importorskip("torch")
@@ -30,6 +31,7 @@ from tupli_mcap.torch import Episodes, MapDataset, StreamDataset, collate  # noq
 from tupli_mcap.torch.order import Batches, Blocks, Part  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:'set_vital' is deprecated:UserWarning")  # torchdata's
+GUIDE = Path(__file__).parents[1] / "docs" / "pytorch.md"
 SMALL = 20_000  # bytes: a few chunks of what `record` writes
 
 
@@ -546,26 +548,12 @@ def test_batches_go_through_the_pinning_thread(dataset: TupliDataset) -> None:
 # ---- training
 
 
-def test_a_policy_learns_from_recorded_episodes(tmp_path: Path) -> None:
-    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "expert.mcap") as env:
-        state, _ = env.reset(seed=0)
-        for _ in range(2000):
-            state, _, terminal, timeout, _ = env.step(int(state[2] + 0.3 * state[3] > 0))
-            if terminal or timeout:
-                state, _ = env.reset()
-    dataset = TupliDataset.from_files(tmp_path / "expert.mcap")
-    torch.manual_seed(0)
-    policy = torch.nn.Linear(4, 2)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=0.05)
-    stream = StreamDataset(dataset.transitions(fields=["states", "actions"]), 64, seed=0)
-    for epoch in range(6):
-        stream.set_epoch(epoch)
-        for batch in DataLoader(stream, batch_size=None, collate_fn=collate):
-            loss = torch.nn.functional.cross_entropy(policy(batch["states"]), batch["actions"])
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-    test = gym.make("CartPole-v1")
+def test_the_documented_policy_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_python(GUIDE.read_text())
+    assert len(names["rest"]) == len(names["stream"]) - 1
+    assert names["batch"]["next", "reward"].shape == (32, 1)
+    policy, test = names["policy"], gym.make("CartPole-v1")
     state, _ = test.reset(seed=1)
     steps, over = 0, False
     while not over:
