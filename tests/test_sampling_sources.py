@@ -347,6 +347,16 @@ def test_seconds_that_recordings_say_and_times_recorded(tmp_path: Path) -> None:
         assert found.masks["time"].tolist() == [True] * len(deltas) + [False] * 2
 
 
+def test_a_recording_that_is_open_stays_open(library: list[Path]) -> None:
+    with Recording(library[0]) as recording, library[0].open("rb") as file:
+        steps = steps_of(recording)
+        assert len(recording.read([1])) == 6
+        check(steps, library[:1])
+        of_file = steps_of(Recording(file))
+        check(of_file, library[:1])
+    check(steps, library[:1])  # it opens the path itself
+
+
 @pytest.mark.parametrize("cache_bytes", [0, 1 << 22])
 def test_stacks_of_frames(tmp_path: Path, cache_bytes: int) -> None:
     path = tmp_path / "s.mcap"
@@ -358,3 +368,17 @@ def test_stacks_of_frames(tmp_path: Path, cache_bytes: int) -> None:
     steps = TupliDataset.from_files(path).with_cache(cache_bytes).steps
     check(steps, [path])
     check(pickle.loads(pickle.dumps(steps)), [path])
+
+
+def test_a_url_that_every_process_opens_for_itself(tmp_path: Path) -> None:
+    path = tmp_path / "u.mcap"
+    with RecordEpisodes(Sampler(IMAGE, spaces.Discrete(3)), path, chunk_size=2000) as env:
+        roll(env, 50)
+    for cache_bytes in (0, 1 << 20):
+        steps = TupliDataset.from_files(path.as_uri()).with_cache(cache_bytes).steps
+        check(steps, [path])
+        check(pickle.loads(pickle.dumps(steps)), [path])
+        windows = TupliDataset.from_files(path.as_uri()).with_cache(cache_bytes).windows(3)
+        expected = _digest(windows)
+        with multiprocessing.get_context("fork").Pool(1) as pool:
+            assert pool.map(_digest, [windows]) == [expected]

@@ -15,6 +15,8 @@ from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns import FIELDS
 from tupli_mcap.recording.describe import describe
+from tupli_mcap.sampling import steps_of
+from tupli_mcap.sampling.steps import map_arrays
 
 __all__ = ["Facts", "UnexpectedError", "judge", "observe"]
 
@@ -95,11 +97,28 @@ def _read(reader: Reader, recording: Recording) -> None:
     columns = reader.ask("columns", lambda: recording.read(fields=FIELDS))
     if columns is not None:
         reader.ask("nested", lambda: len(columns))
+    reader.ask("at random", lambda: _at_random(recording, columns), none_yet)
     episodes: dict[int, Facts] = {}
     for i in range(min(len(recording), 64)):
         one = _episode(reader, recording, i)
         episodes[recording.episodes[i].number] = one
     reader.facts["episodes"] = episodes
+
+
+def _at_random(recording: Recording, columns: Any) -> int:
+    """Reads the steps by number, the last one first, and holds them against the columns."""
+    for cache_bytes in (0, 1 << 24):  # chunk by chunk, or decoded
+        steps = steps_of(recording, cache_bytes=cache_bytes, threads=1)
+        found = steps.read(FIELDS, np.arange(len(steps))[::-1].copy())
+        for name in FIELDS:
+            if columns is not None and _flipped(found[name]) != _exact(getattr(columns, name)):
+                raise UnexpectedError(f"{name} differ when they are read by number")
+    return len(steps)
+
+
+def _flipped(column: Any) -> str:
+    """The column with its last row first."""
+    return _exact(map_arrays(lambda part: part[::-1], column, lambda part: part[::-1]))
 
 
 def _episode(reader: Reader, recording: Recording, i: int) -> Facts:

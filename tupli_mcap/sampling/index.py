@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -84,7 +85,7 @@ class StepIndex:
     def of(
         cls,
         listed: Iterable[ListedEpisodes],
-        open_recording: Callable[[str], Recording],
+        open_recording: Callable[[str], AbstractContextManager[Recording]],
         files: OpenFiles,
         cache: ChunkCache,
     ) -> StepIndex:
@@ -96,12 +97,8 @@ class StepIndex:
         """
         builder = _Builder(files, cache)
         for part in listed:
-            recording = open_recording(part.recording)
-            try:
+            with open_recording(part.recording) as recording:
                 builder.add(recording, part)
-            finally:
-                if recording.stored.where is not None:  # else nobody could open it again
-                    recording.close()
         return builder.finish()
 
     def __getstate__(self) -> dict[str, Any]:

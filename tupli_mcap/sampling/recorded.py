@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,7 +45,7 @@ class RecordedSteps:
 
     Args:
         listed: the episodes, in order.
-        open_recording: opens a recording by its name.
+        open_recording: opens a recording by its name; it is left when it has been looked at.
         mask: which of the listed steps are wanted (bool); None for all.
         cache_bytes: budget for what is kept.
         threads: how many read chunks.
@@ -57,7 +58,7 @@ class RecordedSteps:
     def __init__(
         self,
         listed: Iterable[ListedEpisodes],
-        open_recording: Callable[[str], Recording],
+        open_recording: Callable[[str], AbstractContextManager[Recording]],
         mask: Array | None = None,
         *,
         cache_bytes: int = CACHE_BYTES,
@@ -144,9 +145,11 @@ class RecordedSteps:
     @property
     def room(self) -> int:
         """How many steps are in the chunks that fit into half the cache."""
-        tables = [store.table for store in self._index.stores]
-        size = sum(int(table["uncompressed"].sum()) for table in tables)
-        return len(self) if size == 0 else int(len(self) * self.cache_bytes / 2 / size)
+        stored = sum(int(store.table["uncompressed"].sum()) for store in self._index.stores)
+        images = (
+            sum(leaf.size for leaf in self.layout.images) if self.layout else 0
+        )  # stored smaller, some of them
+        return int(self.cache_bytes / 2 / max(1, stored / max(1, len(self)), images))
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
         n = len(self)
@@ -295,4 +298,4 @@ def steps_of(
     """
     numbers, lengths = (recording.index[name].astype(np.int64) for name in ("episode", "length"))
     listed = ListedEpisodes(recording.name, numbers, lengths)
-    return RecordedSteps([listed], lambda _: recording, cache_bytes=cache_bytes, threads=threads)
+    return RecordedSteps([listed], lambda _: nullcontext(recording), cache_bytes=cache_bytes, threads=threads)
