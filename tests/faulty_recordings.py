@@ -52,6 +52,8 @@ WORKLOADS = {
     "info": Workload(_BOX, {"chunk_size": 400, "record_info": True}),
     "flushed": Workload(_BOX, {"chunk_size": 4000}, flush=True),
     "vector": Workload(_BOX, {"chunk_size": 400}, envs=3),
+    "vector-wide": Workload(spaces.Box(-1, 1, (900,), np.float64), {}, envs=3),
+    "png": Workload(_IMAGE, {"chunk_size": 1000, "image_format": "png"}),
     "vector-text": Workload(spaces.Text(20), {"chunk_size": 400}, envs=2),
     "vector-image": Workload(_IMAGE, {"chunk_size": 2000}, envs=2),
     "append": Workload(_BOX, {"chunk_size": 400}, start=9),
