@@ -12,7 +12,7 @@ from tupli_mcap.recording.durability import Durability, check_durability
 from tupli_mcap.recording.pictures import ImageFormat
 from tupli_mcap.system import refused
 
-__all__ = ["Mode", "WriterOptions", "check_options"]
+__all__ = ["Mode", "WriterOptions", "check_local", "check_options"]
 
 Mode = Literal["x", "w", "a"]
 
@@ -39,12 +39,17 @@ class WriterOptions(NamedTuple):
     image_format: ImageFormat = "raw"
 
 
-def check_options(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:
-    """The options, with a place for the journal that does not depend on the process's directory."""
+def check_local(path: str | os.PathLike[str]) -> None:
+    """Raises RecordingError if `path` is a URL, as it was given: as a `Path` it no longer looks like one."""
     if "://" in os.fspath(path):
         raise RecordingError(
             f"{path}: expected a local path to record to, found a URL; record to a path, and copy the file"
         )
+
+
+def check_options(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:
+    """The options, with a place for the journal that does not depend on the process's directory."""
+    check_local(path)
     if options.chunk_size < 1:
         raise RecordingError(f"chunk_size: expected at least 1 byte, found {options.chunk_size!r}")
     check_durability(options.durability)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.options import Mode, WriterOptions
+from tupli_mcap.recording.options import Mode, WriterOptions, check_local
 from tupli_mcap.recording.writer import LAST_ROW, RecordingWriter
 
 __all__ = ["Rotation", "series"]
@@ -63,6 +63,7 @@ class Rotation:
     def __init__(
         self, path: str | os.PathLike[str], mode: Mode, max_bytes: int | None, max_seconds: float | None
     ) -> None:
+        check_local(path)
         for name, limit in (("max_bytes", max_bytes), ("max_seconds", max_seconds)):
             if limit is not None and not (isinstance(limit, int | float) and limit > 0):
                 raise RecordingError(f"{name}: expected a positive number or None, found {limit!r:.40}")
