@@ -44,15 +44,6 @@ class OpenFiles:
             self._sources.move_to_end(where)
             return found
 
-    @property
-    def count(self) -> int:
-        """How many are open."""
-        return len(self._sources)
-
-    def close(self) -> None:
-        """Closes all; they open again when they are read."""
-        self._forget()
-
     def __getstate__(self) -> dict[str, Any]:
         return {"limit": self._limit}
 

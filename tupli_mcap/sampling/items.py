@@ -21,7 +21,7 @@ __all__ = ["Items", "Parts", "StepItems", "checked_count"]
 
 Array = np.ndarray[Any, Any]
 T = TypeVar("T")
-_MANY = 1 << 20
+_MANY = 1 << 20  # items that are looked at together
 
 
 @dataclass(frozen=True)
