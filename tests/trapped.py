@@ -176,6 +176,12 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
         "rewrite",
         lambda: _with(path, lambda r: tupli_mcap.rewrite_recording(r, work / f"rewritten_{name}")),
     )
+    yield "merge", lambda: tupli_mcap.merge_recordings([path], work / f"merged_{name}", overwrite=True)
+    yield "split", lambda: tupli_mcap.split_recording(path, work / f"{name}_parts" / "a.mcap", episodes=1)
+    yield (
+        "filter",
+        lambda: tupli_mcap.filter_recording(path, work / f"some_{name}", "n_tuples > 0", overwrite=True),
+    )
     yield "import", lambda: _import(path, work / "lab")
     yield "view", lambda: viewer.save(path, work / f"{name}.rrd", force=True)
     yield "plot", lambda: plots.report(path)

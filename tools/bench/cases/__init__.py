@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from tools.bench.cases import atari, catalog, columns, memory, reading, startup, vector, viewing, watching
+from tools.bench.cases import atari, catalog, columns, library, memory, reading, startup, vector, viewing, watching
 from tools.bench.measure import Run
 from tools.bench.targets import Target
 
@@ -25,6 +25,8 @@ CASES: dict[str, Callable[[Run], Iterator[Target]]] = {
     "startup": startup.startup,
 }
 MORE: dict[str, Callable[[Run], Iterator[Target]]] = {
+    "library": library.library,
+    "copying": library.copying,
     "live": watching.live,
     "replay": viewing.replay_cartpole,
 }
