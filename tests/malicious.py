@@ -15,7 +15,7 @@ import pytest
 
 from tupli_mcap import FileStorage, RecordEpisodes, Recording, rewrite_recording
 from tupli_mcap.environment import EnvironmentRecord, capture
-from tupli_mcap.recording import rewrite
+from tupli_mcap.recording import transfer
 from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery
 from tupli_mcap.storage.document import benchmark_hash, facts_about, pack, recording_attachments, unpack
 
@@ -166,12 +166,12 @@ def _write_texts(directory: Path) -> None:
                 return _START.decode(body)._replace(options=text, reset_info=text)
 
         with pytest.MonkeyPatch.context() as patch, Recording(directory / "spec_wrapper.mcap") as recording:
-            patch.setattr(rewrite, "EpisodeEnd", Ends)
-            patch.setattr(rewrite, "EpisodeStart", Starts)
+            patch.setattr(transfer, "EpisodeEnd", Ends)
+            patch.setattr(transfer, "EpisodeStart", Starts)
             rewrite_recording(recording, directory / f"text_{i}.mcap")
 
 
-_END, _START = rewrite.EpisodeEnd, rewrite.EpisodeStart
+_END, _START = transfer.EpisodeEnd, transfer.EpisodeStart
 
 
 def _write_spaces(directory: Path) -> None:

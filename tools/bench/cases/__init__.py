@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from tools.bench.cases import atari, catalog, columns, library, memory, reading, startup, vector, viewing, watching
+from tools.bench.cases import (
+    atari,
+    catalog,
+    columns,
+    library,
+    memory,
+    reading,
+    startup,
+    vector,
+    viewing,
+    watching,
+)
 from tools.bench.measure import Run
 from tools.bench.targets import Target
 

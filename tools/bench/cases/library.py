@@ -71,4 +71,6 @@ def copying(run: Run) -> Iterator[Target]:
 
     values = alternate({"copied": lambda: side(path), "anew": lambda: side(anew)}, max(run.rounds, 5))
     note = f"{steps:,} steps; {min(values['copied']):.2f} and {min(values['anew']):.2f} s"
-    yield at_most("copy chunks, over compressing anew", 1.0, ratio(values["copied"], values["anew"]), note, "x")
+    yield at_most(
+        "copy chunks, over compressing anew", 1.0, ratio(values["copied"], values["anew"]), note, "x"
+    )
