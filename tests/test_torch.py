@@ -118,6 +118,14 @@ def test_tensors_keep_the_dtypes_that_were_recorded(tmp_path: Path) -> None:
     assert batch["terminals"].dtype == torch.bool
 
 
+def test_items_one_by_one_from_a_worker(each_space: TupliDataset) -> None:
+    windows = each_space.windows(3)
+    loader = DataLoader(MapDataset(windows), batch_size=None, num_workers=1, collate_fn=collate)
+    for one, expected in zip(itertools.islice(loader, 5), windows, strict=False):
+        assert same(as_numpy(one)["states"], expected.states)
+        assert one["steps"].item() == expected.steps
+
+
 def test_episodes_are_filled_up_to_the_longest(tmp_path: Path) -> None:
     dataset = TupliDataset.from_files(record(tmp_path / "a.mcap", SPACES["text"], 24, length=10))
     episodes = Episodes(dataset.steps)
@@ -413,7 +421,7 @@ def test_a_state_dict_of_another_dataset_is_refused(dataset: TupliDataset, worke
         next(iter(other))
 
 
-def test_state_dicts_of_other_options_are_refused(dataset: TupliDataset) -> None:
+def test_state_dicts_of_other_options_are_refused(dataset: TupliDataset, tmp_path: Path) -> None:
     state = stream_of(dataset, 0).state_dict()
     windows = dataset.windows(2)
     with pytest.raises(SamplingError, match="expected a state dict with batch_size=8, found 32"):
@@ -422,9 +430,15 @@ def test_state_dicts_of_other_options_are_refused(dataset: TupliDataset) -> None
         StreamDataset(windows, 32, seed=0, rank=0, ranks=2, worker_cache_bytes=SMALL).load_state_dict(state)
     with pytest.raises(SamplingError, match="expected the state dict of such a dataset, with items"):
         stream_of(dataset, 0).load_state_dict({"step": 3})
+    columns = TupliDataset.from_files(sorted({header.recording for header in dataset.preview()}))
+    columns.materialize(tmp_path / "columns")
+    with pytest.raises(SamplingError, match="expected a state dict with (mix|chunks)="):
+        stream_of(columns, 0).load_state_dict(state)
+    with pytest.raises(SamplingError, match="expected workers, key and batches in a state dict"):
+        stream_of(dataset, 0).load_state_dict({name: part for name, part in state.items() if name != "key"})
     other = stream_of(dataset, 0)
     other.load_state_dict({**state, "workers": 2})
-    with pytest.raises(SamplingError, match="expected a state dict with workers=1, found 2"):
+    with pytest.raises(SamplingError, match="of a run with 1 workers.*, found 2"):
         next(iter(other))
 
 

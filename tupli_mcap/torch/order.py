@@ -8,8 +8,10 @@ workers reads blocks of its own.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +42,13 @@ class Blocks:
     def sizes(self) -> Array:
         """Items of each block."""
         return np.add.reduceat(self.stops - self.starts, self.firsts[:-1])
+
+    @cached_property
+    def digest(self) -> str:
+        """Of which items lie in which block."""
+        return hashlib.sha256(
+            b"".join(part.tobytes() for part in (self.starts, self.stops, self.firsts))
+        ).hexdigest()
 
     def items(self, block: int) -> Array:
         """The items of a block."""

@@ -67,7 +67,7 @@ def packed(columns: dict[str, Any]) -> PackedBatch:
             start = -(-ends[-1] // _ALIGNED) * _ALIGNED
             arrays.append(array)
             ends.append(start + array.nbytes)
-            return _Place(start, ends[-1], torch.from_numpy(array[..., :0]).dtype, array.shape)
+            return _Place(start, ends[-1], torch.from_numpy(np.empty(0, array.dtype)).dtype, array.shape)
         if isinstance(column, Mapping):
             return {key: place(part) for key, part in column.items()}
         return tuple(place(part) for part in column) if isinstance(column, tuple) else column

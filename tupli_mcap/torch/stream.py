@@ -96,7 +96,11 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         state, self._loaded = self._loaded, None
         done = 0
         if state is not None:
-            check_state(state, self._reader.items.identity, self._options(workers))
+            if state["workers"] != workers:
+                raise SamplingError(
+                    f"expected a state dict of a run with {workers} workers, 1 where there is none, "
+                    f"found {state['workers']!r:.80}"
+                )
             key, done = state["key"] or key, state["batches"]  # no key: saved before the first iteration
         self._state = self._state_of(key, done)
         return self._read(key, done, worker, workers)
@@ -142,19 +146,19 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         """The next iteration goes on from there, in the order of that epoch.
 
         Raises:
-            SamplingError: the state is of another dataset, or of other options; the iteration raises it where the
-                number of workers is another.
+            SamplingError: the state is of another dataset, of other options, or of recordings that have other chunks
+                now; the iteration raises it where the number of workers is another.
         """
-        info = get_worker_info()
-        workers = state_dict.get("workers") if isinstance(state_dict, dict) and info is None else None
-        check_state(
-            state_dict,
-            self._reader.items.identity,
-            self._options(info.num_workers if info is not None else workers),
-        )
+        check_state(state_dict, self._reader.items.identity, self._options())
+        if not {"workers", "key", "batches"} <= state_dict.keys():
+            raise SamplingError(
+                f"expected workers, key and batches in a state dict, found {[*state_dict]!r:.80}"
+            )
+        _least(state_dict["batches"], 0, "a state dict with a number of batches")
         self._loaded = self._state = dict(state_dict)
 
-    def _options(self, workers: Any) -> dict[str, Any]:
+    def _options(self) -> dict[str, Any]:
+        """What the order of an epoch depends on, besides the items, the workers and the key."""
         return {
             "batch_size": self._size,
             "shuffle": self._blocks is not None,
@@ -162,14 +166,14 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             "rank": self._rank,
             "ranks": self._ranks,
             "streams": self._streams,
-            "workers": workers,
             "mix": self._mix,
+            "chunks": None if self._blocks is None else self._blocks.digest,
         }
 
     def _state_of(self, key: list[int] | None, done: int) -> dict[str, Any]:
         info = get_worker_info()
-        workers = 1 if info is None else info.num_workers
-        return {"items": self._reader.items.identity, **self._options(workers), "key": key, "batches": done}
+        told = {"workers": 1 if info is None else info.num_workers, "key": key, "batches": done}
+        return {"items": self._reader.items.identity, **self._options(), **told}
 
 
 def _mixing(items: Items[Any], cache_bytes: int) -> tuple[int, Blocks]:
@@ -179,9 +183,7 @@ def _mixing(items: Items[Any], cache_bytes: int) -> tuple[int, Blocks]:
     chunks = max(4, cache_bytes // 2 // chunk_bytes)
     single = blocks_of(items, 1)
     items_of_chunk = len(items) / len(single)
-    steps = getattr(items, "length", 1) + getattr(
-        items, "history", 0
-    )  # of an item, if there are more than a few
+    steps = getattr(items, "length", 1) + getattr(items, "history", 0)  # of an item, where it has many
     least = int(min(2 * steps, chunks * items_of_chunk / 4))
     blocks = blocks_of(items, least) if least > items_of_chunk else single
     return max(2, chunks * len(blocks) // len(single)), blocks
