@@ -63,7 +63,7 @@ def image_codecs(layout: StepLayout, channels: Mapping[int, Channel]) -> dict[in
 
 
 def _codec(name: str, leaf: Leaf, layout: ImageLayout, topic: str) -> ImageCodec:
-    """A lossy codec would be made here, too."""
+    """The codec of a name; one of video would be named and made here."""
     if name == "stack" and leaf.kind == "stack":
         return StackCodec(leaf, layout)
     if name == "png" and leaf.kind == "image":
@@ -96,7 +96,6 @@ class StackCodec:
         self._height = leaf.shape[1]
         self._frame_bytes = leaf.size // self._frames
         self._start = layout.dtype.itemsize - leaf.size  # of the pixels in a record
-        self._fixed = layout.body
         self._height_at = BODY + layout.body.index(
             _HEIGHT_WIDTH.pack(self._frames * self._height, leaf.shape[2]), 8
         )
@@ -147,6 +146,8 @@ class StackCodec:
             )
         if len(data) == count * size:
             return data
+        if len(data) < count * (start + frame):  # before anything is allocated
+            raise FormatError(f"{where}: expected {count} stacks of frames, found {len(data)} bytes")
         out = bytearray(count * size)
         source, windows, at = memoryview(data), self._windows(out, count), 0
         for i in range(count):

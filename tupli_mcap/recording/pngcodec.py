@@ -39,7 +39,8 @@ class PngCodec:
         records = []
         for row in np.frombuffer(rows.data, self._dtype):
             time_ns = int(row["sec"]) * 10**9 + int(row["nanosec"])
-            body = encode_frame(self._leaf.name, EncodedFrame(time_ns, "png", encode_pixels(row["data"])))
+            png = encode_pixels(row["data"].reshape(self._leaf.shape))
+            body = encode_frame(self._leaf.name, EncodedFrame(time_ns, "png", png))
             times = int(row["#log_time"]), int(row["#publish_time"])
             head = RECORD_HEADER.pack(5, BODY - 9 + len(body), rows.channel, int(row["#sequence"]), *times)
             records.append(head + CDR_HEADER + body)
