@@ -8,7 +8,20 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
-__all__ = ["Rrd"]
+from tupli_mcap.recording import Episode
+
+__all__ = ["Rrd", "joined_rows", "states_of"]
+
+
+def joined_rows(lengths: np.ndarray) -> tuple[list[int], list[int]]:
+    """Rows of episodes on one timeline: of their steps, and of their final states, each after its last step."""
+    finals = np.cumsum(np.asarray(lengths, np.int64) + 1) - 1
+    return np.delete(np.arange(finals[-1] + 1), finals).tolist(), finals.tolist()
+
+
+def states_of(episode: Episode) -> np.ndarray:
+    """All that were seen: one for each step, and the final one."""
+    return np.concatenate([episode.states, [episode.final_state]])
 
 
 class Rrd:
@@ -35,7 +48,7 @@ class Rrd:
     def rows(self, entity: str, component: str, recording: int = 0) -> list[Any]:
         """Of a component or a timeline, in the order they were sent."""
         batches = [b for b in self._batches[recording][entity] if component in b.schema.names]
-        batches.sort(key=lambda batch: str(batch.column("rerun.controls.RowId")[0]))
+        batches.sort(key=lambda batch: batch.column("rerun.controls.RowId")[0].as_py())
         return [row for batch in batches for row in batch.column(component).to_pylist()]
 
     def scalars(self, entity: str, recording: int = 0) -> np.ndarray:

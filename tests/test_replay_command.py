@@ -97,7 +97,7 @@ def test_a_storage_with_a_filter(tmp_path: Path) -> None:
     storage.delete_episode(long[0].id)
     words = ["--filter", "n_tuples > 20", "--save", tmp_path / "out.rrd"]
     assert replay(tmp_path / "lab", *words) == 0
-    assert len(Rrd(tmp_path / "out.rrd").scalars("/state")) == sum(h.n_tuples for h in long[1:])
+    assert len(Rrd(tmp_path / "out.rrd").scalars("/state")) == sum(h.n_tuples + 1 for h in long[1:])
 
 
 def test_recordings_are_compared(folder: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from tupli_mcap import RecordEpisodes, Recording, viewer
 from tupli_mcap.recording import EpisodeData, write_recording
 
 pytest.importorskip("rerun")
-from rrd import Rrd
+from rrd import Rrd, joined_rows
 
 Box = spaces.Box
 
@@ -67,7 +67,7 @@ def test_dimensions_of_other_scales_are_other_entities(tmp_path: Path) -> None:
     found = replayed(tmp_path, Sampled(Box(-np.inf, np.inf, (5,), np.float64), lambda t: scales * (t + 1)))
     groups = {entity: found.scalars(entity) for entity in found.entities() if entity.startswith("/state")}
     assert set(groups) == {"/state/dims_0_2", "/state/dims_1", "/state/dims_3_4"}
-    steps = np.tile(np.arange(1.0, 11), 2)
+    steps = np.tile(np.arange(1.0, 12), 2)
     assert np.array_equal(groups["/state/dims_1"][:, 0], 500 * steps)
     assert np.array_equal(groups["/state/dims_0_2"], np.outer(steps, [1.0, 2.0]))
 
@@ -77,9 +77,9 @@ def test_more_than_twelve_dimensions_are_a_heat_map_an_episode(tmp_path: Path) -
         tmp_path, Sampled(Box(-1, 1, (13,), np.float64), lambda t: np.sin(t / 9 + np.arange(13)))
     )
     maps = found.rows("/state/heat_map", "Tensor:data")
-    assert found.rows("/state/heat_map", "step") == [0, 10]
-    assert [item[0]["shape"] for item in maps] == [[13, 10], [13, 10]]
-    values = np.array(maps[0][0]["buffer"]).reshape(13, 10)
+    assert found.rows("/state/heat_map", "step") == [0, 11]
+    assert [item[0]["shape"] for item in maps] == [[13, 11], [13, 11]]
+    values = np.array(maps[0][0]["buffer"]).reshape(13, 11)
     assert values.min() == 0.0 and values.max() == 1.0
     lines = {entity for entity in found.entities() if entity.startswith("/state/dims")}
     assert sum(found.scalars(entity).shape[1] for entity in lines) == 13
@@ -90,7 +90,7 @@ def test_ten_thousand_dimensions_are_pooled(tmp_path: Path) -> None:
     wide = np.arange(10_000, dtype=np.float32)
     found = replayed(tmp_path, Sampled(Box(-np.inf, np.inf, (10_000,)), lambda t: wide * t))
     assert {entity for entity in found.entities() if entity.startswith("/state")} == {"/state/heat_map"}
-    assert found.rows("/state/heat_map", "Tensor:data")[0][0]["shape"] == [512, 10]
+    assert found.rows("/state/heat_map", "Tensor:data")[0][0]["shape"] == [512, 11]
     assert "10,000 dimensions are in the heat map only" in card(found)
 
 
@@ -98,31 +98,40 @@ def test_images_and_grids(tmp_path: Path) -> None:
     space = spaces.Dict({"eye": Box(0, 255, (4, 6, 3), np.uint8), "map": Box(0, 1, (5, 4), np.float32)})
     found = replayed(tmp_path, Sampled(space))
     with Recording(tmp_path / "sampled.mcap") as recording:
-        states = recording.read(fields=["states"]).states
+        seen = {
+            key: np.concatenate(
+                [[*episode.states[key], episode.final_state[key]] for episode in recording.episodes]
+            )
+            for key in ("eye", "map")
+        }
     pictures = np.array(found.rows("/state/eye", "Image:buffer"), np.uint8)
-    assert np.array_equal(pictures.reshape(20, 4, 6, 3), states["eye"])
+    assert np.array_equal(pictures.reshape(22, 4, 6, 3), seen["eye"])
+    assert found.rows("/state/eye", "step") == found.rows("/state/map", "step") == list(range(22))
     (form,) = found.rows("/state/eye", "Image:format")
     assert (form[0]["width"], form[0]["height"]) == (6, 4)
     grids = np.array([item[0]["buffer"] for item in found.rows("/state/map", "Tensor:data")], np.float32)
-    assert np.array_equal(grids.reshape(20, 5, 4), states["map"])
+    assert np.array_equal(grids.reshape(22, 5, 4), seen["map"])
 
 
 def test_camera_frames_are_sent_as_they_are(tmp_path: Path) -> None:
     pytest.importorskip("PIL")
-    env = gym.make("CartPole-v1", render_mode="rgb_array")
+    env = gym.make("CartPole-v1", render_mode="rgb_array", max_episode_steps=8)
     path = tmp_path / "filmed.mcap"
     with RecordEpisodes(env, path, frames=3) as recorder:
-        recorder.reset(seed=1)
-        for _ in range(8):
-            recorder.step(0)
+        for seed in range(2):
+            recorder.reset(seed=seed)
+            for step in range(8):
+                recorder.step(step % 2)
     found = Rrd(viewer.save(path, tmp_path / "filmed.rrd"))
-    assert found.rows("/camera/render", "step") == [0, 3, 6]
+    assert found.rows("/camera/render", "step") == [0, 3, 6, 8, 9, 12, 15, 17]
     with Recording(path) as recording:
-        encoded = [recording.frames(0).encoded(i) for i in range(3)]
+        encoded = [recording.frames(at).encoded(i) for at in range(2) for i in range(4)]
     assert [bytes(row[0]) for row in found.rows("/camera/render", "EncodedImage:blob")] == [
         frame.data for frame in encoded
     ]
-    assert found.rows("/camera/render", "EncodedImage:media_type") == [[f"image/{encoded[0].form}"]] * 3
+    assert found.rows("/camera/render", "EncodedImage:media_type") == [[f"image/{encoded[0].form}"]] * 8
+    apart = Rrd(viewer.save(path, tmp_path / "apart.rrd", form="split"))
+    assert [apart.rows("/camera/render", "step", i) for i in range(2)] == [[0, 3, 6, 8]] * 2
 
 
 def test_texts_and_values_of_variable_size(tmp_path: Path) -> None:
@@ -131,10 +140,12 @@ def test_texts_and_values_of_variable_size(tmp_path: Path) -> None:
     )
     found = replayed(tmp_path, Sampled(space))
     with Recording(tmp_path / "sampled.mcap") as recording:
-        said = recording.read(fields=["states"]).states["says"]
+        episodes = recording.episodes
+        said = [text for one in episodes for text in (*one.states["says"], one.final_state["says"])]
+    assert found.rows("/state/says", "step") == [*range(22)] * 2  # the text, and the log of it
     assert [row[0] for row in found.rows("/state/says", "TextLog:text")] == said
     assert [row[0] for row in found.rows("/state/says", "TextDocument:text")] == said
-    assert len(found.rows("/state/list", "TextDocument:text")) == 20
+    assert len(found.rows("/state/list", "TextDocument:text")) == 22
     assert "none has no values" in card(found)
 
 
@@ -144,7 +155,7 @@ def test_names_that_are_no_entity_paths(tmp_path: Path) -> None:
     found = replayed(tmp_path, Sampled(space))
     entities = [entity for entity in found.entities() if entity.startswith("/state")]
     assert len(entities) == len(names)
-    assert all(found.scalars(entity).shape == (20, 2) for entity in entities)
+    assert all(found.scalars(entity).shape == (22, 2) for entity in entities)
     assert "\N{ESCAPE}" not in "".join(entities)
 
 
@@ -172,10 +183,8 @@ def test_what_is_not_finite_stays_in_its_step(tmp_path: Path) -> None:
     nan = np.nan
     assert np.array_equal(found.scalars("/return")[:, 0], [1, nan, nan, nan] * 2, equal_nan=True)
     # a marker at no height would not be seen
-    assert found.scalars("/end/terminal").tolist() == [[0], [0]] and found.rows("/end/terminal", "step") == [
-        3,
-        7,
-    ]
+    assert found.scalars("/end/terminal").tolist() == [[0], [0]]
+    assert found.rows("/end/terminal", "step") == [3, 8]
 
 
 def test_a_single_step_is_a_point_since_it_makes_no_line(tmp_path: Path) -> None:
@@ -199,7 +208,10 @@ def test_actions_are_lanes_or_steps(tmp_path: Path) -> None:
     with Recording(tmp_path / "sampled.mcap") as recording:
         actions = recording.read(fields=["actions"]).actions
     gears = [("back", "neutral", "forth")[gear + 1] for gear in actions["gear"]]
-    assert found.held("/action/gear", 20) == gears
+    steps, finals = joined_rows(np.array([10, 10]))
+    held = np.array(found.held("/action/gear", 22))
+    assert held[steps].tolist() == gears and held[finals].tolist() == ["", ""]
+    assert found.rows("/action/wheel", "step") == steps
     assert np.array_equal(found.scalars("/action/wheel"), actions["wheel"])
     assert found.rows("/action/wheel", "SeriesLines:interpolation_mode") == [[2]]  # held until the next
 
@@ -212,7 +224,7 @@ def test_infos_are_series_and_logs(tmp_path: Path) -> None:
     found = replayed(tmp_path, Sampled(Box(0, 1, (1,)), info=info), record_info=True)
     speeds = np.tile(np.arange(1, 11) / 2, 2)
     assert np.array_equal(found.scalars("/info/speed")[:, 0], speeds)
-    assert found.rows("/info/won", "step") == [1, 3, 5, 7, 9, 11, 13, 15, 17, 19]
+    assert found.rows("/info/won", "step") == [1, 3, 5, 7, 9, 12, 14, 16, 18, 20]
     assert found.rows("/info/said", "TextLog:text")[:2] == [["step 2"], ["step 4"]]
     assert "info 'array'" in card(found)
 
@@ -227,24 +239,68 @@ def test_time_in_the_environment_is_a_timeline_where_it_is_known(tmp_path: Path)
         labels = recording.labels
     assert labels.step_seconds is not None
     seconds = [at.total_seconds() for at in found.rows("/state", "episode_time")]
-    assert np.allclose(seconds, np.arange(100) * labels.step_seconds, atol=1e-6)
+    assert np.allclose(seconds, np.arange(101) * labels.step_seconds, atol=1e-6)
     assert found.rows("/state", "SeriesLines:names") == [list(labels.dimensions["state"])]
     unknown = replayed(tmp_path, Sampled(Box(0, 1, (1,))))
     assert unknown.rows("/state", "step") and unknown.rows("/state", "episode_time") == []
 
 
-def test_an_episode_longer_than_a_block_goes_on(tmp_path: Path) -> None:
-    n = 70_000
-    values = np.arange(n, dtype=np.float64)
-    ends = np.zeros(n, np.bool_)
-    episode = EpisodeData(values[:, None], np.zeros(n, np.int64), np.ones(n), ends, ends)
+def counted(path: Path, lengths: list[int], known: list[bool]) -> None:
+    """Episodes whose states are those of one count, each final one, known or not, included."""
+    episodes = []
+    first = 0.0
+    for length, has_final in zip(lengths, known, strict=True):
+        values = np.arange(first, first + length + 1)[:, None]
+        ends = np.zeros(length, np.bool_)
+        actions = np.arange(length) % 2
+        final = values[-1] if has_final else None
+        episodes.append(EpisodeData(values[:-1], actions, np.ones(length), ends, ends, final_state=final))
+        first += length + 1
     space = Box(-np.inf, np.inf, (1,), np.float64)
+    write_recording(path, episodes, observation_space=space, action_space=spaces.Discrete(2))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_episode_longer_than_a_block_goes_on(tmp_path: Path, known: bool) -> None:
+    n = 70_000
     path = tmp_path / "long.mcap"
-    write_recording(path, [episode], observation_space=space, action_space=spaces.Discrete(2))
+    counted(path, [3, n, 65_536, 2], [True, known, known, True])
     found = Rrd(viewer.save(path, tmp_path / "long.rrd"))
-    assert np.array_equal(found.scalars("/state")[:, 0], values)
-    assert np.array_equal(found.scalars("/return")[:, 0], values + 1)
-    assert found.rows("/state", "step") == list(range(n))
+    rows = list(range(3 + n + 65_536 + 2 + 4))
+    steps, finals = joined_rows(np.array([3, n, 65_536, 2]))
+    if not known:
+        for row in finals[1:3]:
+            rows.remove(row)
+    assert found.rows("/state", "step") == rows
+    assert np.array_equal(found.scalars("/state")[:, 0], rows)
+    assert found.rows("/return", "step") == found.rows("/action", "step") == steps
+    returns = np.concatenate([np.arange(1, length + 1) for length in (3, n, 65_536, 2)])
+    assert np.array_equal(found.scalars("/return")[:, 0], returns)
+
+
+def test_a_final_state_that_is_not_known_leaves_its_row_empty(tmp_path: Path) -> None:
+    path = tmp_path / "unknown.mcap"
+    counted(path, [2, 3, 2, 1], [False, True, False, False])
+    found = Rrd(viewer.save(path, tmp_path / "unknown.rrd"))
+    rows = [0, 1, 3, 4, 5, 6, 7, 8, 10]
+    assert found.rows("/state", "step") == rows
+    assert found.scalars("/state")[:, 0].tolist() == rows
+    assert found.held("/action", 12) == ["0", "1", "", "0", "1", "0", "", "0", "1", "", "0", ""]
+    apart = Rrd(viewer.save(path, tmp_path / "apart.rrd", form="split"))
+    assert [apart.rows("/state", "step", i) for i in range(4)] == [[0, 1], [0, 1, 2, 3], [0, 1], [0]]
+
+
+def test_a_lane_of_states_ends_where_the_final_one_is_not_known(tmp_path: Path) -> None:
+    path = tmp_path / "lanes.mcap"
+    none = np.zeros(2, np.bool_)
+    episodes = [
+        EpisodeData(np.array([0, 1]), np.array([1, 1]), np.ones(2), none, none, final_state=final)
+        for final in (2, None, 1)
+    ]
+    write_recording(path, episodes, observation_space=spaces.Discrete(3), action_space=spaces.Discrete(2))
+    found = Rrd(viewer.save(path, tmp_path / "lanes.rrd"))
+    assert found.held("/state", 9) == ["0", "1", "2", "0", "1", "", "0", "1", "1"]
+    assert found.held("/action", 9) == ["1", "1", ""] * 3
 
 
 def test_the_overview_is_of_all_episodes(tmp_path: Path) -> None:

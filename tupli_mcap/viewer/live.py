@@ -232,7 +232,7 @@ class LivePicture:
         return self._layout.nest_state([values if other is leaf else None for other in self._layout.state])
 
     def _times(self, rows: Array, times: Array) -> Times:
-        return Times(rows, times, None if self._seconds is None else rows * self._seconds)
+        return Times(rows, times, self._seconds)
 
     def _flags(self, steps: NewSteps) -> tuple[Array, Array]:
         if steps.rows is not None:

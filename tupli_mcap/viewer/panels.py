@@ -75,12 +75,17 @@ class Panel(Protocol):
     @property
     def title(self) -> str: ...
 
+    @property
+    def column(self) -> str:
+        """The field that it shows. Only those of "states" have a value after the last step of an episode."""
+        ...
+
     def declare(self, place: Place) -> None:
         """Sends what does not change."""
         ...
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        """Sends a block of steps."""
+        """Sends a block of steps; of "states", a block `with_finals`."""
         ...
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
@@ -124,6 +129,7 @@ class Rewards:
 
     leaves: Sequence[Leaf]
     title: str = "reward and return"
+    column: str = "rewards"
     _running: float = 0.0  # the return of an episode that goes on in the next block
 
     def declare(self, place: Place) -> None:

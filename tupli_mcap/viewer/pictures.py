@@ -130,11 +130,12 @@ def _pooled(values: Array) -> Array:
 
 @dataclass(frozen=True)
 class Camera:
-    """The frames of a camera, as they were encoded."""
+    """The frames of a camera, as they were encoded; they show states."""
 
     name: str
     entity: str
     title: str
+    column: str = "states"
 
     def declare(self, place: Place) -> None:
         """Nothing: frames say all themselves."""
@@ -147,7 +148,7 @@ class Camera:
             return
         for piece in block.pieces:
             frames = block.recording.frames(piece.position, self.name)
-            steps = frames.steps  # that after the last step belongs to no row
+            steps = frames.steps
             chosen = np.flatnonzero((steps >= piece.step) & (steps < piece.step + piece.end - piece.begin))
             for few in np.array_split(chosen, -(-len(chosen) // _FRAMES_AT_ONCE)) if len(chosen) else ():
                 encoded = [frames.encoded(int(i)) for i in few]

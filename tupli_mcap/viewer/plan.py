@@ -14,7 +14,7 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.about import plain, send_about
 from tupli_mcap.viewer.arrange import blueprint_of
-from tupli_mcap.viewer.blocks import Block, blocks_of
+from tupli_mcap.viewer.blocks import Block, blocks_of, row_counts
 from tupli_mcap.viewer.panels import PALETTE, Place
 from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk
@@ -45,9 +45,14 @@ class Part(NamedTuple):
     first: int = 0
 
     @property
-    def rows(self) -> int:
+    def steps(self) -> int:
         """How many steps its episodes have."""
         return int(self.chosen.recording.index["length"][list(self.chosen.positions)].sum())
+
+    @property
+    def rows(self) -> int:
+        """How many rows its episodes take: their steps and final states."""
+        return int(row_counts(*self.chosen).sum())
 
 
 class Plan(NamedTuple):
@@ -86,23 +91,30 @@ class Plan(NamedTuple):
         stream.send_recording_name(self.name)
         recordings = list({id(part.chosen.recording): part.chosen.recording for part in self.parts}.values())
         send_about(stream, recordings, self.shown, self.parts[0].scene.unseen)
-        rows: dict[str, int] = {}
+        steps: dict[str, int] = {}
         for part in self.parts:
-            rows[part.root] = rows.get(part.root, 0) + part.rows
+            steps[part.root] = steps.get(part.root, 0) + part.steps
         for part in self.parts:
-            place = Place(stream, part.root, part.title, part.color, single=rows[part.root] == 1)
+            place = Place(stream, part.root, part.title, part.color, single=steps[part.root] == 1)
             for panel in part.scene.panels:
                 panel.declare(place)
             for block in blocks_of(*part.chosen, part.first):
-                times = times_of(block)
-                for panel in part.scene.panels:
-                    panel.send(place, block, times)
+                _send_block(place, part.scene, block)
+
+
+def _send_block(place: Place, scene: Scene, block: Block) -> None:
+    states = block.with_finals()
+    times, state_times = times_of(block), times_of(states)
+    for panel in scene.panels:
+        if panel.column == "states":
+            panel.send(place, states, state_times)
+        else:
+            panel.send(place, block, times)
 
 
 def times_of(block: Block) -> Times:
     """Where a block's rows lie on the timelines."""
-    seconds = block.recording.labels.step_seconds
-    return Times(block.number, block.times, None if seconds is None else block.number * seconds)
+    return Times(block.number, block.times, block.recording.labels.step_seconds)
 
 
 def name_of(recording: Recording) -> str:
@@ -144,7 +156,7 @@ def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
     several = sum(len(item.positions) for item in chosen) > 1
     for item in chosen:
         scene = scene_of(item.recording, item.positions)
-        scene.rows = int(item.recording.index["length"][list(item.positions)].max())
+        scene.rows = int(row_counts(*item).max())
         for position in item.positions:
             number = item.recording.episodes[position].number
             name = f"episode {number} · {Path(item.recording.name).stem}"  # a list has room for its beginning
@@ -165,7 +177,7 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
     if total == 1:
         told = _episode_told(chosen[0].recording, chosen[0].positions[0])
     else:
-        told = f"{total:,} episodes, {first:,} steps, on one timeline"
+        told = f"{total:,} episodes, {sum(part.steps for part in parts):,} steps, on one timeline"
     scene.rows = first
     return Plan(name, chosen[0].recording.uuid, parts, told)
 
@@ -209,7 +221,7 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
                     Chosen(item.recording, [position]), scene, root, title, PALETTE[len(parts) % len(PALETTE)]
                 )
             )
-    scene.rows = max(int(item.recording.index["length"][list(item.positions)].max()) for item in chosen)
+    scene.rows = max(int(row_counts(*item).max()) for item in chosen)
     lines = [f"\n- {plain(part.title)}: {_episode_told(*_only(part))}" for part in parts]
     return Plan("comparison", first.uuid, parts, f"**Compared**\n{''.join(lines)}")
 

@@ -19,13 +19,14 @@ class Times:
     Args:
         step: number of the step.
         wall: wall clock (ns).
-        seconds: time in the environment (s); None if it is not known, then there is no such timeline.
+        step_seconds: time that a step takes in the environment (s); None if it is not known, then there is no such
+            timeline.
     """
 
-    def __init__(self, step: Array, wall: Array, seconds: Array | None) -> None:
+    def __init__(self, step: Array, wall: Array, step_seconds: float | None) -> None:
         self._step = step
         self._wall = wall
-        self._seconds = seconds
+        self._step_seconds = step_seconds
 
     @cached_property
     def columns(self) -> list[Any]:
@@ -36,14 +37,18 @@ class Times:
             rr.TimeColumn("step", sequence=self._step),
             rr.TimeColumn("time", timestamp=self._wall.astype("datetime64[ns]")),
         ]
-        if self._seconds is not None:
-            columns.insert(1, rr.TimeColumn("episode_time", duration=self._seconds))
+        if self._step_seconds is not None:
+            columns.insert(1, rr.TimeColumn("episode_time", duration=self._step * self._step_seconds))
         return columns
 
     def at(self, rows: Array) -> Times:
         """Of some of the rows."""
+        return Times(self._step[rows], self._wall[rows], self._step_seconds)
+
+    def inserted(self, before: Array, step: Array, wall: Array) -> Times:
+        """With other rows, each before one of these."""
         return Times(
-            self._step[rows], self._wall[rows], None if self._seconds is None else self._seconds[rows]
+            np.insert(self._step, before, step), np.insert(self._wall, before, wall), self._step_seconds
         )
 
 

@@ -18,6 +18,7 @@ from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
 __all__ = ["Infos", "Lanes", "Words", "infos_of"]
 
 _LONGEST = 2000  # characters of a text that is shown
+_NO_STATE = ""  # as the viewer reads it: a gap in the lane
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,14 @@ class Lanes:
         rows = np.flatnonzero(changed)
         which = values[rows] - int(self.leaf.space.start)  # type: ignore[attr-defined]
         known = (which >= 0) & (which < len(self.labels))
-        texts = pa.array([*self.labels, None], pa.utf8()).take(
-            pa.array(np.where(known, which, len(self.labels)))
-        )
-        send_texts(
-            place.stream, place.root + self.entity, times.at(rows), rr.StateChange.descriptor_state(), texts
-        )
+        which = np.where(known, which, len(self.labels))
+        at = times.at(rows)
+        if block.finals is not None:  # which have no value here: the lane ends
+            before = np.searchsorted(rows, block.finals.before)
+            which = np.insert(which, before, len(self.labels) + 1)
+            at = at.inserted(before, block.finals.number, block.finals.times)
+        texts = pa.array([*self.labels, None, _NO_STATE], pa.utf8()).take(pa.array(which))
+        send_texts(place.stream, place.root + self.entity, at, rr.StateChange.descriptor_state(), texts)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         import rerun.blueprint as rrb
@@ -113,6 +116,7 @@ class Infos:
     numbers: Mapping[str, str]  # key -> entity
     texts: Mapping[str, str]
     title: str = "infos"
+    column: str = "infos"
 
     def declare(self, place: Place) -> None:
         for i, (key, entity) in enumerate(self.numbers.items()):

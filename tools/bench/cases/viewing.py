@@ -15,6 +15,8 @@ from tools.bench.workloads import WORKLOADS, reference
 
 INSTALL_RERUN = "rerun-sdk is not installed"
 _ROWS = 65_536
+_TIMES = ("step", "time", "episode_time")
+_Columns = dict[str, dict[str, Any]]  # entity -> timelines and "values"
 
 
 def replay_cartpole(run: Run) -> Iterator[Target]:
@@ -47,63 +49,68 @@ def replay_cartpole(run: Run) -> Iterator[Target]:
     yield at_most(what, 1.5, ratio(values["ours"], values["bare"]), note, "x")
 
 
-def _columns(path: Path) -> dict[str, Any]:
-    """What a replay shows, by entity, and the timelines: made before the clock runs."""
+def _columns(path: Path) -> _Columns:
+    """What a replay shows, by entity, with its places on the timelines: made before the clock runs."""
     from tupli_mcap import Recording
 
     with Recording(path) as recording:
         read = recording.read(fields=["states", "actions", "rewards", "times"])
+        finals = recording.final_states(np.arange(len(recording)))
         seconds = recording.labels.step_seconds
         lengths = read.episode_lengths
     ends = np.cumsum(lengths)
     sums = np.cumsum(read.rewards)
     before = np.repeat(np.concatenate([[0.0], sums[ends[:-1] - 1]]), lengths)
-    step = np.arange(len(read))
+    wall = np.insert(read.times, ends, read.times[ends - 1] + 1).astype("datetime64[ns]")
+    step = np.arange(len(wall))
+    of_steps = np.delete(step, ends + np.arange(len(ends)))  # a row each is left for the final states
+
+    def placed(values: Any, rows: Any) -> dict[str, Any]:
+        times = [step[rows], wall[rows], None if seconds is None else step[rows] * seconds]
+        return {**dict(zip(_TIMES, times, strict=True)), "values": values}
+
     return {
-        "step": step,
-        "time": read.times.astype("datetime64[ns]"),
-        "episode_time": None if seconds is None else step * seconds,
-        "/state": read.states.astype(np.float64),
-        "/action": read.actions.astype(np.float64)[:, None],
-        "/reward": read.rewards[:, None],
-        "/return": (sums - before)[:, None],
+        "/state": placed(np.insert(read.states, ends, finals, axis=0).astype(np.float64), step),
+        "/action": placed(read.actions.astype(np.float64)[:, None], of_steps),
+        "/reward": placed(read.rewards[:, None], of_steps),
+        "/return": placed((sums - before)[:, None], of_steps),
     }
 
 
-def _send(rr: Any, columns: dict[str, Any], goal: Path) -> None:
+def _send(rr: Any, columns: _Columns, goal: Path) -> None:
     stream = rr.RecordingStream("bare")
     stream.save(goal)
-    total = len(columns["step"])
-    for first in range(0, total, _ROWS):
-        rows = slice(first, min(first + _ROWS, total))
-        times = [
-            rr.TimeColumn("step", sequence=columns["step"][rows]),
-            rr.TimeColumn("time", timestamp=columns["time"][rows]),
-        ]
-        if columns["episode_time"] is not None:
-            times.append(rr.TimeColumn("episode_time", duration=columns["episode_time"][rows]))
-        for entity in ("/state", "/action", "/reward", "/return"):
-            values = columns[entity][rows]
+    for entity, column in columns.items():
+        for first in range(0, len(column["values"]), _ROWS):
+            rows = slice(first, first + _ROWS)
+            times = [
+                rr.TimeColumn("step", sequence=column["step"][rows]),
+                rr.TimeColumn("time", timestamp=column["time"][rows]),
+            ]
+            if column["episode_time"] is not None:
+                times.append(rr.TimeColumn("episode_time", duration=column["episode_time"][rows]))
+            values = column["values"][rows]
             scalars = rr.Scalars.columns(scalars=values.reshape(-1))
             stream.send_columns(entity, times, scalars.partition([values.shape[1]] * len(values)))
     stream.flush()
     stream.disconnect()
 
 
-def _checked(side: str, goal: Path, columns: dict[str, Any], seconds: float) -> float:
-    """`seconds`, if all values are in the file."""
+def _checked(side: str, goal: Path, columns: _Columns, seconds: float) -> float:
+    """`seconds`, if all values are in the file, on their steps."""
     from rerun.chunk import RrdReader
 
-    found: dict[str, list[tuple[int, Any]]] = {}
+    found: dict[str, list[tuple[Any, Any]]] = {}
     for chunk in RrdReader(str(goal)).stream():
         batch = chunk.to_record_batch()
         if "Scalars:scalars" in batch.schema.names and "step" in batch.schema.names:
             values = batch.column("Scalars:scalars").flatten().to_numpy(zero_copy_only=False)
-            found.setdefault(chunk.entity_path, []).append((batch.column("step")[0].as_py(), values))
-    for entity in ("/state", "/action", "/reward", "/return"):
-        parts = [values for _, values in sorted(found.get(entity, []), key=lambda part: part[0])]
+            found.setdefault(chunk.entity_path, []).append((batch.column("step").to_numpy(), values))
+    for entity, column in columns.items():
+        parts = sorted(found.get(entity, []), key=lambda part: int(part[0][0]))
         check(bool(parts), f"{side}: nothing at {entity}")
-        same = np.array_equal(np.concatenate(parts), columns[entity].reshape(-1))
-        check(same, f"{side}: other values at {entity}")
+        steps, values = (np.concatenate(kind) for kind in zip(*parts, strict=True))
+        check(np.array_equal(values, column["values"].reshape(-1)), f"{side}: other values at {entity}")
+        check(np.array_equal(steps, column["step"]), f"{side}: other steps at {entity}")
     goal.unlink()
     return seconds
