@@ -191,7 +191,13 @@ class HeadlessViewer:
 def _of_the_machine(message: str) -> bool:
     """Whether a message is about this machine's graphics, or about a picture that could not be taken."""
     return any(
-        word in message.lower() for word in ("software rasterizer", "adapter", "not found for screenshot")
+        word in message.lower()
+        for word in (
+            "software rasterizer",
+            "adapter",
+            "not found for screenshot",
+            "failed to render screenshot",
+        )
     )
 
 
