@@ -134,4 +134,4 @@ def speed_of_window(seconds: float, budget: float) -> int:
     """How many windows fit into `budget` seconds."""
     if not seconds:
         raise CannotError("no windows")
-    return int(min(20_000, max(BATCH, budget / seconds)))
+    return int(min(20_000, max(32, budget / seconds)))

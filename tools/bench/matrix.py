@@ -36,6 +36,7 @@ OPERATIONS = {
     "filter": Operation("filter", "µs/episode"),
     "append": Operation("append", "ms"),
 }
+SLOW = 8.0  # seconds; who takes longer is asked once
 STEPS = {"cartpole": 100_000, "floats": 100_000, "images": 1000, "dict": 10_000}
 APPENDED = {"cartpole": 45, "floats": 1, "images": 1, "dict": 10}  # episodes, about 1,000 steps (images: 200)
 
@@ -116,7 +117,7 @@ class Workbench:
     ) -> None:
         """Fills one column: a round that does not count, then as many as there are or as time permits."""
         began = time.perf_counter()
-        sides = list(built)
+        sides, slow = list(built), set[str]()
         if operation.startswith("epoch") and self.loading:
             sides = [name for name in sides if name in self.loading]
         for name in sides:
@@ -128,8 +129,9 @@ class Workbench:
                 break
             for name in sides if number % 2 else sides[::-1]:
                 cell = cells[name]
-                if cell.cannot or cell.failed:
+                if cell.cannot or cell.failed or name in slow:
                     continue
+                asked = time.perf_counter()
                 try:
                     value = self._ask(name, operation, work, paths[name], steps)
                 except NoAnswerError as err:
@@ -138,9 +140,11 @@ class Workbench:
                         self.fail(f"{work}: {operation}: {name} failed: {err}")
                         self._again(name, work, paths[name], built)
                     continue
-                if number:
+                if time.perf_counter() - asked > SLOW and number < self.rounds:
+                    slow.add(name)  # this figure is all there will be
+                if number or name in slow:
                     cell.values.append(value)
-                if operation == "record" and number:
+                if operation == "record" and (number or name in slow):
                     finishing = self.processes[name].ask("finishing")
                     if finishing:
                         built[name].setdefault("rollout", []).append(value - finishing)

@@ -21,6 +21,7 @@ def _peak(run: Run, code: str, *arguments: Any) -> float:
 
 _RECORD = """
 import sys, json, resource
+from pathlib import Path
 from tools.bench.contenders.ours import Ours
 from tools.bench.workloads import WORKLOADS
 path, steps = Path(sys.argv[1]), int(sys.argv[2])
