@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import json
 import pickle
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from torchdata.stateful_dataloader import StatefulDataLoader  # noqa: E402
 
 from tupli_mcap.torch import Episodes, MapDataset, StreamDataset, collate  # noqa: E402
 from tupli_mcap.torch.order import Batches, Blocks, Part  # noqa: E402
+from tupli_mcap.torch.packed import packed  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:'set_vital' is deprecated:UserWarning")  # torchdata's
 GUIDE = Path(__file__).parents[1] / "docs" / "pytorch.md"
@@ -196,6 +199,19 @@ def test_a_batch_comes_from_a_worker_in_one_piece(each_space: TupliDataset) -> N
         assert type(batch) is dict
         assert same(as_numpy(batch), windows[i * 7 : i * 7 + 7].asdict())
         assert batch["rewards"].untyped_storage().data_ptr() == batch["mask"].untyped_storage().data_ptr()
+
+
+def test_packing_lets_go_of_the_arrays() -> None:
+    array = np.zeros(10)
+    there = weakref.ref(array)
+    gc.disable()
+    try:
+        batch = packed({"a": array, "b": {"c": (array, ["text"])}})
+        del array
+        assert there() is None
+    finally:
+        gc.enable()
+    assert batch["b"]["c"][1] == ["text"]
 
 
 def doubled(samples: Any) -> Any:

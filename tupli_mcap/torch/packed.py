@@ -60,25 +60,26 @@ def packed(columns: dict[str, Any]) -> PackedBatch:
     """Columns of arrays, copied into shared memory."""
     arrays: list[np.ndarray[Any, Any]] = []
     ends = [0]
-
-    def place(column: Any) -> Any:
-        if isinstance(column, _NUMBERS):
-            array = np.asarray(column)
-            start = -(-ends[-1] // _ALIGNED) * _ALIGNED
-            arrays.append(array)
-            ends.append(start + array.nbytes)
-            return _Place(start, ends[-1], torch.from_numpy(np.empty(0, array.dtype)).dtype, array.shape)
-        if isinstance(column, Mapping):
-            return {key: place(part) for key, part in column.items()}
-        return tuple(place(part) for part in column) if isinstance(column, tuple) else column
-
-    places = place(columns)
+    places = _placed(columns, arrays, ends)
     storage = torch.UntypedStorage._new_shared(max(1, ends[-1]))  # type: ignore[no-untyped-call]  # as default_collate
     buffer = torch.empty(0, dtype=torch.uint8).set_(storage)
     target = buffer.numpy()
     for array, end in zip(arrays, ends[1:], strict=True):
         target[end - array.nbytes : end] = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
     return PackedBatch(buffer, places)
+
+
+def _placed(column: Any, arrays: list[np.ndarray[Any, Any]], ends: list[int]) -> Any:
+    """Where each array will lie. (No inner function: one that calls itself would keep the arrays alive for long.)"""
+    if isinstance(column, _NUMBERS):
+        array = np.asarray(column)
+        start = -(-ends[-1] // _ALIGNED) * _ALIGNED
+        arrays.append(array)
+        ends.append(start + array.nbytes)
+        return _Place(start, ends[-1], torch.from_numpy(np.empty(0, array.dtype)).dtype, array.shape)
+    if isinstance(column, Mapping):
+        return {key: _placed(part, arrays, ends) for key, part in column.items()}
+    return tuple(_placed(part, arrays, ends) for part in column) if isinstance(column, tuple) else column
 
 
 def _unpacked(buffer: torch.Tensor, place: Any) -> Any:
