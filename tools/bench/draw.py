@@ -109,6 +109,8 @@ def _values(found: dict[str, Any], operation: str, name: str) -> list[float]:
 
 def _growth(plt: Any, growth: dict[str, Any]) -> Any:
     """Seconds by number of steps, both logarithmic."""
+    from matplotlib.ticker import NullFormatter
+
     made, axes = plt.subplots(2, 2, figsize=(10.5, 6.2), sharex=True)
     for axis, (key, title) in zip(axes.flat, GROWTH.items(), strict=True):
         for number, (name, points) in enumerate(growth.items()):
@@ -126,6 +128,7 @@ def _growth(plt: Any, growth: dict[str, Any]) -> Any:
                 )
         axis.set_xscale("log")
         axis.set_yscale("log")
+        axis.yaxis.set_minor_formatter(NullFormatter())
         axis.set_title(f"{title} (seconds)", fontsize=9, loc="left")
         axis.grid(color=FAINT, linewidth=0.6)
         axis.tick_params(which="both", length=0)

@@ -65,11 +65,14 @@ class Workbench:
     rounds: int = 5
     build_seconds: float = 4.0
     record_seconds: float = 1.0
+    workload_seconds: float = 190.0  # operations that begin later have one round
+    growth_seconds: float = 200.0  # no further size begins after this
     operation_seconds: float = 10.0  # no further round of an operation begins after this
     loading: tuple[str, ...] = ()  # contenders whose epochs are measured; all if empty
 
     def measure(self, work: str) -> dict[str, Any]:
         """One workload: {"built": {contender: facts}, "cells": {operation: {contender: cell}}}."""
+        started = time.perf_counter()
         built: dict[str, Any] = {}
         cells: dict[str, dict[str, Cell]] = {name: {} for name in OPERATIONS}
         paths = {name: self.run.fresh(f"{work}-{number}") for number, name in enumerate(self.processes)}
@@ -89,10 +92,12 @@ class Workbench:
                     cells[operation][name] = Cell(**{err.why: str(err)})
                 if err.why == "failed":
                     self.fail(f"{work}: {name} failed: {err}")
+        self.say(f"{work}: building took {time.perf_counter() - started:.0f} s")
         for operation in OPERATIONS:
             if operation != "size":
                 began = time.perf_counter()
-                self._operation(operation, work, paths, steps, cells[operation], built)
+                rounds = self.rounds if began - started < self.workload_seconds else 1
+                self._operation(operation, work, paths, steps, cells[operation], built, rounds)
                 self.say(f"{work}: {operation} took {time.perf_counter() - began:.0f} s")
         for name, path in paths.items():
             if name in built:
@@ -114,6 +119,7 @@ class Workbench:
         steps: int,
         cells: dict[str, Cell],
         built: Any,
+        rounds: int,
     ) -> None:
         """Fills one column: a round that does not count, then as many as there are or as time permits."""
         began = time.perf_counter()
@@ -122,7 +128,7 @@ class Workbench:
             sides = [name for name in sides if name in self.loading]
         for name in sides:
             cells[name] = Cell()
-        for number in range(self.rounds + 1):
+        for number in range(rounds + 1):
             if number == 1:
                 began = time.perf_counter()
             if number > 2 and time.perf_counter() - began > self.operation_seconds:
@@ -140,7 +146,7 @@ class Workbench:
                         self.fail(f"{work}: {operation}: {name} failed: {err}")
                         self._again(name, work, paths[name], built)
                     continue
-                if time.perf_counter() - asked > SLOW and number < self.rounds:
+                if time.perf_counter() - asked > SLOW and number < rounds:
                     slow.add(name)  # this figure is all there will be
                 if number or name in slow:
                     cell.values.append(value)
@@ -179,6 +185,7 @@ def grow(
 ) -> dict[str, list[dict[str, float]]]:
     """Cost by number of steps; a contender grows no further when ten times the work would take too long."""
     found: dict[str, list[dict[str, float]]] = {}
+    started = time.perf_counter()
     for name in names:
         process = bench.processes.get(name)
         if process is None:
@@ -196,7 +203,7 @@ def grow(
                 break
             took = time.perf_counter() - began
             bench.say(f"growth: {name}, {steps:,} steps took {took:.1f} s")
-            if took * 10 > seconds:
+            if took * 10 > seconds or time.perf_counter() - started > bench.growth_seconds:
                 break
         process.stop()  # and its memory with it: the next size is judged alone
     return found
