@@ -10,7 +10,6 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -278,21 +277,15 @@ class TestDeclaredKeys:
             assert "ix_key_0" in catalog.explain(wanted)
             assert catalog.count(wanted) == 1
 
-    def test_few_among_many_come_back_at_once(self, catalog: Catalog) -> None:
+    def test_few_among_many_come_by_the_index(self, catalog: Catalog) -> None:
         chance = random.Random(1)
         rows = [row(n, {"score": chance.random(), "n": n, "name": f"run-{n % 7}"}) for n in range(20_000)]
         catalog.declare_key("metadata.score")
         put(catalog, rows=rows)
         wanted = (F("metadata.score") > 0.5) & (F("metadata.score") < 0.55)
         expected = sum(0.5 < json.loads(r.metadata)["score"] < 0.55 for r in rows)
-        took = math.inf
-        for _ in range(5):
-            start = time.perf_counter()
-            found = catalog.episodes(wanted)
-            took = min(took, time.perf_counter() - start)
-        assert len(found) == expected
+        assert len(catalog.episodes(wanted)) == expected
         assert "(key_0_kind=? AND key_0_value>? AND key_0_value<?)" in catalog.explain(wanted)
-        assert took < 0.1  # 10 ms on an idle machine
 
 
 class TestLargeFilters:
@@ -351,6 +344,15 @@ class TestFile:
             put(catalog, rows=[row(0)])
         with Catalog(path) as catalog:
             assert catalog.count() == 1
+
+    def test_a_new_file_is_told_from_the_old_one(self, catalog: Catalog) -> None:
+        found = set()
+        for _ in range(20):  # a file system may give a new file the number of one that nobody has open
+            assert catalog.recordings() == {}
+            found.add(catalog.identity)
+            catalog.path.unlink()
+            assert not catalog.is_current()
+        assert len(found) == 20
 
     def test_damage_inside_is_said_and_reset_repairs(self, tmp_path: Path) -> None:
         path = tmp_path / "catalog.sqlite"

@@ -91,7 +91,7 @@ class Catalog:
         return self._temporary is not None
 
     @property
-    def identity(self) -> tuple[int, int] | None:
+    def identity(self) -> int:
         """Tells the file of the last transaction from others that were at its path."""
         return self._database.identity
 

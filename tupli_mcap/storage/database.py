@@ -61,6 +61,7 @@ class Database:
         self._process = os.getpid()
         self._inherited: list[Pool] = []  # a parent's connections, which a child must not even close
         self._identity: tuple[int, int] | None = None
+        self._opened = 0  # how many files have been
         self._closed = False
 
     def open(self) -> None:
@@ -103,25 +104,25 @@ class Database:
                     with connection.begin():
                         yield connection
             except DBAPIError as err:
-                if _identity(self.path) != opened:
+                if opened is None or _identity(self.path) != opened:
                     raise CatalogMovedError(f"catalog {str(self.path)!r} was replaced meanwhile") from err
                 raise
 
     @property
-    def identity(self) -> tuple[int, int] | None:
+    def identity(self) -> int:
         """Tells the file of the last transaction from others that were at its path."""
-        return self._identity
+        return self._opened  # not its number, which a new file may be given when nobody has the old one open
 
     def is_current(self) -> bool:
         """Whether the file of the last transaction still is the one at its path."""
-        return self._identity == _identity(self.path)
+        return self._identity is not None and self._identity == _identity(self.path)
 
     def _refresh(self) -> None:
         if self._closed:
             raise StorageError(f"catalog {str(self.path)!r} is closed")
         self._leave_parent()
         with self._lock, _usable(self.path):
-            if _identity(self.path) != self._identity:
+            if self._identity is None or _identity(self.path) != self._identity:
                 self._engine.dispose()
                 self._open()
 
@@ -132,6 +133,7 @@ class Database:
             self._lock = threading.Lock()  # held by a thread that is not here, perhaps
             self._inherited.append(self._engine.pool)
             self._engine.dispose(close=False)
+            self._identity = None  # nothing keeps the file's number from being given again
 
     def _open(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -148,6 +150,7 @@ class Database:
                     raise
             if found is not None and found == _identity(self.path):
                 self._identity = found
+                self._opened += 1
                 return
             self._engine.dispose()  # it was replaced or deleted meanwhile
         raise CatalogMovedError(f"catalog {str(self.path)!r} is replaced all the time")
@@ -182,7 +185,7 @@ class Database:
             with contextlib.suppress(OSError):
                 _remove(new)
             raise
-        self._identity = _identity(self.path)
+        self._identity = None  # until it is open
 
 
 def _engine(path: Path, *, new: bool = False, lock: Path | None = None) -> Engine:

@@ -54,7 +54,7 @@ class RecordingFiles:
         self._lock = lock
         self._declared_keys = list(declared_keys)
         self._opened: Catalog | None = None
-        self._synced: tuple[int, int] | None = None  # the catalog that has been brought up to date
+        self._synced = -1  # the catalog that has been brought up to date
         self._undeclared = True  # its keys are still to be declared
         self._warned: set[tuple[str, RecordingStamp]] = set()
 
