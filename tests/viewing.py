@@ -103,9 +103,19 @@ class HeadlessViewer:
         else:
             raise TimeoutError(f"the viewer is still loading: {state.loading or 'no recording appeared'}")
         if any(recording.timelines for recording in state.recordings):
-            self.client.set_time(play_state="paused")  # else every picture waits for the next ones
+            self._pause()
         self.screenshot()  # reports are those of the last time a view was drawn
         return self.client.get_state()
+
+    def _pause(self) -> None:
+        """Stops the time, else every picture waits for the next ones."""
+        for _ in patiently(20.0):
+            try:
+                return self.client.set_time(play_state="paused")
+            except ConnectionError as err:  # the recording in front is not the one that has some
+                if "no timelines" not in str(err):
+                    raise
+        raise TimeoutError("the recording in front has no timelines")
 
     def seek(self, timeline: str, step: int) -> None:
         """Stop at a step of a sequence timeline."""
