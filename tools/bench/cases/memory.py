@@ -19,21 +19,22 @@ def _peak(run: Run, code: str, *arguments: Any) -> float:
     return float(json.loads(_ran(run, code, *arguments).splitlines()[-1])["peak"])
 
 
+# VmHWM, not ru_maxrss: that one keeps what the process was before it became another program.
 _RECORD = """
-import sys, json, resource
+import sys, json
 from pathlib import Path
 from tools.bench.contenders.ours import Ours
 from tools.bench.workloads import WORKLOADS
 path, steps = Path(sys.argv[1]), int(sys.argv[2])
 Ours().record(WORKLOADS["long"], path, steps // 1000)
-print(json.dumps({"peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
+print(json.dumps({"peak": int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) / 1024}))
 """
 _READ = """
-import sys, json, resource
+import sys, json
 from tupli_mcap import Recording
 with Recording(sys.argv[1], cache_bytes=32 << 20) as recording:
     total = sum(float(episode.rewards.sum()) + len(episode.states) for episode in recording.episodes)
-print(json.dumps({"peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
+print(json.dumps({"peak": int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) / 1024}))
 """
 
 
