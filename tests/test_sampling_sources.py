@@ -382,3 +382,16 @@ def test_a_url_that_every_process_opens_for_itself(tmp_path: Path) -> None:
         expected = _digest(windows)
         with multiprocessing.get_context("fork").Pool(1) as pool:
             assert pool.map(_digest, [windows]) == [expected]
+
+
+def test_a_copy_of_loaded_windows_reads_the_recordings(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        roll(env, 100)
+    dataset = TupliDataset.from_files(path)
+    dataset.load()
+    windows = dataset.windows(4)
+    copied = pickle.loads(pickle.dumps(windows))
+    assert copied.identity == windows.identity
+    assert np.array_equal(copied[:].states, windows[:].states)
+    assert isinstance(copied.source, RecordedSteps)

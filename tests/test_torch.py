@@ -241,7 +241,8 @@ def test_a_worker_keeps_to_its_own_budget(tmp_path: Path, loaded: bool) -> None:
         recorded: Any = steps._rest if loaded else steps
         return int(recorded.cache_bytes)
 
-    in_worker = list(DataLoader(stream, None, num_workers=1, collate_fn=told))
+    forked = DataLoader(stream, None, num_workers=1, collate_fn=told, multiprocessing_context="fork")
+    in_worker = list(forked)
     assert set(in_worker) == {SMALL}
     assert told(None) > SMALL
 

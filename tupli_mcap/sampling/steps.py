@@ -76,7 +76,10 @@ class Steps(Protocol):
 
 
 class MemorySteps:
-    """Steps whose columns are in memory, at least some of them; the other fields are read from `rest`."""
+    """Steps whose columns are in memory, at least some of them; the other fields are read from `rest`.
+
+    A pickled copy, such as that in a worker which is spawned, is one of `rest`: memory is not sent to others.
+    """
 
     def __init__(self, columns: Mapping[str, Any], rest: Steps) -> None:
         self._columns = dict(columns)
@@ -112,6 +115,13 @@ class MemorySteps:
         """Keeps to another budget for what is not in memory."""
         if hasattr(self._rest, "limit"):
             self._rest.limit(cache_bytes, threads)
+
+    def __reduce__(self) -> tuple[Callable[[Steps], Steps], tuple[Steps]]:
+        return _same, (self._rest,)
+
+
+def _same(steps: Steps) -> Steps:
+    return steps
 
 
 def checked_fields(fields: Sequence[str], known: Sequence[str] = FIELDS) -> list[str]:
