@@ -336,7 +336,12 @@ def stream_of(dataset: TupliDataset, seed: int | None) -> StreamDataset:
 
 
 def resumable(stream: StreamDataset, workers: int) -> Any:
-    return StatefulDataLoader(stream, batch_size=None, num_workers=workers, collate_fn=collate)
+    context = (
+        "fork" if workers else None
+    )  # TorchRL, once it is imported, makes spawn the default, which takes long
+    return StatefulDataLoader(
+        stream, batch_size=None, num_workers=workers, collate_fn=collate, multiprocessing_context=context
+    )
 
 
 @pytest.mark.parametrize("workers", [0, 2])
