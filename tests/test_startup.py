@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
+import gymnasium as gym
 import pytest
+
+from tupli_mcap import RecordEpisodes
 
 # Extras, and what of the standard library or of the dependencies takes long.
 EXTRAS = (
@@ -49,6 +53,27 @@ def run(*arguments: str) -> str:
 )
 def test_left_out(code: str, left_out: tuple[str, ...]) -> None:
     assert imported(code) & set(left_out) == set()
+
+
+def test_a_replay_is_saved_without_what_pyarrow_would_import(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        env.reset(seed=1)
+        env.step(0)
+    found = imported(run("replay", str(path), "--save", str(tmp_path / "r.rrd")))
+    assert (tmp_path / "r.rrd").stat().st_size > 10_000
+    assert "rerun" in found
+    assert found & {"pandas", "pyarrow.compute", "pydoc", "matplotlib", "sqlalchemy"} == set()
+
+
+@pytest.mark.parametrize("earlier", ["", "import pandas; "])
+def test_pandas_is_there_for_those_who_use_it(earlier: str) -> None:
+    code = (
+        f"{earlier}from tupli_mcap.viewer.sdk import leave_pandas_out; leave_pandas_out(); import pyarrow\n"
+        "assert pyarrow.table({'a': [1, 2]}).to_pandas().a.tolist() == [1, 2]\n"
+        "import pandas; assert pandas.Series([1]).sum() == 1"
+    )
+    assert "pandas" in imported(code)
 
 
 def test_the_look_sees_what_is_imported() -> None:

@@ -52,12 +52,16 @@ def _bars(values: Any) -> Any:
     """At most a thousand bars: means of neighbours where there are more; what is not finite is 0."""
     import rerun as rr
 
+    from tupli_mcap.viewer.sending import tensor_array
+
     finite = np.where(np.isfinite(values), values, 0.0)
     if len(finite) <= _MOST_BARS:
-        return rr.BarChart(finite)
+        return rr.BarChart(tensor_array([finite], ["episode"]))
     edges = np.linspace(0, len(finite), _MOST_BARS + 1).astype(int)
     counts = np.diff(edges)  # a bar is as wide as the episodes it stands for
-    return rr.BarChart(np.add.reduceat(finite, edges[:-1]) / counts, abscissa=edges[:-1], widths=counts)
+    means = np.add.reduceat(finite, edges[:-1]) / counts
+    bars, places = (tensor_array([found], ["episode"]) for found in (means, edges[:-1]))
+    return rr.BarChart(bars, abscissa=places, widths=counts)
 
 
 def card(recording: Recording) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import sys
+from types import ModuleType
 from typing import Any
 
 from tupli_mcap.errors import MissingExtraError, TupliError
 
-__all__ = ["OLDEST", "ViewerError", "rerun_sdk"]
+__all__ = ["OLDEST", "ViewerError", "leave_pandas_out", "rerun_sdk"]
 
 OLDEST = (0, 39)
 
@@ -35,6 +38,34 @@ def rerun_sdk() -> Any:
             "pip install -U 'tupli-mcap[rerun]'"
         )
     return rerun
+
+
+class _NoPandas:
+    """Finds no pandas, for whoever imports it first."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: ModuleType | None = None) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(f"no module named {name!r} is needed here", name=name)
+
+
+def leave_pandas_out() -> None:
+    """Lets pyarrow do without pandas, which it imports with its first array where it is installed (half a second).
+
+    Only for a process that gives pyarrow nothing of pandas, as the command line is one. Whoever imports pandas later
+    gets it, and so does pyarrow where it is asked to make something for pandas. Nothing happens if it is there already.
+    """
+    if "pandas" in sys.modules:
+        return
+    finder: Any = _NoPandas
+    sys.meta_path.insert(0, finder)
+    try:
+        with contextlib.suppress(ImportError):  # there is an error for it, if it is needed
+            import pyarrow
+
+            pyarrow.array([])  # it looks once
+    finally:
+        sys.meta_path.remove(finder)
 
 
 def version_of(text: str) -> tuple[int, ...]:

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Times", "blob_array", "column_of", "send_blobs", "send_scalars", "send_tensors", "send_texts"]
+__all__ = [
+    "Times", "blob_array", "column_of", "send_blobs", "send_scalars", "send_tensors", "send_texts", "tensor_array"
+]  # fmt: skip
 
 Array = np.ndarray[Any, Any]
 
@@ -82,11 +84,11 @@ def send_scalars(stream: Any, entity: str, times: Times, values: Array) -> None:
     stream.send_columns(entity, times.columns, [column])
 
 
-def send_texts(stream: Any, entity: str, times: Times, descriptor: Any, texts: Any) -> None:
-    """Send one text a row (a list, or an Arrow array); None is an empty one."""
+def send_texts(stream: Any, entity: str, times: Times, descriptor: Any, texts: Sequence[str | None]) -> None:
+    """Send one text a row; None is an empty one."""
     import pyarrow as pa
 
-    array = texts if isinstance(texts, pa.Array) else pa.array(texts, pa.utf8())
+    array = pa.array(texts, pa.utf8())
     stream.send_columns(entity, times.columns, [column_of(descriptor, array)])
 
 
@@ -101,47 +103,57 @@ def blob_array(data: Array, ends: Array) -> Any:
     """Bytes cut into blobs; they have to be declared as never null, or the viewer does not see them."""
     import pyarrow as pa
 
-    blobs = pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), pa.array(data))
-    return blobs.cast(pa.list_(pa.field("item", pa.uint8(), nullable=False)))
+    blob = pa.list_(pa.field("item", pa.uint8(), nullable=False))
+    return pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), pa.array(data), type=blob)
 
 
 def send_tensors(
     stream: Any, entity: str, times: Times, values: Sequence[Array], names: Sequence[str]
 ) -> None:
-    """Send one tensor a row: arrays of one dtype, float32 or uint8, and of as many dimensions as there are names."""
+    """Send one tensor a row; for `values` and `names`, see `tensor_array`."""
+    import rerun as rr
+
+    column = column_of(rr.Tensor.descriptor_data(), tensor_array(values, names))
+    stream.send_columns(entity, times.columns, [column])
+
+
+def tensor_array(values: Sequence[Array], names: Sequence[str]) -> Any:
+    """Tensors: arrays of one dtype (float32, float64, int64 or uint8), and of as many dimensions as there are names.
+
+    Made without a cast: the first one of a process takes pyarrow a tenth of a second.
+    """
     import pyarrow as pa
     import rerun as rr
 
     rows = len(values)
-    (example,) = rr.Tensor.columns(data=[np.zeros(1)])
-    goal = example.as_arrow_array().type.value_type
+    goal = rr.components.TensorDataBatch(None).as_arrow_array().type
     fields = [goal.field(i) for i in range(goal.num_fields)]  # shape, names, buffer
     each = pa.array(np.arange(0, rows * len(names) + 1, len(names), dtype=np.int32))
     shapes = pa.array(np.array([value.shape for value in values], np.uint64).reshape(-1))
     told = pa.array(list(names) * rows, pa.utf8())
-    tensors = pa.StructArray.from_arrays(
+    return pa.StructArray.from_arrays(
         [
-            pa.ListArray.from_arrays(each, shapes).cast(fields[0].type),
-            pa.ListArray.from_arrays(each, told).cast(fields[1].type),
+            pa.ListArray.from_arrays(each, shapes, type=fields[0].type),
+            pa.ListArray.from_arrays(each, told, type=fields[1].type),
             _tensor_buffers(values, fields[2].type),
         ],
         fields=fields,
     )
-    stream.send_columns(entity, times.columns, [column_of(rr.Tensor.descriptor_data(), tensors)])
 
 
 def _tensor_buffers(values: Sequence[Array], union: Any) -> Any:
     """The buffers of tensors, a dense union of lists with one child for each dtype."""
     import pyarrow as pa
 
-    kind = {"f": "F32", "u": "U8"}[values[0].dtype.kind]
-    ends = np.cumsum([0, *(value.size for value in values)]).astype(np.int32)
-    data = pa.ListArray.from_arrays(
-        pa.array(ends), pa.array(np.concatenate([value.reshape(-1) for value in values]))
-    )
+    kind = {"float32": "F32", "float64": "F64", "int64": "I64", "uint8": "U8"}[values[0].dtype.name]
+    ends = pa.array(np.cumsum([0, *(value.size for value in values)]).astype(np.int32))
+    data = pa.array(np.concatenate([value.reshape(-1) for value in values]))
     of_union = [union.field(i) for i in range(union.num_fields)]
     children = [
-        data.cast(field.type) if field.name == kind else pa.array([], field.type) for field in of_union
+        pa.ListArray.from_arrays(ends, data, type=field.type)
+        if field.name == kind
+        else pa.array([], field.type)
+        for field in of_union
     ]
     code = [field.name for field in of_union].index(kind)
     codes = pa.array(np.full(len(values), code, np.int8))

@@ -39,7 +39,6 @@ class Lanes:
         place.stream.log(place.root + self.entity, style, static=True)
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        import pyarrow as pa
         import rerun as rr
 
         values = self.leaf.get(getattr(block.columns, self.column)).astype(np.int64)
@@ -55,7 +54,8 @@ class Lanes:
             before = np.searchsorted(rows, block.finals.before)
             which = np.insert(which, before, len(self.labels) + 1)
             at = at.inserted(before, block.finals.number, block.finals.times)
-        texts = pa.array([*self.labels, None, _NO_STATE], pa.utf8()).take(pa.array(which))
+        known_texts = [*self.labels, None, _NO_STATE]
+        texts = [known_texts[i] for i in which.tolist()]
         send_texts(place.stream, place.root + self.entity, at, rr.StateChange.descriptor_state(), texts)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
