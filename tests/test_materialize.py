@@ -335,6 +335,8 @@ def test_copies_in_other_processes(cart: Files, tmp_path: Path) -> None:
 def test_nothing_to_materialize(cart: Files, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="expected episodes to materialize, found none"):
         cart().with_episode_filter(F("n_tuples") > 1000).materialize(tmp_path / "columns")
+    with pytest.raises(DatasetError, match="expected the path of a directory for the columns, found None"):
+        cart().materialize(None)
     assert not (tmp_path / "columns").exists()
     none = cart().with_tuple_filter(F("reward") > 2).materialize(tmp_path / "columns")
     assert none.observations.shape == (0, 4)

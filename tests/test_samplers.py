@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections import Counter
 from pathlib import Path
@@ -188,6 +189,58 @@ def test_a_state_of_something_else(dataset: TupliDataset, tmp_path: Path) -> Non
         Batches(other, transitions.order(8))
 
 
+def test_shuffled_blocks_go_on_with_the_same_blocks_only(tmp_path: Path) -> None:
+    """The items are the same after `load`, but lie in other blocks: going on would repeat some and leave some out."""
+    path = write(tmp_path / "r.mcap", [1000] * 40, [0] * 40)
+
+    def order(dataset: TupliDataset, shuffle: Any) -> Order:
+        return dataset.transitions().order(64, shuffle=shuffle, seed=1, buffer=2000)
+
+    recorded, loaded = TupliDataset.from_files(path), TupliDataset.from_files(path)
+    loaded.load()
+    first = order(recorded, "blocks")
+    taken = list(itertools.islice(first, 3))
+    with pytest.raises(
+        SamplingError, match="expected the state of a shuffle of these blocks, found that of others"
+    ):
+        order(loaded, "blocks").load_state_dict(first.state_dict())
+    resumed = order(TupliDataset.from_files(path), "blocks")
+    resumed.load_state_dict(first.state_dict())
+    assert len(np.unique(np.concatenate([*taken, *resumed]))) == 40_000
+    order(loaded, "exact").load_state_dict(order(recorded, "exact").state_dict())
+
+
+def test_a_state_that_was_changed(dataset: TupliDataset) -> None:
+    transitions = dataset.transitions()
+    weighted, order = transitions.sampler(8, weights=np.ones(100)), transitions.order(8)
+    for numbers, changed, message in [
+        (weighted, {"weights": [1.0]}, "expected weights as bytes in a state, found"),
+        (weighted, {"weights": b"1234567"}, "expected weights as bytes in a state, found"),
+        (weighted, {"weights": np.ones(2).tobytes()}, "expected 100 weights, one for each item"),
+        (weighted, {"unused": 5}, "expected a list of unused batches in a state, found 5"),
+        (weighted, {"unused": [["a"]]}, "expected unused numbers of items in one dimension, found"),
+        (weighted, {"unused": [[3, 100]]}, "expected unused numbers of items from 0 to 99, found others"),
+        (order, {"batch": 14}, "expected a batch of at most 13, found 14"),
+    ]:
+        before = numbers.state_dict()
+        with pytest.raises(SamplingError, match=message):
+            numbers.load_state_dict({**before, **changed})
+        assert numbers.state_dict() == before
+
+
+def test_weights_of_the_episodes_that_the_items_are_of(tmp_path: Path) -> None:
+    """Also where the dataset has listed others since."""
+    path = write(tmp_path / "r.mcap", LENGTHS, [0, 0, 0, 0, 7])
+    dataset = TupliDataset.from_files(path)
+    transitions = dataset.transitions()
+    path.unlink()
+    write(path, [9, 9, 9, 9, 9, 9], [1] * 6)
+    assert len(dataset.preview()) == 6
+    for by in ("steps", "episodes"):
+        drawn = transitions.sampler(50, by=by, weights=F("metadata.score"), seed=0).draw(0)
+        assert drawn.min() >= sum(LENGTHS[:4])  # of the last one
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -208,7 +261,12 @@ def test_a_state_of_something_else(dataset: TupliDataset, tmp_path: Path) -> Non
         ),
         ({"by": "hours"}, "expected by to be 'steps' or 'episodes', found 'hours'"),
         ({"seed": -1}, "expected a seed that is an integer from 0, found -1"),
-        ({"seed": 1 << 128}, "expected a seed below"),
+        (
+            {"seed": 1 << 128},
+            "expected a seed of at most 340282366920938463463374607431768211455, found 3402",
+        ),
+        ({"weights": [1e308] * 100}, "found 1e\\+308 for item 0; their sum must be finite, too"),
+        ({"weights": [[1], [1, 2]]}, r"expected 100 weights, one for each item, found \[\[1\], \[1, 2\]\]"),
         ({"batch_size": 0}, "expected a batch size that is an integer from 1, found 0"),
     ],
 )
@@ -234,8 +292,27 @@ def test_what_else_is_refused(dataset: TupliDataset) -> None:
     sampler = transitions.sampler(8, weights=np.ones(100))
     with pytest.raises(SamplingError, match="expected items from 0 to 99, found 5 to 100"):
         sampler.update([5, 100], 1)
-    with pytest.raises(SamplingError, match="expected finite weights from 0 on, found -1.0"):
+    with pytest.raises(SamplingError, match="expected weights from 0 on, of a finite sum, found -1.0"):
         sampler.update([5], -1)
+    with pytest.raises(
+        SamplingError, match="expected weights from 0 on, of a finite sum, found 1e\\+308 to 1e"
+    ):
+        sampler.update(range(100), 1e308)
+    for places in ([0.7], ["a"], None, [True]):
+        with pytest.raises(SamplingError, match="expected items from 0 to 99 in one dimension, found"):
+            sampler.update(places, 1)
+    for weights in (["a"], [1, 2, 3], {}):
+        with pytest.raises(SamplingError, match="expected a weight, or 2 of them, one for each item, found"):
+            sampler.update([4, 5], weights)
+    assert (sampler.weights == 1).all()
+    with pytest.raises(
+        SamplingError, match="expected the number of a batch that is an integer from 0, found -1"
+    ):
+        sampler.draw(-1)
+    for numbers in (None, "a", [1, 2]):
+        with pytest.raises(SamplingError, match="expected an Order, a Sampler or a batch size, found"):
+            transitions.batches(numbers)
+    assert len(transitions.batches(np.int64(8))) == 13
     with pytest.raises(SamplingError, match="expected an Order, which has epochs, found a Sampler"):
         len(transitions.batches(sampler))
 

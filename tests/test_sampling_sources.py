@@ -252,6 +252,16 @@ BAD: list[tuple[Callable[[TupliDataset], Any], str]] = [
     (lambda d: d.windows(99), "expected windows of at most 8 steps, which the longest episode has, found 99"),
     (lambda d: d.windows(4, history=5), "expected windows of at most 8 steps, .* found 9"),
     (lambda d: d.windows(0), f"expected a length of windows {COUNT} 1, found 0"),
+    (
+        lambda d: d.windows(1 << 63),
+        "expected a length of windows of at most 281474976710656, found 9223372036854",
+    ),
+    (
+        lambda d: d.windows(2, history=1 << 47),
+        "expected windows of at most 8 steps, .* found 140737488355330",
+    ),
+    (lambda d: d.windows(2, fields=5), "expected fields from states, .*, found 5"),
+    (lambda d: d.windows(2)[[[1], [2, 3]]], rf"{NUMBERS} \[\[1\], \[2, 3\]\]"),
     (lambda d: d.windows(2.5), f"expected a length of windows {COUNT} 1, found 2.5"),
     (lambda d: d.windows(2, True), f"expected a stride {COUNT} 1, found True"),
     (lambda d: d.windows(2, pad="x"), "expected pad to be one of 'none', 'repeat', 'zero', found 'x'"),
@@ -282,6 +292,12 @@ BAD: list[tuple[Callable[[TupliDataset], Any], str]] = [
     ),
     (lambda d: d.with_episode_filter(F("n_tuples") > 99).transitions(), "found an empty dataset"),
     (lambda d: d.with_tuple_filter(F("reward") > 99).windows(1), "found an empty dataset"),
+    (
+        lambda d: d.delta_windows({"state": [0]}, "seconds", step_seconds="1"),
+        "expected a known time of a step, found '1'",
+    ),
+    (lambda d: d.episode_values("n_tuples"), "expected an expression, such as .*, found 'n_tuples'"),
+    (lambda d: steps_of("run.mcap"), "expected a Recording, found 'run.mcap'"),
     (lambda d: d.with_cache(-1), f"expected a budget in bytes {COUNT} 0, found -1"),
     (lambda d: d.with_cache(1, 0), f"expected a number of threads {COUNT} 1, found 0"),
 ]
@@ -291,6 +307,20 @@ BAD: list[tuple[Callable[[TupliDataset], Any], str]] = [
 def test_what_means_nothing(library: list[Path], ask: Callable[[TupliDataset], Any], message: str) -> None:
     with pytest.raises(SamplingError, match=message):
         ask(TupliDataset.from_files(library))
+
+
+def test_numbers_beyond_everything(library: list[Path]) -> None:
+    """More steps than an episode has are as many as it has."""
+    dataset = TupliDataset.from_files(library)
+    far, near = dataset.transitions(1 << 40, 0.9)[:], dataset.transitions(8, 0.9)[:]
+    assert same(far.asdict(), near.asdict())
+    for unit, far_away in (("steps", 2.0**80), ("seconds", 1e300), ("clock", 1e300)):
+        windows = dataset.delta_windows({"state": [-far_away, far_away]}, unit, step_seconds=0.5)
+        ends = dataset.delta_windows({"state": [-8, 8]})
+        assert same(windows[:].values, ends[:].values) and not windows[:].masks["state"].any()
+    with pytest.raises(IndexError, match="expected numbers from 0 to 152, found"):
+        dataset.windows(2)[np.array([2**64 - 1], np.uint64)]
+    assert [*ends[0].asdict()] == ["values", "masks", "steps", "episodes"]
 
 
 def test_numbers_that_are_not_there(library: list[Path]) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -64,7 +65,7 @@ class RandomAccess:
             SamplingError: no episode is long enough, or the arguments mean nothing.
         """
         made = Windows(self.steps, length, stride, pad, history, fields=fields)
-        return made.of_episodes(self.episode_values)
+        return made.of_episodes(self._values_now())
 
     def transitions(
         self, n_step: int = 1, discount: float = 1.0, *, fields: Sequence[str] = TRANSITION_FIELDS
@@ -76,7 +77,7 @@ class RandomAccess:
         Raises:
             SamplingError: the dataset is empty, or the arguments mean nothing.
         """
-        return Transitions(self.steps, n_step, discount, fields=fields).of_episodes(self.episode_values)
+        return Transitions(self.steps, n_step, discount, fields=fields).of_episodes(self._values_now())
 
     def episode_values(self, expression: F | BaseFilter) -> np.ndarray[Any, np.dtype[np.float64]]:
         """The number that each episode has at a key, such as `F("metadata.score")`; of a filter, 1 where it is true,
@@ -87,6 +88,10 @@ class RandomAccess:
             FilterError: the expression names an unknown field.
         """
         return episode_values(self._query.headers, expression)
+
+    def _values_now(self) -> Callable[[F | BaseFilter], np.ndarray[Any, np.dtype[np.float64]]]:
+        """`episode_values` of the episodes as they are listed now, whatever is listed later."""
+        return partial(episode_values, self._query.headers)
 
     def delta_windows(
         self,
@@ -105,7 +110,7 @@ class RandomAccess:
         if unit == "seconds" and step_seconds is None:
             step_seconds = self._step_seconds()
         made = DeltaWindows(self.steps, deltas, unit, step_seconds=step_seconds)
-        return made.of_episodes(self.episode_values)
+        return made.of_episodes(self._values_now())
 
     def _step_seconds(self) -> float | None:
         """How long a step takes, where all recordings say the same."""

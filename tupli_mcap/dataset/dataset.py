@@ -174,13 +174,15 @@ class TupliDataset(RandomAccess):
             verify: also compare all columns with their digests; damaged ones are written anew, with a warning.
 
         Raises:
-            DatasetError: there is no episode.
+            DatasetError: there is no episode, or the directory is no path.
             SpaceError: the steps of two recordings do not fit into one array; the message says which.
             StorageError: the directory holds something else, the disk is full, ...
 
         Returns:
             the dataset itself.
         """
+        if not isinstance(directory, str | os.PathLike):
+            raise DatasetError(f"expected the path of a directory for the columns, found {directory!r:.80}")
         anew(lambda: self._query.materialize(Path(directory), verify=verify))
         return self
 

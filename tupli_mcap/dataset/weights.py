@@ -19,12 +19,14 @@ def episode_values(headers: Sequence[EpisodeHeader], expression: F | BaseFilter)
     """The number that each episode has at a key, `F("metadata.score")` for example; of a filter, 1 where it is true.
 
     Raises:
-        SamplingError: an episode has no number there.
+        SamplingError: an episode has no number there, or it is no expression.
         FilterError: the expression names an unknown field.
     """
     if isinstance(expression, BaseFilter):
         matches = compile_predicate(expression, EpisodeHeader)
         return np.array([float(matches(header)) for header in headers])
+    if not isinstance(expression, F):
+        raise SamplingError(f"expected an expression, such as F('metadata.score'), found {expression!r:.80}")
     path = split_key(expression.key)
     if path[0] not in EpisodeHeader.model_fields:
         known = ", ".join(sorted(EpisodeHeader.model_fields))

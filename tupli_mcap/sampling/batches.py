@@ -31,6 +31,8 @@ class Batches(Generic[T]):
     """
 
     def __init__(self, items: Items[T], numbers: Numbers, *, read_ahead: int = 0) -> None:
+        if not hasattr(numbers, "items_identity"):
+            raise SamplingError(f"expected an Order, a Sampler or a batch size, found {numbers!r:.80}")
         if numbers.items_identity != items.identity:
             raise SamplingError("expected numbers of the same items, found those of others")
         self.items = items

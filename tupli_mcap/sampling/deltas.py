@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tupli_mcap.sampling.items import StepItems
+from tupli_mcap.sampling.items import Parts, StepItems
 from tupli_mcap.sampling.steps import SamplingError, Steps
 from tupli_mcap.sampling.windows import shaped_rows
 
@@ -22,10 +22,12 @@ KEYS = {
     "timeout": "timeouts", "next_state": "next_states", "time": "times",
 }  # fmt: skip
 _CLOSEST = 1e-4  # seconds that a delta may lie beside a step
+_FARTHEST = 1 << 48  # steps: beyond every episode
+_LONGEST = 1e9  # seconds of the clock, 31 years: the same
 
 
 @dataclass(frozen=True)
-class DeltaWindow:
+class DeltaWindow(Parts):
     """Values around one step, or around B steps, by key ("state", "action", …).
 
     `values[key]` is a column of shape (K, ...), or (B, K, ...), with K the number of the key's deltas, nested as the
@@ -115,7 +117,9 @@ class DeltaWindows(StepItems[DeltaWindow]):
     def _nearest(self, steps: Array, deltas: Array, firsts: Array, lasts: Array) -> tuple[Array, Array]:
         """The steps whose times are nearest, found by bisection: times grow within an episode."""
         shape = (len(steps), len(deltas))
-        target = self._times(steps)[:, None] + np.round(deltas * 1e9).astype(np.int64)
+        target = self._times(steps)[:, None] + np.round(deltas.clip(-_LONGEST, _LONGEST) * 1e9).astype(
+            np.int64
+        )
         low, high = (np.broadcast_to(ends[:, None], shape).copy() for ends in (firsts, lasts))
         slack = round(_CLOSEST * 1e9)
         mask = (target >= self._times(low) - slack) & (target <= self._times(high) + slack)
@@ -158,7 +162,7 @@ def _in_steps(given: Mapping[str, Array], unit: str, step_seconds: float | None)
     """The deltas as numbers of steps (int64)."""
     scale: float = 1
     if unit == "seconds":
-        if step_seconds is None or not 0 < step_seconds < np.inf:
+        if not isinstance(step_seconds, int | float | np.number) or not 0 < step_seconds < np.inf:
             raise SamplingError(
                 f"expected a known time of a step, found {step_seconds!r}; give step_seconds=, or take unit='clock', "
                 "for the times recorded"
@@ -174,5 +178,5 @@ def _in_steps(given: Mapping[str, Array], unit: str, step_seconds: float | None)
                 f"expected deltas of {key!r} that are whole steps{f' of {scale} s' if unit == 'seconds' else ''}, "
                 f"found {wrong}"
             )
-        found[key] = steps.astype(np.int64)
+        found[key] = steps.clip(-_FARTHEST, _FARTHEST).astype(np.int64)
     return found

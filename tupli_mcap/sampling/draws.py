@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from tupli_mcap.sampling.items import Items, checked_count
+from tupli_mcap.sampling.items import Items, checked_count, checked_numbers
 from tupli_mcap.sampling.shuffling import through_buffer
 from tupli_mcap.sampling.steps import SamplingError
 from tupli_mcap.sampling.sumtree import SumTree
@@ -36,7 +37,7 @@ class Numbers(Protocol):
     def give_back(self, batches: Sequence[Array]) -> None: ...
 
     def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
-        """Where this is: plain numbers, strings, lists and arrays. `unused` are the last batches, to be given again."""
+        """Where this is: plain numbers, strings, bytes and lists. `unused` are the last batches, to be given again."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -97,15 +98,23 @@ class Sampler:
             )
 
     def _checked(self, weights: Any, n: int) -> Array:
-        found = np.asarray(weights)
+        try:
+            found = np.asarray(weights)
+        except (TypeError, ValueError) as err:  # lists of different lengths
+            raise SamplingError(
+                f"expected {n} weights, one for each {self._what}, found {weights!r:.80}"
+            ) from err
         if found.shape != (n,) or found.dtype.kind not in "biuf":
             raise SamplingError(
                 f"expected {n} weights, one for each {self._what}, found {found.dtype} of shape {found.shape}"
             )
         found = found.astype(np.float64)
-        if not (np.isfinite(found) & (found >= 0)).all():
-            i = int(np.argmin(np.isfinite(found) & (found >= 0)))
-            raise SamplingError(f"expected weights from 0 on, found {found[i]} for {self._what} {i}")
+        usable = _usable(found, n)
+        if not usable.all():
+            i = int(np.argmin(usable))
+            raise SamplingError(
+                f"expected weights from 0 on, found {found[i]} for {self._what} {i}; their sum must be finite, too"
+            )
         if self._counts is not None and len(found) == len(self._counts):
             found = np.where(self._counts > 0, found, 0.0)  # of an episode without items, none can be drawn
         if not found.any():
@@ -124,15 +133,22 @@ class Sampler:
             raise SamplingError(
                 "expected a sampler with weights, found one without; give weights=... when it is made"
             )
-        places = np.asarray(places, np.int64).reshape(-1)
         n = len(self._tree.weights)
+        places = checked_numbers(places, f"{self._what}s from 0 to {n - 1}")
         if len(places) and (places.min() < 0 or places.max() >= n):
             raise SamplingError(
                 f"expected {self._what}s from 0 to {n - 1}, found {places.min()} to {places.max()}"
             )
-        given = np.broadcast_to(np.asarray(weights, np.float64), places.shape)
-        if not (np.isfinite(given) & (given >= 0)).all():
-            raise SamplingError(f"expected finite weights from 0 on, found {given.min()} to {given.max()}")
+        try:
+            given = np.broadcast_to(np.asarray(weights, np.float64), places.shape)
+        except (TypeError, ValueError) as err:
+            raise SamplingError(
+                f"expected a weight, or {len(places)} of them, one for each {self._what}, found {weights!r:.80}"
+            ) from err
+        if not _usable(given, n).all():
+            raise SamplingError(
+                f"expected weights from 0 on, of a finite sum, found {given.min()} to {given.max()}"
+            )
         if self._counts is not None:
             given = np.where(self._counts[places] > 0, given, 0.0)
         self._tree.update(places, given)
@@ -144,7 +160,7 @@ class Sampler:
 
     def draw(self, number: int) -> Array:
         """Batch `number` of this seed, with the weights as they are now."""
-        random = _random(self.seed, _DRAWS, number)
+        random = _random(self.seed, _DRAWS, checked_count(number, 0, "the number of a batch"))
         if self._tree is not None:
             if not self._tree.total > 0:
                 raise SamplingError(f"expected a weight above 0, found 0 for every {self._what}")
@@ -170,7 +186,7 @@ class Sampler:
         self._unused = [*batches, *self._unused]
 
     def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
-        """Where this is; with weights, they are in it as an array."""
+        """Where this is; with weights, they are in it as bytes (float64), which `torch.load` also takes."""
         return {
             "kind": f"{type(self).__name__} by {self.by}",
             "items": self.items_identity,
@@ -178,19 +194,31 @@ class Sampler:
             "seed": self.seed,
             "batch": self.batch,
             "unused": [batch.tolist() for batch in (*unused, *self._unused)],
-            "weights": self.weights,
+            "weights": None if self._tree is None else self._tree.weights.tobytes(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         _check_state(state, self.state_dict())
-        self.seed, self.batch = _checked_seed(state["seed"]), checked_count(state["batch"], 0, "a batch")
-        self._unused = [np.asarray(batch, np.int64) for batch in state["unused"]]
-        if (self._tree is None) != (state["weights"] is None):
+        seed, batch = _checked_seed(state["seed"]), checked_count(state["batch"], 0, "a batch")
+        unused = self._checked_unused(state["unused"])
+        weights = state["weights"]
+        if (self._tree is None) != (weights is None):
             raise SamplingError(
                 "expected a state of a sampler with weights if this one has some, and without if not"
             )
         if self._tree is not None:
-            self._tree = SumTree(self._checked(state["weights"], len(self._tree.weights)))
+            if not isinstance(weights, bytes) or len(weights) % 8:
+                raise SamplingError(f"expected weights as bytes in a state, found {weights!r:.80}")
+            self._tree = SumTree(self._checked(np.frombuffer(weights), len(self._tree.weights)))
+        self.seed, self.batch, self._unused = seed, batch, unused
+
+    def _checked_unused(self, batches: Any) -> list[Array]:
+        if not isinstance(batches, list):
+            raise SamplingError(f"expected a list of unused batches in a state, found {batches!r:.80}")
+        found = [checked_numbers(batch, "unused numbers of items") for batch in batches]
+        if any(len(batch) and not 0 <= batch.min() <= batch.max() < self._n for batch in found):
+            raise SamplingError(f"expected unused numbers of items from 0 to {self._n - 1}, found others")
+        return found
 
 
 class Order:
@@ -238,6 +266,7 @@ class Order:
             room = getattr(items.source, "room", len(items.source))
             self.buffer = max(1, min(_BUFFER, room * self._n // len(items.source)))
         self._runs = items.block_runs() if shuffle == "blocks" else None
+        self._blocks = None if self._runs is None else _digest(self._runs)
         if not len(self):
             raise SamplingError(
                 f"expected at least {batch_size} items for one full batch, found {self._n}; take drop_last=False"
@@ -285,6 +314,7 @@ class Order:
             "items": self.items_identity,
             "batch_size": self.batch_size,
             "buffer": self.buffer if self._runs is not None else 0,
+            "blocks": self._blocks,
             "seed": self.seed,
             "epoch": epoch,
             "batch": batch - len(unused),
@@ -292,10 +322,9 @@ class Order:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         _check_state(state, self.state_dict())
-        self.seed = _checked_seed(state["seed"])
-        self.epoch = checked_count(state["epoch"], 0, "an epoch")
-        self.batch = checked_count(state["batch"], 0, "a batch")
-        self._resumed = True
+        seed, epoch = _checked_seed(state["seed"]), checked_count(state["epoch"], 0, "an epoch")
+        self.batch = checked_count(state["batch"], 0, "a batch", len(self))
+        self.seed, self.epoch, self._resumed = seed, epoch, True
 
 
 def _cut(order: Array, size: int) -> Iterator[Array]:
@@ -308,13 +337,20 @@ def _random(seed: int, stream: int, number: int) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, number]))
 
 
+def _usable(weights: Array, n: int) -> Array:
+    """Which weights can be one of n: from 0 on, and so small that the sum of n such is finite."""
+    return (weights >= 0) & (weights <= np.finfo(np.float64).max / n)
+
+
+def _digest(runs: tuple[Array, Array, Array]) -> str:
+    """Of which items lie in which block."""
+    return hashlib.sha256(b"".join(part.tobytes() for part in runs)).hexdigest()
+
+
 def _checked_seed(seed: object) -> int:
     if seed is None:
         return int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
-    found = checked_count(seed, 0, "a seed")
-    if found >= 1 << 128:
-        raise SamplingError(f"expected a seed below 2**128, found {found}")
-    return found
+    return checked_count(seed, 0, "a seed", (1 << 128) - 1)
 
 
 def _check_state(state: Mapping[str, Any], own: Mapping[str, Any]) -> None:
@@ -325,6 +361,11 @@ def _check_state(state: Mapping[str, Any], own: Mapping[str, Any]) -> None:
         raise SamplingError(
             "expected the state of these items, found that of others: the dataset, its filters or the windows have "
             "changed since; begin anew, or take what the state was saved with"
+        )
+    if state.get("blocks") != own.get("blocks") and state["kind"] == own["kind"]:
+        raise SamplingError(
+            "expected the state of a shuffle of these blocks, found that of others: the recordings have been written "
+            "anew, loaded or materialized since; read them as before, or take shuffle='exact'"
         )
     for key in ("kind", "batch_size", "buffer"):
         if state.get(key) != own.get(key):

@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from tupli_mcap.sampling.batches import Batches
     from tupli_mcap.sampling.draws import Numbers, Order, Sampler, Shuffle, Weights
 
-__all__ = ["Items", "Parts", "StepItems", "checked_count"]
+__all__ = ["Items", "Parts", "StepItems", "checked_count", "checked_numbers"]
 
 Array = np.ndarray[Any, Any]
 T = TypeVar("T")
 _MANY = 1 << 20  # items that are looked at together
+_MOST = 1 << 48  # of what can be counted here; sums of a few such numbers are integers of 64 bits
 
 
 @dataclass(frozen=True)
@@ -81,10 +82,7 @@ class Items(ABC, Generic[T]):
             return self._one(int(index) % n)
         if isinstance(index, slice):
             return self._batch(np.arange(*index.indices(n)))
-        chosen = np.asarray(index)
-        if chosen.ndim != 1 or (chosen.dtype.kind not in "iu" and len(chosen)):
-            raise SamplingError(f"expected numbers from 0 to {n - 1} in one dimension, found {index!r:.80}")
-        chosen = chosen.astype(np.int64)
+        chosen = checked_numbers(index, f"numbers from 0 to {n - 1}")
         if len(chosen) and (chosen.min() < -n or chosen.max() >= n):
             wrong = chosen[(chosen < -n) | (chosen >= n)][0]
             raise IndexError(f"expected numbers from 0 to {n - 1}, found {wrong}")
@@ -129,8 +127,9 @@ class Items(ABC, Generic[T]):
         """
         from tupli_mcap.sampling.batches import Batches
 
-        chosen = self.order(numbers) if isinstance(numbers, int) else numbers
-        return Batches(self, chosen, read_ahead=read_ahead)
+        if isinstance(numbers, int | np.integer):
+            numbers = self.order(numbers)
+        return Batches(self, numbers, read_ahead=read_ahead)
 
     def episode_values(self, expression: F | BaseFilter) -> Array:
         """The value of an expression over `EpisodeHeader` for each episode (float64).
@@ -190,12 +189,33 @@ class StepItems(Items[T]):
         return self._episode_ends.searchsorted(steps, side="right")
 
 
-def checked_count(value: object, least: int, what: str) -> int:
-    """The value, if it is an integer from `least` on.
+def checked_count(value: object, least: int, what: str, most: int = _MOST) -> int:
+    """The value, if it is an integer from `least` to `most`.
 
     Raises:
         SamplingError: it is something else.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise SamplingError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
+    if value > most:
+        raise SamplingError(f"expected {what} of at most {most}, found {value!r:.80}")
     return int(value)
+
+
+def checked_numbers(value: Any, what: str) -> Array:
+    """The value as int64, if it is integers in one dimension.
+
+    Raises:
+        SamplingError: it is something else.
+    """
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError, OverflowError):  # lists of different lengths, for example
+        found = np.empty(())
+    if found.ndim != 1 or (found.dtype.kind not in "iu" and len(found)):
+        raise SamplingError(f"expected {what} in one dimension, found {value!r:.80}")
+    if found.dtype == np.uint64:
+        found = np.minimum(
+            found, np.uint64(_MOST)
+        )  # which is beyond everything, and does not become negative
+    return found.astype(np.int64)

@@ -19,7 +19,7 @@ from tupli_mcap.sampling.files import OpenFiles
 from tupli_mcap.sampling.gather import TIME, ConstantRows, Rows
 from tupli_mcap.sampling.index import ListedEpisodes, StepIndex
 from tupli_mcap.sampling.kinds import EPISODE, final_rows, image_rows, step_rows
-from tupli_mcap.sampling.steps import checked_fields, rows_of_runs
+from tupli_mcap.sampling.steps import SamplingError, checked_fields, rows_of_runs
 
 __all__ = ["CACHE_BYTES", "THREADS", "RecordedSteps", "steps_of"]
 
@@ -295,7 +295,10 @@ def steps_of(
 
     Raises:
         RecordingError: it has no step yet.
+        SamplingError: it is no `Recording`.
     """
+    if not isinstance(recording, Recording):
+        raise SamplingError(f"expected a Recording, found {recording!r:.80}; open it, or take dataset.steps")
     numbers, lengths = (recording.index[name].astype(np.int64) for name in ("episode", "length"))
     listed = ListedEpisodes(recording.name, numbers, lengths)
     return RecordedSteps([listed], lambda _: nullcontext(recording), cache_bytes=cache_bytes, threads=threads)

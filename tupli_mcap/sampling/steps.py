@@ -128,9 +128,12 @@ def checked_fields(fields: Sequence[str], known: Sequence[str] = FIELDS) -> list
     """The fields, one name as a list of one.
 
     Raises:
-        SamplingError: one of them is unknown.
+        SamplingError: one of them is unknown, or there is something else.
     """
-    names = [fields] if isinstance(fields, str) else list(fields)
+    try:
+        names = [fields] if isinstance(fields, str) else list(fields)
+    except TypeError as err:
+        raise SamplingError(f"expected fields from {', '.join(known)}, found {fields!r:.80}") from err
     unknown = [name for name in names if name not in known]
     if unknown:
         raise SamplingError(f"expected fields from {', '.join(known)}, found {', '.join(map(repr, unknown))}")

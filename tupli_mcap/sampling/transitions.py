@@ -109,7 +109,7 @@ class Transitions(StepItems[Transition]):
         """The last step of each transition, how many it has, and its rewards if they are asked for."""
         source = self.source
         breaks = source.breaks[source.breaks.searchsorted(rows)]
-        ahead = np.arange(self.n_step)
+        ahead = np.arange(min(self.n_step, int((breaks - rows).max(initial=0)) + 1))
         wanted = np.minimum(rows[:, None] + ahead, breaks[:, None])
         names = ["terminals", *(["rewards"] if "rewards" in self.fields else [])]
         found = source.read(names, wanted.reshape(-1))
