@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import threading
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -20,6 +21,7 @@ from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.crc import crc32
 from tupli_mcap.recording.source import PathSource, open_source
+from tupli_mcap.recording.together import do_all
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
@@ -146,6 +148,35 @@ def test_what_is_lent(tmp_path: Path, kind: str) -> None:
         source.lend(len(content) - 1, 2)
     source.close()
     file.close()
+
+
+def test_tasks_are_done_once_by_several_threads() -> None:
+    met, done = threading.Barrier(3), list[int]()
+    names = set[str]()
+
+    def task(number: int) -> None:
+        if number < 3:
+            met.wait(30)  # which three threads at work at a time do
+        names.add(threading.current_thread().name)
+        done.append(number)
+
+    do_all([lambda number=number: task(number) for number in range(200)], 3)
+    assert sorted(done) == list(range(200))
+    assert threading.current_thread().name in names
+    assert len(names) == 3
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_an_error_of_a_task_ends_the_others(threads: int) -> None:
+    done = list[int]()
+
+    def task(number: int) -> None:
+        done.append(number)
+        raise FormatError(f"chunk {number} is damaged")
+
+    with pytest.raises(FormatError, match=r"chunk \d is damaged"):
+        do_all([lambda number=number: task(number) for number in range(200)], threads)
+    assert len(done) <= threads
 
 
 def test_checksums_are_those_of_zlib() -> None:

@@ -233,22 +233,20 @@ class ChunkStore:
         return kept
 
     def _read(self, i: int) -> Any:
-        row = self.table[i]
-        offset, length, size = int(row["offset"]), int(row["length"]), int(row["uncompressed"])
+        offset, length, size, _, _, skip, row_crc, _, compression, _ = self.table[i].item()
         if offset >= IN_MEMORY:
             return self._memory[offset - IN_MEMORY]
         where = f"{self._source.name}: chunk at offset {offset}"
-        skip = int(row["skip"])
         if (
             length < _CHUNK_HEAD.size + 8
             or size > MAX_CHUNK
             or skip > size
-            or int(row["compression"]) >= len(COMPRESSIONS)
+            or compression >= len(COMPRESSIONS)
         ):
             raise FormatError(
                 f"{where}: expected a chunk of at most {MAX_CHUNK} bytes, found {length} holding {size}"
             )
-        name = COMPRESSIONS[row["compression"]].replace("none", "")
+        name = COMPRESSIONS[compression].replace("none", "")
         # what is not compressed is used where it is
         record = self._source.lend(offset, length) if name else self._source.view(offset, length)
         opcode, claimed, _, _, found_size, crc, name_length = _CHUNK_HEAD.unpack_from(record)
@@ -259,26 +257,27 @@ class ChunkStore:
                 f"{where}: expected a chunk of {size} bytes ({name or 'none'}), found another record"
             )
         data = decompress(name, record[start:], size, where)
-        if crc != row["crc"] or not (self._checked[i] or crc32(data) == crc):
+        if crc != row_crc or not (self._checked[i] or crc32(data) == crc):
             raise FormatError(f"{where}: its CRC differs, the chunk is damaged or another one")
         self._checked[i] = isinstance(record.obj, mmap)  # what is mapped stays as it is, and is checked once
         return memoryview(data)[skip:] if skip else data
 
     def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> np.ndarray[Any, Any]:
         """The rows of a chunk of constant layout as one structured array; their headers are checked."""
-        codec = self.codecs.get(int(self.table["channel"][i]))
+        _, _, _, _, n, _, _, channel, _, _ = self.table[i].item()
+        codec = self.codecs.get(channel)
         kept = self.chunk(i, keep=keep) if codec is None else self._decoded(i, codec, keep=keep)
         if kept.rows is not None:
+            if kept.rows.dtype is not dtype:  # the same bytes in other words: `items_dtype`
+                kept.rows = kept.rows.view(dtype)
             return kept.rows
         data = kept.data
-        row = self.table[i]
-        n = int(row["rows"])
         if len(data) != n * dtype.itemsize:
             raise FormatError(
                 f"{self._source.name}: chunk {i} expected {n} rows of {dtype.itemsize} bytes, found {len(data)} bytes"
             )
         rows = np.frombuffer(data, dtype)
-        head = _ROW_HEAD.pack(5, dtype.itemsize - 9, row["channel"])
+        head = _ROW_HEAD.pack(5, dtype.itemsize - 9, channel)
         if np.ndarray(n, f"V{len(head)}", data, strides=dtype.itemsize).tobytes() != head * n:
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
         kept.rows = rows

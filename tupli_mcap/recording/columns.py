@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,6 +16,7 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.pieces import Pieces, Runs, final_runs, items, items_dtype
+from tupli_mcap.recording.together import do_all
 
 __all__ = ["FIELDS", "ColumnReader", "Columns"]
 
@@ -24,7 +24,6 @@ FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states"
 _TIME = "#log_time"
 Array = np.ndarray[Any, Any]
 _MANY_ROWS = 1000  # fewer are copied before they have been looked at in another way
-_FEW_TASKS = 4  # fewer are done before a thread pool has started
 
 
 @dataclass
@@ -105,12 +104,7 @@ class ColumnReader:
                 tasks += self._tasks(
                     moved, ["data"], {"data": out[leaf.name]}, layout.image_messages[leaf.name].dtype, keep
                 )
-        if threads > 1 and len(tasks) > _FEW_TASKS:
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(lambda task: task(), tasks))
-        else:
-            for task in tasks:
-                task()
+        do_all(tasks, threads)
         nest = {"states": layout.nest_state, "actions": layout.nest_action, "rewards": layout.nest_reward}
         columns = {
             field: nest[field]([out[leaf.name] for leaf in group])
@@ -140,14 +134,12 @@ class ColumnReader:
         self, runs: Runs, names: Sequence[str], out: Mapping[str, Any], dtype: Any, keep: bool
     ) -> list[Callable[[], None]]:
         targets = [(name, out[name]) for name in names]
-        item_dtype = None
         if len(targets[0][1]) >= _MANY_ROWS:
             targets = [(name, items(column)) for name, column in targets]
-            item_dtype = items_dtype(dtype)
+            dtype = items_dtype(dtype)
 
         def copy(pieces: Pieces) -> None:
-            rows = self._store.rows(pieces.chunk, dtype, keep=keep)
-            pieces.copy(rows if item_dtype is None else rows.view(item_dtype), targets)
+            pieces.copy(self._store.rows(pieces.chunk, dtype, keep=keep), targets)
 
         return [partial(copy, pieces) for pieces in Pieces.of(runs, self._store)]
 

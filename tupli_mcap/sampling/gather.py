@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.together import do_all
 from tupli_mcap.sampling.segments import Piece, Segments
 from tupli_mcap.sampling.steps import pick_runs, rows_of_runs
 
@@ -21,7 +21,6 @@ TIME = "#log_time"  # the column of times (uint64, ns), named as in the records
 _TIME_STRUCT, _TIME_OFFSET = struct.Struct("<Q"), 15
 
 Array = np.ndarray[Any, Any]
-_FEW_CHUNKS = 4  # fewer are read before a thread pool has started
 
 
 class Column(NamedTuple):
@@ -112,7 +111,7 @@ class ConstantRows:
         out = {name: self.columns[name].empty(len(rows)) for name in names}
         filled = [name for name in names if out[name].size]
         pieces = self.segments.pieces(rows) if filled else []
-        run([partial(self._copy, piece, filled, out) for piece in pieces], threads)
+        do_all([partial(self._copy, piece, filled, out) for piece in pieces], threads)
         return out
 
     def _copy(self, piece: Piece, names: Sequence[str], out: dict[str, Any]) -> None:
@@ -127,7 +126,7 @@ class ConstantRows:
 
     def _fill(self, held: _HeldColumns, rows: Array, threads: int) -> None:
         missing = held.missing(rows)
-        run([partial(self._fill_unit, held, unit) for unit in missing], threads)
+        do_all([partial(self._fill_unit, held, unit) for unit in missing], threads)
         if missing:
             held.whole = bool(held.there.all())
 
@@ -212,16 +211,6 @@ class DecodedRows:
             for name in names:
                 if name in values:  # an array of no elements is not in the message
                     out[name][place] = values[name]
-
-
-def run(tasks: Sequence[Callable[[], None]], threads: int) -> None:
-    """Does all of it, in threads where there is much to do."""
-    if threads > 1 and len(tasks) > _FEW_CHUNKS:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(lambda task: task(), tasks))
-    else:
-        for task in tasks:
-            task()
 
 
 def _shaped(values: Array, target: Array) -> Array:

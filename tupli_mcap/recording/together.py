@@ -1,0 +1,42 @@
+"""Many small tasks, done by several threads that hardly wait for each other."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+__all__ = ["do_all"]
+
+_FEW = 4  # so many are done before a thread has started
+
+
+def do_all(tasks: Sequence[Callable[[], None]], threads: int) -> None:
+    """Does all of the tasks, in `threads` threads, of which the calling one is the first.
+
+    The first error of a task is raised when the tasks at work have ended; the others are left out.
+    """
+    # Not a future for each task: who waits for them wakes up at every one, and takes the interpreter from the workers.
+    left = deque(tasks)
+    if threads < 2 or len(left) <= _FEW:
+        _work(left)
+        return
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(_work, left) for _ in range(min(threads, len(left)) - 1)]
+        _work(left)
+    for other in others:
+        other.result()
+
+
+def _work(left: deque[Callable[[], None]]) -> None:
+    """Takes one task after the other, as long as there are some."""
+    try:
+        while True:
+            try:
+                task = left.popleft()
+            except IndexError:
+                return
+            task()
+    except BaseException:
+        left.clear()
+        raise
