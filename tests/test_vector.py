@@ -412,10 +412,10 @@ def test_a_half_whose_chunks_are_not_written_yet_is_in_the_journal(tmp_path: Pat
     space = spaces.Box(-1, 1, (250,), np.float64)  # some 30 rows a half
     path, copied = tmp_path / "r.mcap", tmp_path / "killed.mcap"
     env = RecordEpisodes(make(space, None), path, compression=compression)
-    add = env._writer.container.add_prepared
-    env._writer.container.add_prepared = lambda chunks: None  # type: ignore[method-assign]
+    add = env._writer.container.finish_chunks
+    env._writer.container.finish_chunks = lambda packed: None  # type: ignore[method-assign]
     taken = run(env, None, 50)  # more than a half, less than two
-    env._writer.container.add_prepared = add  # type: ignore[method-assign]
+    env._writer.container.finish_chunks = add  # type: ignore[method-assign]
     shutil.copy(path, copied)
     shutil.copy(f"{path}.journal", f"{copied}.journal")
     recording = check(copied, taken)

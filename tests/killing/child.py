@@ -19,6 +19,7 @@ import numpy as np
 from killing import breakages
 from killing.kinds import KINDS, open_recorder
 from killing.moments import MOMENTS, lay_trap
+from tupli_mcap.recording import worker
 
 __all__ = ["Job", "Told", "record_and_die"]
 
@@ -129,6 +130,8 @@ class _Recorder:
         job, moment, rng = self._job, self._moment, self._random
         if job.breakage:
             breakages.BREAKAGES[job.breakage]()
+        if moment.threaded or not moment.below:  # small chunks are made without the thread otherwise
+            worker.WORTH_A_THREAD = 0.0
         self._tell("born")
         lay_trap(moment, rng, job.length, self._tell)
         env = open_recorder(self._kind, job.path, job.mode, job.chunk, job.seed, self._tell, job.benchmark_id)

@@ -11,7 +11,8 @@ import os
 import struct
 import threading
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import lz4.frame
@@ -88,10 +89,13 @@ class Prepared(NamedTuple):
     crc: int
 
 
+Packed = Sequence[tuple[Sequence[Prepared], Sequence[bytes]]]  # chunks, and what was made of their data
+
+
 class Container:
     """Writes records to a file descriptor and remembers what the summary needs.
 
-    `add_chunk` and `add_prepared` may be called from two threads, for different channels; nothing else.
+    What `start_chunks` returns first may be called from another thread; nothing else.
     """
 
     def __init__(self, fd: int, name: str, compression: Compression) -> None:
@@ -103,7 +107,6 @@ class Container:
         method = b"" if compression == "none" else compression.encode()
         self._method = len(method).to_bytes(4, "little") + method, COMPRESSIONS.index(compression)
         self._local = threading.local()  # a compressor is not to be shared
-        self._lock = threading.RLock()
         self.position = 0
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -224,7 +227,7 @@ class Container:
 
     def pack_all(self, data: Sequence[Any]) -> list[bytes]:
         """`pack` of several chunks."""
-        if data and self.packs_together:
+        if len(data) > 1 and self.packs_together:  # each call makes compressors for its threads
             parts = self._zstd().multi_compress_to_buffer(list(data))
             return [parts[i].tobytes() for i in range(len(parts))]
         return [self.pack(part) for part in data]
@@ -239,30 +242,47 @@ class Container:
         """Writes a prepared chunk and its message index."""
         self._place([prepared], [packed])
 
-    def add_prepared(self, chunks: Sequence[Prepared]) -> None:
-        """Compresses and writes prepared chunks of different channels; may be called from a thread."""
-        for begin in range(0, len(chunks), _TOGETHER):
-            part = chunks[begin : begin + _TOGETHER]
-            self._place(part, self.pack_all([chunk.data for chunk in part]))
+    def start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], Packed]:
+        """What compresses chunks of different channels, in any thread; `finish_chunks` takes what it returns.
+
+        Whatever needs the interpreter lock is done now, or then: a thread that compresses waits for it once.
+        """
+        codecs = [self.codecs.get(rows.channel) for rows in chunks]
+        if any(codecs):
+            return lambda: self._packed(
+                [
+                    self.prepare(rows if codec is None else codec.encode(rows))
+                    for rows, codec in zip(chunks, codecs, strict=True)
+                ]
+            )
+        return partial(self._packed, [self.prepare(rows) for rows in chunks])
+
+    def _packed(self, chunks: Sequence[Prepared]) -> Packed:
+        parts = [chunks[begin : begin + _TOGETHER] for begin in range(0, len(chunks), _TOGETHER)]
+        return [(part, self.pack_all([chunk.data for chunk in part])) for part in parts]
+
+    def finish_chunks(self, packed: Packed) -> None:
+        """Writes chunks that have been compressed."""
+        for chunks, data in packed:
+            self._place(chunks, data)
 
     def _place(self, chunks: Sequence[Prepared], packed: Sequence[bytes]) -> None:
         name, method = self._method
         records, notes = [], []
-        with self._lock:
-            position = self.position
-            for (rows, skip, data, crc), body in zip(chunks, packed, strict=True):
-                start, end, size = int(rows.times[0]), int(rows.times[-1]), len(data)
-                record = _chunk_record(name, body, (start, end, size, crc))
-                index = _message_index(rows, skip)
-                found = (start, end, position, len(record), rows.channel, position + len(record), len(index))
-                entry = _chunk_index(name, found, (len(body), size))
-                row = (position, len(record), size, rows.first, len(rows.offsets), skip, crc, rows.channel)
-                notes.append((entry, start, end, (*row, method, 0)))
-                records += [record, index]
-                position += len(record) + len(index)
-            self.write(b"".join(records))
-            for note in notes:
-                self._note(*note)
+        position = self.position
+        for (rows, skip, data, crc), body in zip(chunks, packed, strict=True):
+            start, end, size = int(rows.times[0]), int(rows.times[-1]), len(data)
+            record = _chunk_record(name, body, (start, end, size, crc))
+            index = _message_index(rows, skip)
+            found = (start, end, position, len(record), rows.channel, position + len(record), len(index))
+            entry = _chunk_index(name, found, (len(body), size))
+            row = (position, len(record), size, rows.first, len(rows.offsets), skip, crc, rows.channel)
+            notes.append((entry, start, end, (*row, method, 0)))
+            records += [record, index]
+            position += len(record) + len(index)
+        self.write(b"".join(records))
+        for note in notes:
+            self._note(*note)
 
     def note_chunk(self, index: ChunkIndex, row: tuple[int, ...]) -> None:
         """Remembers a chunk that is in the file, for the summary and the episode index."""

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Callable
-from concurrent.futures import Future
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +20,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.journal import RowArea
-from tupli_mcap.recording.worker import ChunkWorker
 
 __all__ = ["HOLE", "ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
 
@@ -32,6 +29,7 @@ _TIMES_AT = SEQUENCE_OFFSET + 4  # log_time and publish_time follow the sequence
 HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 Array = np.ndarray[Any, Any]
 Sink = Callable[[Rows], None]
+StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]  # begins to make chunks; the result writes them
 
 
 def rows_per_half(row_size: int, chunk_size: int) -> int:
@@ -193,13 +191,15 @@ class ImageRows:
         sink: Sink,
         first: int = 0,
         time_ns: int = 0,
-        worker: ChunkWorker | None = None,
+        start_chunks: StartChunks | None = None,
         *,
         sealed: bool = False,
     ) -> None:
-        self._worker = worker
+        self._start_chunks = start_chunks
         self._sealed = sealed
-        self._jobs: dict[int, Future[None]] = {}  # chunks being written, by the half they are in
+        self._jobs: dict[
+            int, Callable[[], None]
+        ] = {}  # write a chunk that is being made, by the half it is in
         self._due: tuple[int, int, int, int] | None = None  # a full half: what `_emit` will be given
         self._leaf = leaf
         self._layout = layout
@@ -237,7 +237,7 @@ class ImageRows:
 
     def put(self, image: Array) -> None:
         """Writes the image of the state that follows the running row's; every step before must be committed."""
-        self._write_due(self._worker)
+        self._write_due(self._start_chunks)
         self._advance()
         self.put_first(image)
 
@@ -272,10 +272,10 @@ class ImageRows:
         # not now: the step of its last image is not committed yet, and the file must not have more images than steps
         self._due = (half, flushed, rows, self._sequence - rows + flushed)
 
-    def _write_due(self, worker: ChunkWorker | None) -> None:
+    def _write_due(self, start: StartChunks | None) -> None:
         due, self._due = self._due, None
         if due is not None:
-            self._emit(*due, worker)
+            self._emit(*due, start)
 
     def flush(self) -> None:
         """Writes the rows before the running one; every step before must be committed."""
@@ -286,11 +286,11 @@ class ImageRows:
 
     def _wait(self, half: int) -> None:
         """Until the chunk of a half is in the file; raises what its writing raised."""
-        job = self._jobs.pop(half, None)
-        if job is not None:
-            job.result()
+        write = self._jobs.pop(half, None)
+        if write is not None:
+            write()
 
-    def _emit(self, half: int, begin: int, end: int, first: int, worker: ChunkWorker | None) -> None:
+    def _emit(self, half: int, begin: int, end: int, first: int, start_chunks: StartChunks | None) -> None:
         if begin == end:
             return
         size = self._area.row_size
@@ -302,7 +302,7 @@ class ImageRows:
         if self._sealed:
             table["#publish_time"] = table["#log_time"]
         rows = even_rows(self._channel, first, data, table)
-        if worker is None:
+        if start_chunks is None:
             self._sink(rows)
         else:
-            self._jobs[half] = worker.submit(partial(self._sink, rows))
+            self._jobs[half] = start_chunks([rows])

@@ -13,11 +13,10 @@ from tupli_mcap.recording.journal import Journal
 from tupli_mcap.recording.logs import EventLog, StepLog
 from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
 from tupli_mcap.recording.vector_rows import VectorRows
-from tupli_mcap.recording.worker import ChunkWorker
 
 __all__ = ["Stores"]
 
-_LARGE_ROW = 16 * 1024  # bytes from which a thread writes the chunks
+_LARGE_ROW = 16 * 1024  # bytes from which a thread compresses the chunks
 
 
 class Stores:
@@ -27,7 +26,6 @@ class Stores:
         layout, channels: what the stores hold.
         container: counts the messages that are in the file already.
         journal: has the areas of `plan_areas`.
-        worker: writes the chunks of large images.
         add_chunk: writes a chunk, durably where that is asked for.
         start_chunks: begins to compress several chunks; what it returns writes them, durably where that is asked for.
         vector: steps of sub-environments.
@@ -50,7 +48,6 @@ class Stores:
         channels: Channels,
         container: Container,
         journal: Journal,
-        worker: ChunkWorker,
         add_chunk: Callable[[Rows], None],
         start_chunks: Callable[[Sequence[Rows]], Callable[[], None]],
         *,
@@ -71,7 +68,7 @@ class Stores:
             sinks = [
                 ImageRows(
                     leaf, layout.image_messages[leaf.name], rows_area(name), buffer(name), channel, add_chunk,
-                    counts[channel], before_ns, worker if leaf.size >= _LARGE_ROW else None, sealed=sealed,
+                    counts[channel], before_ns, start_chunks if leaf.size >= _LARGE_ROW else None, sealed=sealed,
                 )
                 for name, channel in zip(names, ids, strict=True)
             ]  # fmt: skip

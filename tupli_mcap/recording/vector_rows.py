@@ -20,11 +20,9 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.journal import RowArea
-from tupli_mcap.recording.rows import HOLE, Array
+from tupli_mcap.recording.rows import HOLE, Array, StartChunks
 
 __all__ = ["HOLE", "VectorRows"]
-
-StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]
 
 
 class VectorRows:

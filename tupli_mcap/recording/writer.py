@@ -14,7 +14,6 @@ import uuid
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -211,7 +210,7 @@ class RecordingWriter:
         self.journal = self._new_journal(areas)
         self.journal.publish(durable=self._durable)
         self._stores = stores = Stores(
-            layout, channels, self.container, self.journal, self.worker, self.add_chunk, self._start_chunks,
+            layout, channels, self.container, self.journal, self.add_chunk, self._start_chunks,
             vector=self.is_vector, sealed=self._sealed, durable=self._durable, grow=self._grow,
         )  # fmt: skip
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
@@ -320,7 +319,7 @@ class RecordingWriter:
         self._warn_if_deleted()
 
     def _start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], None]:
-        """Begins to compress and write chunks, on the worker's thread; the result waits until they are in the file.
+        """Begins to compress chunks, on the worker's thread; the result waits for it and writes them.
 
         Until then their memory must stay, and no other chunk of their channels be written.
         """
@@ -328,15 +327,16 @@ class RecordingWriter:
             self._check_room(rows)
         container = self.container
         with self.whole:
-            job = partial(container.add_prepared, [container.prepare(rows) for rows in chunks])
+            pack = container.start_chunks(chunks)
             # a thread that needs the interpreter lock for every chunk would wait for it again and again
-            written = self.worker.submit(job).result if container.packs_together else job
+            in_thread = container.packs_together or len(chunks) == 1
+            packed = self.worker.submit(pack) if in_thread else pack
 
         def finish() -> None:
             if self.failed is not None:
                 raise self.failed
             with self.whole:
-                written()
+                container.finish_chunks(packed())
                 if self._durable:
                     self._settle()
             self._warn_if_deleted()
