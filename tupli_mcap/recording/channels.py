@@ -143,8 +143,8 @@ def plan_areas(
             row // leaf.shape[0] if leaf.kind == "stack" else row
         )  # of a stack, most rows store one frame
         rows = rows_per_half(
-            stored, max(size, min(8 * stored, 1 << 20))
-        )  # a few images a chunk, within 1 MiB
+            stored, max(size, min(16 * stored, 2 << 20))
+        )  # some images a chunk, within 2 MiB
         rows = max(1, min(rows, _HALF // row))
         areas += [RowArea(f"{leaf.name}/{i}", row, rows) for i in range(n)]
     areas.append(LogArea("events", 512 * 1024))
