@@ -69,7 +69,7 @@ def test_a_replay_is_saved_without_what_pyarrow_would_import(tmp_path: Path) -> 
 @pytest.mark.parametrize("earlier", ["", "import pandas; "])
 def test_pandas_is_there_for_those_who_use_it(earlier: str) -> None:
     code = (
-        f"{earlier}from tupli_mcap.viewer.sdk import leave_pandas_out; leave_pandas_out(); import pyarrow\n"
+        f"{earlier}from tupli_mcap.viewer.sdk import import_quickly; import_quickly(); import pyarrow\n"
         "assert pyarrow.table({'a': [1, 2]}).to_pandas().a.tolist() == [1, 2]\n"
         "import pandas; assert pandas.Series([1]).sum() == 1"
     )

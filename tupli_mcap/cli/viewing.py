@@ -75,7 +75,7 @@ def _replay(
     Timelines: step, episode_time (where the recording knows how long a step takes), and wall clock.
     """
     from tupli_mcap import viewer
-    from tupli_mcap.viewer.sdk import leave_pandas_out
+    from tupli_mcap.viewer.sdk import import_quickly
 
     if to_mcap is not None:
         if compare or split or web or save is not None or connect is not None:
@@ -96,7 +96,7 @@ def _replay(
     if force and save is None:
         raise typer.BadParameter("--force replaces the file of --save; give that too")
     wanted = filter_of(filter_text)
-    leave_pandas_out()
+    import_quickly()
     if save is not None:
         commands: list[str] = []
         path = viewer.save(
