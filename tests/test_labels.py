@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from environments import Sampler
 from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation, RescaleAction
 from jsonschema import Draft202012Validator
@@ -173,6 +174,21 @@ def test_of_sub_environments_that_are_not_at_hand(mode: str, tmp_path: Path) -> 
         recorder.step(recorder.action_space.sample())
     labels = Recording(tmp_path / "r.mcap").labels
     assert labels.dimensions == {"state": CART_POLE} and labels.values == {"action": PUSHES}
+
+
+@pytest.mark.parametrize(
+    ("name", "seconds"), [("CartPole-v1", 0.02), ("Pendulum-v1", 0.05), ("FrozenLake-v1", 1 / 4), ("", None)]
+)
+def test_how_long_a_step_takes_in_other_processes(name: str, seconds: float | None, tmp_path: Path) -> None:
+    def make() -> gym.Env[Any, Any]:
+        space = gym.spaces.Discrete(2)
+        return gym.make(name) if name else Sampler(space, space)
+
+    with RecordVector(gym.vector.AsyncVectorEnv([make] * 2), tmp_path / "r.mcap") as recorder:
+        recorder.reset(seed=1)
+        for _ in range(3):  # none of them has ended of the question
+            recorder.step(recorder.action_space.sample())
+    assert Recording(tmp_path / "r.mcap").labels.step_seconds == seconds
 
 
 def test_what_a_wrapper_of_sub_environments_changed_has_no_name(tmp_path: Path) -> None:
