@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import pty
 import re
@@ -421,6 +422,23 @@ class TestLook:
             assert told["lengths"]["max"] == recording.index["length"].max()
         (steps,) = [channel for channel in told["channels"] if channel["topic"] == "/step"]
         assert steps["messages"] == 200
+
+    @pytest.mark.parametrize(
+        ("returns", "said"),
+        [
+            ([2.0, math.nan, 4.0], "mean 3, std 1, from 2 to 4; NaN in 1 episode, left out"),
+            ([math.nan, math.nan], "NaN in every episode"),
+        ],
+    )
+    def test_info_of_returns_that_are_no_numbers(self, here: Path, returns: list[float], said: str) -> None:
+        rewards = iter(returns)
+        env = gym.wrappers.TransformReward(gym.make("CartPole-v1"), lambda _: next(rewards))
+        with RecordEpisodes(env, "r.mcap") as recorder:
+            for _ in returns:
+                recorder.reset(seed=1)
+                recorder.step(0)
+        assert f"return       {said}\n" in ok("info", "r.mcap")
+        assert run("info", "r.mcap", "--json").json["returns"]["nan"] == returns.count(math.nan)
 
     def test_info_of_an_empty_recording(self, here: Path) -> None:
         spaces = gym.make("CartPole-v1")

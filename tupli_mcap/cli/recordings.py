@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from enum import StrEnum
@@ -339,9 +340,12 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
 def _spread_text(spread: Spread | None, of: str = "") -> str:
     if spread is None:
         return ""
+    if math.isnan(spread.mean) and math.isnan(spread.min):
+        return ", NaN in every episode"
+    odd = f"; NaN in {counted(spread.nan, 'episode')}, left out" if spread.nan else ""
     return (
         f", mean {number(spread.mean)}{of}, std {number(spread.std)}, "
-        f"from {number(spread.min)} to {number(spread.max)}"
+        f"from {number(spread.min)} to {number(spread.max)}{odd}"
     )
 
 

@@ -18,12 +18,16 @@ __all__ = ["ChannelFacts", "RecordingDescription", "Spread", "describe", "descri
 
 
 class Spread(NamedTuple):
-    """Of one number an episode: mean, population standard deviation, smallest, largest."""
+    """Of one number an episode: mean, population standard deviation, smallest, largest.
+
+    They are those of the others where `nan` of the episodes have no number; NaN where none has one.
+    """
 
     mean: float
     std: float
     min: float
     max: float
+    nan: int
 
 
 class ChannelFacts(NamedTuple):
@@ -140,8 +144,11 @@ def _spread(values: np.ndarray[Any, Any]) -> Spread | None:
     if len(values) == 0:
         return None
     numbers = values.astype(np.float64)
+    none = np.isnan(numbers)
+    numbers = numbers[~none] if not none.all() else numbers
     with np.errstate(invalid="ignore", over="ignore"):  # infinite returns have no spread
-        return Spread(float(numbers.mean()), float(numbers.std()), float(numbers.min()), float(numbers.max()))
+        mean, std, least, most = map(float, (numbers.mean(), numbers.std(), numbers.min(), numbers.max()))
+    return Spread(mean, std, least, most, int(none.sum()))
 
 
 def _channels(recording: Recording) -> list[ChannelFacts]:

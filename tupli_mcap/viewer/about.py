@@ -74,7 +74,8 @@ def card(recording: Recording) -> str:
     rows += [("steps", f"{d.steps:,}")]
     for name, spread in (("return", d.returns), ("length", d.lengths)):
         if spread:
-            rows.append((name, f"mean {spread.mean:.4g}, from {spread.min:.4g} to {spread.max:.4g}"))
+            odd = f"; NaN in {spread.nan:,} more" if spread.nan else ""
+            rows.append((name, f"mean {spread.mean:.4g}, from {spread.min:.4g} to {spread.max:.4g}{odd}"))
     rows += _leaf_rows(recording)
     rows += [
         ("benchmark", d.benchmark_id[:12] or "none"),
