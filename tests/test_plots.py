@@ -436,6 +436,7 @@ def test_recordings_are_compared(tmp_path: Path) -> None:
     best = max((one.rows["return"].max(), one.name) for one in made.measured)[1]
     assert [one.name for one, _ in made.traces] == [best]
     check_formats(made, tmp_path, page=False)
+    assert not [text for text in texts(made) if "lines are" in text]  # of so few episodes each is on them
     with pytest.raises(
         RecordingError, match="expected best, worst, first or last of 2 recordings, found '3'"
     ):
@@ -448,6 +449,24 @@ def test_recordings_of_different_spaces_are_compared_by_their_returns(tmp_path: 
     made = report([tmp_path / "a.mcap", tmp_path / "b.mcap"])
     assert made.notes[0].startswith("The recordings have different spaces")
     assert made.png()
+
+
+def test_what_lines_of_compared_recordings_are_is_said(tmp_path: Path) -> None:
+    space = spaces.Box(-99, 99, (1,), np.float32)
+    for name, episodes in (("short", 20), ("middle", 55), ("long", 3500)):
+        scripted(tmp_path / f"{name}.mcap", lambda n: np.float32([n]), space, episodes, length=1)
+    paths = {name: tmp_path / f"{name}.mcap" for name in ("short", "middle", "long")}
+
+    def told(*names: str) -> set[str]:
+        made = report([paths[name] for name in names])
+        return {text for text in texts(made) if text.startswith("episode;")}
+
+    assert told("short", "middle") == {"episode; lines are means of 2 to 5 episodes"}
+    assert told("short", "long") == {"episode; lines are means of 2 to 14 episodes"}
+    assert told("long", "long") == {"episode; lines are means of 14 episodes"}
+
+
+def test_so_many_recordings_that_not_all_are_named(tmp_path: Path) -> None:
     many = tmp_path / "many"
     many.mkdir()
     for i in range(14):

@@ -47,11 +47,21 @@ def _draw_order(axes: Any, measured: Sequence[Measured], column: str, name: str)
     else:
         for one, colour in zip(measured, colours(len(measured)), strict=True):
             _draw_one_of_several(axes, one, column, colour, few=len(measured) <= 4)
+        axes.set_xlabel(f"episode{_told_of_lines([len(one.rows) for one in measured])}")
     numbers = np.concatenate([one.rows["episode"].astype(np.int64) for one in measured])
     if numbers.min() == numbers.max():
         axes.set_xlim(numbers[0] - 1, numbers[0] + 1)
     axes.xaxis.get_major_locator().set_params(integer=True)
     legend_above(axes)
+
+
+def _told_of_lines(counts: Sequence[int]) -> str:
+    """What the lines of recordings of so many episodes are."""
+    spans = [count // _GROUPS if count > MOST_DOTS else window_of(count) for count in counts]
+    least, most = min(spans), max(spans)
+    if most == 1:
+        return ""
+    return f"; lines are means of {most if least == most else f'{least} to {most}'} episodes"
 
 
 def _draw_dots(axes: Any, rows: Array, values: Array) -> None:
