@@ -186,6 +186,17 @@ def test_a_url_that_is_none_is_told(folder: Path, capfd: pytest.CaptureFixture[s
     assert "error: the viewer at viewer.example took nothing" in capfd.readouterr().err
 
 
+def test_where_no_viewer_answers_it_ends_soon(
+    folder: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(targets, "_ANSWER_SECONDS", 0.3)
+    port = targets.free_port()
+    assert replay(folder / "runs" / "one.mcap", "--connect", f"rerun+http://127.0.0.1:{port}/proxy") == 1
+    told = capfd.readouterr().err
+    assert told.count("\n") == 1
+    assert re.search(rf"error: no viewer answers at .*; start one there \(rerun --port {port}\)", told)
+
+
 def test_without_a_viewer_it_says_how_to_get_one(
     folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

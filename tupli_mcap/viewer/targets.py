@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import shlex
+import socket
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording.replacing import replacing
@@ -29,6 +31,7 @@ from tupli_mcap.viewer.sdk import ViewerError
 
 __all__ = ["to_browser", "to_file", "to_viewer", "to_window"]
 
+_ANSWER_SECONDS = 3.0
 _FLUSH_SECONDS = 600.0  # a viewer takes some millions of steps a second
 
 
@@ -95,6 +98,7 @@ def to_viewer(plans: Iterable[Plan], url: str) -> None:
     Raises:
         ViewerError: the URL is none, or nobody there took the data.
     """
+    _await_viewer(url)
     for plan in plans:
         stream = plan.new_stream()
         try:
@@ -105,6 +109,29 @@ def to_viewer(plans: Iterable[Plan], url: str) -> None:
                 stream.flush(timeout_sec=_FLUSH_SECONDS)
         finally:
             stream.disconnect()
+
+
+def _await_viewer(url: str) -> None:
+    """Returns once somebody listens there, who may just have been started; the SDK would try for much longer."""
+    parts = urlsplit(url)
+    try:
+        address = parts.hostname, parts.port
+    except ValueError:  # the port is none: the SDK says what is wrong
+        return
+    if None in address or not parts.scheme.startswith("rerun"):
+        return
+    until = time.monotonic() + _ANSWER_SECONDS
+    while True:
+        try:
+            socket.create_connection(address, timeout=_ANSWER_SECONDS).close()
+            return
+        except OSError as err:
+            if time.monotonic() > until:
+                raise ViewerError(
+                    f"no viewer answers at {url} ({err.strerror or err}); start one there (rerun --port "
+                    f"{parts.port}), or write a file with --save FILE.rrd (in Python: save=)"
+                ) from err
+        time.sleep(0.1)
 
 
 @contextlib.contextmanager
