@@ -305,6 +305,7 @@ class TestTrust:
         code, out, err = run("render", path, "-o", tmp_path / "new.mcap")
         assert (code, out) == (1, "")
         assert err.startswith("error: rebuilding the environment")
+        assert "pass --trust or run `tupli-mcap trust FILE`" in err
         assert not (tmp_path / "new.mcap").exists()
         monkeypatch.undo()
         assert run("render", path, "-o", tmp_path / "new.mcap", "--trust", "--episodes", "all")[0] == 0
@@ -396,6 +397,29 @@ class TestCommandLine:
         )
         assert code == 0
         assert [episode["episode"] for episode in json.loads(out)["episodes"]] == [0, 2]
+
+    def test_the_best_episode_of_a_storage(self, tmp_path: Path) -> None:
+        lengths = {"one": 5, "two": 9}
+        (tmp_path / "runs").mkdir()
+        for name, steps in lengths.items():
+            env = gym.make("tests/Drifting-v0", render_mode=None, max_episode_steps=steps)
+            recorded(tmp_path / "runs" / f"{name}.mcap", env)
+        with Recording(tmp_path / "runs" / "two.mcap") as recording:
+            returns = {"two": recording.index["return"].max()}
+        with Recording(tmp_path / "runs" / "one.mcap") as recording:
+            returns["one"] = recording.index["return"].max()
+        best = max(returns, key=lambda name: returns[name])
+        code, out, err = run("render", tmp_path / "runs", "-o", tmp_path / "new.mcap")
+        assert (code, err) == (0, "")
+        with Recording(tmp_path / "new.mcap") as new:
+            found = [episode for episode in new.episodes if len(episode.frames)]
+            assert [(episode.return_, len(episode.frames)) for episode in found] == [
+                (returns[best], lengths[best] + 1)
+            ]
+        code, out, err = run("render", tmp_path / "runs", "-o", tmp_path / "all.mcap", "--episodes", "all")
+        assert (code, out) == (1, "")
+        assert "found some of 2 in" in err and "(one.mcap, two.mcap); give the path of one of them" in err
+        assert not (tmp_path / "all.mcap").exists()
 
     def test_a_divergence_is_said_and_its_frames_are_kept(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

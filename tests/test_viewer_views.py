@@ -69,6 +69,19 @@ def test_all_episodes_apart_are_opened_from_the_standard_input(
         assert len(window.client.get_state().recordings) == 3 and window.problems() == []
 
 
+def test_recordings_of_different_environments_are_opened_without_a_complaint(
+    cart_pole: Path, tmp_path: Path
+) -> None:
+    other, goal = viewed.talk(tmp_path / "talk.mcap"), tmp_path / "both.rrd"
+    result = CliRunner().invoke(app, ["replay", str(cart_pole), str(other), "--save", str(goal)])
+    assert "open it with: rerun - < " in result.output
+    with HeadlessViewer(tmp_path, piped=goal) as window:
+        for _ in patiently(20.0):
+            if len(window.settled().recordings) == 2:
+                break
+        assert len(window.client.get_state().recordings) == 2 and window.problems() == []
+
+
 def test_compared_episodes(viewer: HeadlessViewer, cart_pole: Path) -> None:
     state = shown(viewer, cart_pole, "--compare", "--episode", "best,worst")
     names = ("Cart Position", "Cart Velocity", "Pole Angle", "Pole Angular Velocity")

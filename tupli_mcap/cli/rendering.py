@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,11 +14,17 @@ import typer
 
 from tupli_mcap.cli.options import FilterText, Json, filter_of
 from tupli_mcap.cli.output import bytes_of, counted, number, print_json, step_progress
+from tupli_mcap.errors import RecordingError
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording import Recording
+    from tupli_mcap.recording.episode import Episode
     from tupli_mcap.replay import RenderReport
+    from tupli_mcap.schema import BaseFilter
 
 __all__ = ["register"]
+
+_MOST_NAMES = 5
 
 
 class _Format(StrEnum):
@@ -30,7 +38,12 @@ def register(app: typer.Typer) -> None:
 
 
 def _render(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or an URL.")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE|STORAGE", help="A recording: a path or an URL; or a directory with the recording."
+        ),
+    ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")
     ],
@@ -54,36 +67,62 @@ def _render(
     Rebuilds the environment, takes the episodes again, and compares every step with the recording, bit for
     bit. The frames go into a copy of the recording (as /camera/render), into an MP4, or into a GIF.
 
+    Of a storage, best and worst are those of all its recordings; other choices have to be of one recording.
+
     Where the replay differs from the recording, rendering ends: the frames before that are written, the
     difference is named, and the exit code is 1. So is it for an episode that cannot be replayed.
     """
-    from tupli_mcap.dataset.choose import choose_episodes
-    from tupli_mcap.recording import Recording
     from tupli_mcap.replay import render
 
     os.environ.setdefault(
         "SDL_VIDEODRIVER", "dummy"
     )  # no window is opened, and pygame need not look for a screen
-    with Recording(file) as recording:
-        chosen = choose_episodes(recording, episodes, filter_of(filter_text))
-        with step_progress(sum(map(len, chosen)), "rendering") as progress:
-            report = render(
-                recording,
-                output,
-                episodes=chosen,
-                every=every,
-                width=width,
-                frame_format=frame_format.value,
-                trust=trust,
-                overwrite=force,
-                progress=progress,
-            )
+    with (
+        _chosen(source, episodes, filter_of(filter_text)) as (recording, chosen),
+        step_progress(sum(map(len, chosen)), "rendering") as progress,
+    ):
+        report = render(
+            recording,
+            output,
+            episodes=chosen,
+            every=every,
+            width=width,
+            frame_format=frame_format.value,
+            trust=trust,
+            overwrite=force,
+            progress=progress,
+        )
     if as_json:
         print_json(_plain(report))
     else:
         _print(report)
     if not report.ok:
         raise typer.Exit(1)
+
+
+@contextlib.contextmanager
+def _chosen(
+    source: str, episodes: str, wanted: BaseFilter | None
+) -> Iterator[tuple[Recording, list[Episode]]]:
+    """Some episodes, and the one recording that they are of."""
+    from tupli_mcap.dataset.choose import choose_episodes
+    from tupli_mcap.recording import Recording
+    from tupli_mcap.viewer.choice import chosen_from
+
+    if "://" in source or not Path(source).is_dir():
+        with Recording(source) as recording:
+            yield recording, choose_episodes(recording, episodes, wanted)
+        return
+    with chosen_from(source, episodes, wanted) as found:
+        if len(found) > 1:
+            names = ", ".join(Path(item.recording.name).name for item in found[:_MOST_NAMES])
+            raise RecordingError(
+                f"expected episodes of one recording to render, found some of {len(found)} in {source} "
+                f"({names}{', …' if len(found) > _MOST_NAMES else ''}); give the path of one of them, or choose with "
+                "--episodes best, worst, first or last"
+            )
+        (item,) = found
+        yield item.recording, [item.recording.episodes[at] for at in item.positions]
 
 
 def _plain(report: RenderReport) -> dict[str, object]:

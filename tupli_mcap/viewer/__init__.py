@@ -30,7 +30,8 @@ def save(
     """Writes episodes and their blueprint into a `.rrd` file, which `rerun FILE` opens.
 
     Of a file with several Rerun recordings ("split", or recordings of different spaces) it opens one; `rerun - < FILE`
-    opens them all.
+    opens them all. Those of different spaces are of different applications in the viewer, which keeps a blueprint for
+    each; opened as `rerun FILE`, it says so.
 
     Args:
         sources: a recording, its path or URL, a storage's directory, or several of them.
