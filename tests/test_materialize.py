@@ -28,7 +28,7 @@ from tupli_mcap.dataset import DatasetError, writing
 from tupli_mcap.errors import FormatError, StorageError, TupliError
 from tupli_mcap.materialized import open_columns
 from tupli_mcap.recording import blocks as recording_blocks
-from tupli_mcap.sampling import FIELDS, SamplingError
+from tupli_mcap.sampling import FIELDS, MemorySteps, RecordedSteps, SamplingError
 from tupli_mcap.sampling.mapped import MAPPED_FIELDS, MappedSteps
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -129,6 +129,32 @@ def test_rows_in_any_order(cart: Files, tmp_path: Path, filter: Any) -> None:
     assert steps.read(["next_states"], rows[:0])["next_states"].shape == (0, 4)
     with pytest.raises(SamplingError, match="expected fields from states, .* found 'state'"):
         steps.read(["state"], rows)
+
+
+def test_rows_that_follow_each_other(cart: Files, tmp_path: Path) -> None:
+    loaded = cart()
+    columns = (*loaded.convert_to_numpy(mark_cuts=False), loaded.next_states.copy())
+    wanted = dict(zip(FIELDS, columns, strict=False))
+    fields = tuple(wanted)
+    loaded.load()
+    n = len(loaded)
+    shuffled = np.arange(n)
+    shuffled[3:5] = 4, 3
+    runs = [np.arange(n), np.arange(7, n - 2), np.arange(1), np.array([0, 0, 2]), shuffled]
+    kinds = {
+        MappedSteps: cart().materialize(tmp_path / "columns"), MemorySteps: loaded, RecordedSteps: cart(),
+    }  # fmt: skip
+    for kind, dataset in kinds.items():
+        steps = dataset.steps
+        assert type(steps) is kind
+        for rows in runs:
+            found = steps.read(fields, rows)
+            for field, column in found.items():
+                assert same(column, wanted[field][rows]), (kind, field)
+                column[:] = 0  # one's own: the next ones are what they were
+        for beyond in (np.arange(n + 1), np.arange(n, n + 2)):
+            with pytest.raises(IndexError, match=rf"{n}"):
+                steps.read(fields[:5], beyond)
 
 
 @pytest.mark.parametrize("of", [None, F("state.0") > 0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -11,9 +11,10 @@ import numpy as np
 
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.pieces import items, items_dtype
 from tupli_mcap.recording.together import do_all
 from tupli_mcap.sampling.segments import Piece, Segments
-from tupli_mcap.sampling.steps import pick_runs, rows_of_runs
+from tupli_mcap.sampling.steps import following, pick, pick_runs, rows_of_runs
 
 __all__ = ["TIME", "Column", "ConstantRows", "DecodedRows", "RowFormat", "Rows"]
 
@@ -72,6 +73,7 @@ class ConstantRows:
         self.segments = segments
         self.columns = columns
         self._formats = formats
+        self._items = [_items_of(source, columns) for source in formats]
         self._held: _HeldColumns | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -97,7 +99,8 @@ class ConstantRows:
             return self._read_chunks(names, rows, threads)
         if not held.whole:
             self._fill(held, rows, threads)
-        return {name: held.columns[name].take(rows, axis=0) for name in names}
+        where = following(rows, self.segments.total)
+        return {name: pick(held.columns[name], where) for name in names}
 
     def read_runs(self, names: Sequence[str], starts: Array, length: int, threads: int) -> dict[str, Any]:
         held = self._held
@@ -115,14 +118,11 @@ class ConstantRows:
         return out
 
     def _copy(self, piece: Piece, names: Sequence[str], out: dict[str, Any]) -> None:
-        chunk, fields = self._open(piece.unit, keep=True)
+        source = self._formats[int(self.segments.file_of[piece.unit])]
+        fields = source.fields
+        chunk = source.store.rows(int(self.segments.chunk_of[piece.unit]), source.dtype)
         for name in names:
             out[name][piece.out] = _shaped(chunk[fields.get(name, name)][piece.rows], out[name])
-
-    def _open(self, unit: int, *, keep: bool) -> tuple[Array, dict[str, str]]:
-        source = self._formats[int(self.segments.file_of[unit])]
-        chunk = source.store.rows(int(self.segments.chunk_of[unit]), source.dtype, keep=keep)
-        return chunk, source.fields
 
     def _fill(self, held: _HeldColumns, rows: Array, threads: int) -> None:
         missing = held.missing(rows)
@@ -131,7 +131,10 @@ class ConstantRows:
             held.whole = bool(held.there.all())
 
     def _fill_unit(self, held: _HeldColumns, unit: int) -> None:
-        held.put(unit, *self._open(unit, keep=False))
+        file, chunk = int(self.segments.file_of[unit]), int(self.segments.chunk_of[unit])
+        source, as_items = self._formats[file], self._items[file]
+        rows = source.store.rows(chunk, source.dtype if as_items is None else as_items, keep=False)
+        held.put(unit, rows, source.fields, as_items=as_items is not None)
 
 
 class _HeldColumns:
@@ -139,9 +142,9 @@ class _HeldColumns:
 
     def __init__(self, segments: Segments, columns: dict[str, Array]) -> None:
         self.columns = columns
+        self._items = {name: items(column) for name, column in columns.items() if column.size}
         self.there = np.zeros(len(segments.chunk_of), np.bool_)
-        self._filled = [name for name, column in columns.items() if column.size]
-        self.whole = not self._filled
+        self.whole = not self._items
         self._segments = segments
         self._order = np.argsort(segments.units, kind="stable")  # by unit
         counts = np.bincount(segments.units, minlength=len(self.there))
@@ -153,8 +156,8 @@ class _HeldColumns:
         wanted[self._segments.units[self._segments.of(rows)]] = True
         return np.flatnonzero(wanted & ~self.there).tolist()
 
-    def put(self, unit: int, chunk: Array, fields: dict[str, str]) -> None:
-        """Copies the rows of a chunk to where they belong."""
+    def put(self, unit: int, chunk: Array, fields: dict[str, str], *, as_items: bool) -> None:
+        """Copies the rows of a chunk, or these as items, to where they belong."""
         chosen = self._order[self._ends[unit] : self._ends[unit + 1]]
         begins, starts = self._segments.begins[chosen], self._segments.starts[chosen]
         lengths = np.append(self._segments.starts[1:], self._segments.total)[chosen] - starts
@@ -164,9 +167,12 @@ class _HeldColumns:
         else:
             within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
             source, place = np.repeat(begins, lengths) + within, np.repeat(starts, lengths) + within
-        for name in self._filled:
-            target = self.columns[name]
-            target[place] = _shaped(chunk[fields.get(name, name)][source], target)
+        for name, target in self._items.items():
+            values = chunk[fields.get(name, name)][source]
+            if as_items:
+                target[place] = values
+            else:
+                self.columns[name][place] = _shaped(values, self.columns[name])
         self.there[unit] = True  # last: another thread may be looking
 
 
@@ -211,6 +217,15 @@ class DecodedRows:
             for name in names:
                 if name in values:  # an array of no elements is not in the message
                     out[name][place] = values[name]
+
+
+def _items_of(source: RowFormat, columns: Mapping[str, Column]) -> np.dtype[Any] | None:
+    """The dtype of the rows as items, which are copied faster; None where columns hold the values in another dtype."""
+    fields: Mapping[str, Any] = source.dtype.fields or {}
+    own = {source.fields.get(name, name): column.dtype for name, column in columns.items()}
+    # there is no field for an array of no elements
+    same = all(fields[name][0].base == dtype for name, dtype in own.items() if name in fields)
+    return items_dtype(source.dtype) if same else None
 
 
 def _shaped(values: Array, target: Array) -> Array:

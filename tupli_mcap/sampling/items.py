@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
@@ -31,8 +31,7 @@ class Parts:
 
     def asdict(self) -> dict[str, Any]:
         """What there is, by name, without what was not asked for."""
-        named = ((field.name, getattr(self, field.name)) for field in fields(self))
-        return {name: value for name, value in named if value is not None}
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 class Items(ABC, Generic[T]):

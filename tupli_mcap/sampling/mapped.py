@@ -14,7 +14,7 @@ from tupli_mcap.materialized import OpenedColumns, open_columns
 from tupli_mcap.materialized.opened import VariableColumn
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.sampling.steps import FIELDS, checked_fields, pick_runs, rows_of_runs
+from tupli_mcap.sampling.steps import FIELDS, checked_fields, following, pick, pick_runs, rows_of_runs
 
 __all__ = ["MAPPED_FIELDS", "MappedSteps"]
 
@@ -66,7 +66,8 @@ class MappedSteps:
         Raises:
             SamplingError: there is no such field.
         """
-        return {field: self._field(field, rows) for field in checked_fields(fields, MAPPED_FIELDS)}
+        where = following(rows, len(self))
+        return {field: self._field(field, where) for field in checked_fields(fields, MAPPED_FIELDS)}
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
         """Columns of runs of steps, as of any `Steps`."""
@@ -84,7 +85,7 @@ class MappedSteps:
         variable size, which are made anew."""
         return self._field(field, None)
 
-    def _field(self, field: str, rows: Array | _Runs | None) -> Any:
+    def _field(self, field: str, rows: Array | slice | _Runs | None) -> Any:
         opened, layout = self.opened, self.opened.layout
         if field == "states":
             return layout.nest_state([_taken(opened.leaves[leaf.name], rows) for leaf in layout.state])
@@ -99,8 +100,9 @@ class MappedSteps:
         }  # fmt: skip
         return _taken(plain[field], rows)
 
-    def _next_states(self, rows: Array | None) -> Any:
-        rows = np.arange(len(self)) if rows is None else rows
+    def _next_states(self, rows: Array | slice | None) -> Any:
+        if rows is None or isinstance(rows, slice):
+            rows = np.arange(len(self))[slice(None) if rows is None else rows]
         places = np.searchsorted(self.breaks, rows)
         broken = (
             np.flatnonzero(self.breaks[np.minimum(places, len(self.breaks) - 1)] == rows)
@@ -129,14 +131,15 @@ class MappedSteps:
         return f"<MappedSteps {self.opened.path}: {len(self)} steps of {len(self.episode_lengths)} episodes>"
 
 
-def _taken(column: Any, rows: Array | _Runs | None) -> Any:
+def _taken(column: Any, rows: Array | slice | _Runs | None) -> Any:
     if isinstance(rows, _Runs):
         if isinstance(column, np.ndarray):
             return pick_runs(column, rows.starts, rows.length)
         rows = rows.rows
     if isinstance(column, VariableColumn):
-        return column[:] if rows is None else column.take(rows.tolist())
-    return column if rows is None else column.take(rows, axis=0)
+        rows = slice(None) if rows is None else rows
+        return column[rows] if isinstance(rows, slice) else column.take(rows.tolist())
+    return column if rows is None else pick(column, rows)
 
 
 def _open(directory: Path) -> OpenedColumns:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any, Protocol, runtime_checkable
 
 from torch.utils.data import get_worker_info
@@ -36,19 +35,13 @@ class ReadItems:
     def read(self, index: Any) -> dict[str, Any]:
         """The columns of an item (an integer), or of several (an array of them), by name."""
         if get_worker_info() is None:
-            found: dict[str, Any] = tensors(_columns(self.items[index]))
+            found: dict[str, Any] = tensors(self.items[index].asdict())
             return found
         if self._limited_in != os.getpid():
             self._limited_in = os.getpid()
             if isinstance(self.items.source, Caching):
                 self.items.source.limit(self._worker_cache_bytes, 1)
-        return packed(_columns(self.items[index]))
-
-
-def _columns(item: Any) -> dict[str, Any]:
-    """What there is in an item, by name: a dataclass, None where a column was not asked for."""
-    named = ((field.name, getattr(item, field.name)) for field in fields(item))
-    return {name: value for name, value in named if value is not None}
+        return packed(self.items[index].asdict())
 
 
 def check_state(state: Any, identity: str, expected: Mapping[str, Any]) -> None:
