@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import pickle
@@ -22,9 +23,13 @@ from test_recovery import abandon, cart_pole
 from test_sampling import naive
 
 from tupli_mcap import F, FileStorage, RecordEpisodes, Recording, TupliDataset
+from tupli_mcap.dataset.loading import Selected
+from tupli_mcap.dataset.materialize import Wanted, materialized
+from tupli_mcap.dataset.sources import FilesSource
 from tupli_mcap.errors import FormatError, NotFoundError, SpaceError
 from tupli_mcap.recording import EpisodeData, write_recording
 from tupli_mcap.sampling import FIELDS, ListedEpisodes, RecordedSteps, SamplingError, steps_of
+from tupli_mcap.sampling.mapped import MappedSteps
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 IMAGE = spaces.Dict({"eye": spaces.Box(0, 255, (3, 4, 3), np.uint8), "x": spaces.Box(0, 1, (2,))})
@@ -80,6 +85,41 @@ def test_steps_of_a_killed_recorder_and_of_one_at_work(tmp_path: Path) -> None:
     assert [row.tolist() for row in columns["states"]] == [step["states"].tolist() for step in rows]
     others = np.setdiff1d(np.arange(len(rows)), steps.open_ends)
     assert all(same(columns["next_states"][i], rows[i]["next_states"]) for i in others.tolist())
+
+
+@pytest.mark.parametrize("space", [IMAGE, spaces.Text(5)])
+def test_episodes_that_went_on_since_they_were_listed(tmp_path: Path, space: spaces.Space[Any]) -> None:
+    """What follows their last listed step is known by now: to the recordings as to columns made of them."""
+    paths = [tmp_path / "0.mcap", tmp_path / "1.mcap"]
+    with contextlib.ExitStack() as stack:
+        envs = [
+            stack.enter_context(RecordEpisodes(Sampler(space, spaces.Discrete(3), 9), path)) for path in paths
+        ]
+        for env in envs:
+            roll(env, 30)
+        source = FilesSource(paths)
+        headers = source.episodes(None, None)
+        for env in envs:
+            for _ in range(3):
+                env.step(env.action_space.sample())
+        lengths = [header.n_tuples for header in headers]
+        assert lengths == [9, 9, 9, 3] * 2
+        steps = RecordedSteps(
+            [ListedEpisodes.of(str(path), headers[4 * i : 4 * i + 4]) for i, path in enumerate(paths)],
+            source.open,
+        )
+        wanted = Wanted(
+            source, headers, None, None, None, lambda: Selected(np.array(lengths)), lambda: steps.identity
+        )
+        mapped = MappedSteps(materialized(wanted, tmp_path / "columns"))
+        expected = [step for n, episode in zip(lengths, naive(paths), strict=True) for step in episode[:n]]
+        for kind in (steps, mapped, pickle.loads(pickle.dumps(steps))):
+            assert len(kind) == len(expected) == 60
+            assert len(kind.open_ends) == 0
+            columns = kind.read(["states", "next_states"], np.arange(60)[::-1])
+            for place, step in enumerate(reversed(expected)):
+                for name, column in columns.items():
+                    assert same(_at(column, place), step[name]), (type(kind), name, place)
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4"])

@@ -65,8 +65,9 @@ def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
 class StepIndex:
     """Where the steps of listed episodes lie, in rows 0 to n - 1, episode after episode.
 
-    `after` (int64) says for each episode what comes after its last step: `-1 - k` is row k of `finals`; the number of
-    its last step where that is not known (`unknown`). `finals` are of the episodes `final_numbers`.
+    `after` (int64) says for each episode what comes after its last listed step: `-1 - k` is row k of `finals`; from n
+    on, the row of a step it has gone on with since it was listed; the number of that last step where nothing is known
+    (`unknown`). `finals` are of the episodes `final_numbers`.
     """
 
     layouts: list[StepLayout]
@@ -123,6 +124,12 @@ class _Part(NamedTuple):
         found: Array = (self.rows["final_row"] >= 0) & (self.rows["length"] == self.lengths)
         return found if self.stored.final_channel is not None else np.zeros_like(found)
 
+    @property
+    def went_on(self) -> Array:
+        """Which of the episodes have more steps than were listed."""
+        found: Array = self.rows["length"] > self.lengths
+        return found
+
     def locate(self, channels: Array, first: Array, counts: Array) -> tuple[Array, Array, Array]:
         """Chunks, places in them and numbers of rows, run after run; each run is of the channel of its place."""
         runs, found = [], []
@@ -178,8 +185,10 @@ class _Builder:
         lengths = _joined([part.lengths for part in parts], np.int64)
         known = _joined([part.known for part in parts], np.bool_)
         numbers = _joined([part.rows["episode"][part.known] for part in parts], np.uint32)
+        went_on = _joined([part.went_on for part in parts], np.bool_)
         after = np.cumsum(lengths) - 1
         after[known] = -1 - np.arange(len(numbers))
+        after[went_on] = lengths.sum() + np.arange(np.count_nonzero(went_on))
         images = dict.fromkeys(leaf.path for layout in self._layouts for leaf in layout.images)
         names = {leaf.path: leaf.name for leaf in self._layouts[0].state} if parts else {}
         return StepIndex(
@@ -192,18 +201,28 @@ class _Builder:
             numbers,
             lengths,
             after,
-            ~known,
+            ~(known | went_on),
             self._digest.hexdigest(),
         )
 
     def _steps(self, path: str | None) -> Segments:
-        """Where the steps lie, or the images of a leaf of the state."""
+        """Where the steps lie, or the images of a leaf of the state; then the next one of each episode that went on."""
         builder = SegmentsBuilder()
-        for file, (stored, part) in enumerate((part.stored, part) for part in self._parts):
-            image = next((leaf.name for leaf in stored.layout.images if leaf.path == path), None)
-            channels = stored.channels_of(part.rows["env"].astype(np.int64), image)
-            builder.add(file, *part.locate(channels, part.rows["first_row"].astype(np.int64), part.lengths))
+        places = [(*self._places(part, path), part) for part in self._parts]
+        for file, (channels, first, part) in enumerate(places):
+            builder.add(file, *part.locate(channels, first, part.lengths))
+        for file, (channels, first, part) in enumerate(places):
+            on = part.went_on
+            next_rows = first[on] + part.lengths[on]
+            builder.add(file, *part.locate(channels[on], next_rows, np.ones_like(next_rows)))
         return builder.build()
+
+    def _places(self, part: _Part, path: str | None) -> tuple[Array, Array]:
+        """The channel of the steps (or images) of each episode, and its first row there."""
+        stored = part.stored
+        image = next((leaf.name for leaf in stored.layout.images if leaf.path == path), None)
+        channels = stored.channels_of(part.rows["env"].astype(np.int64), image)
+        return channels, part.rows["first_row"].astype(np.int64)
 
     def _finals(self) -> Segments:
         builder = SegmentsBuilder()
