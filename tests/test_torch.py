@@ -6,10 +6,13 @@ import gc
 import io
 import itertools
 import json
+import multiprocessing
+import os
 import pickle
 import subprocess
 import sys
 import weakref
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
 
@@ -533,8 +536,27 @@ def test_a_worker_that_is_killed_is_told(tmp_path: Path) -> None:
         [sys.executable, "-c", KILLED, path], capture_output=True, text=True, timeout=200, check=False
     )
     assert done.returncode == 1
-    assert "RuntimeError: DataLoader worker (pid " in done.stderr
+    assert "RuntimeError: DataLoader worker (pid" in done.stderr
     assert ") is killed by signal: Killed." in done.stderr or "exited unexpectedly" in done.stderr
+
+
+def test_a_worker_that_dies_while_a_batch_is_handed_over() -> None:
+    ours, theirs = multiprocessing.Pipe()
+
+    def worker() -> None:
+        theirs.send_bytes(ForkingPickler.dumps(packed({"states": np.zeros(3)})))
+        ours.poll(60)  # until it is killed
+        os._exit(1)
+
+    process = multiprocessing.get_context("fork").Process(target=worker)
+    process.start()
+    batch = ours.recv_bytes()
+    process.kill()
+    process.join()
+    with pytest.raises(
+        RuntimeError, match="a worker of the DataLoader has died while it handed over a batch"
+    ):
+        pickle.loads(batch)
 
 
 def test_a_damaged_file_is_told_by_workers(tmp_path: Path) -> None:
@@ -553,6 +575,21 @@ def test_numbers_that_mean_nothing(dataset: TupliDataset) -> None:
     windows = dataset.windows(2)
     with pytest.raises(SamplingError, match="expected a batch size that is an integer from 1, found 0"):
         StreamDataset(windows, 0)
+    for kind in (MapDataset, lambda items: StreamDataset(items, 4)):
+        with pytest.raises(SamplingError, match=r"expected items such as dataset\.windows\(32\), found "):
+            kind(dataset)
+    with pytest.raises(
+        SamplingError, match="expected a budget of workers in bytes that is an integer from 0"
+    ):
+        MapDataset(windows, worker_cache_bytes=-1)
+    with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
+        MapDataset(windows)[0.5]
+    with pytest.raises(SamplingError, match=r"in one dimension, found array\(\[0.5\]\)"):
+        MapDataset(windows).__getitems__([0.5])
+    with pytest.raises(
+        SamplingError, match="expected at least 2000000 items for one full batch in each rank"
+    ):
+        StreamDataset(windows, 1_000_000, seed=0, drop_last=True, rank=0, ranks=2)
     with pytest.raises(SamplingError, match="expected rank and ranks, or neither of them, found rank=1"):
         StreamDataset(windows, 4, seed=0, rank=1)
     with pytest.raises(SamplingError, match="expected a rank from 0 to 1, found 2"):

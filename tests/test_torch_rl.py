@@ -15,6 +15,7 @@ from gymnasium import spaces
 from test_sampling import SPACES, at, record
 
 from tupli_mcap import F, TupliDataset
+from tupli_mcap.recording import EpisodeData, write_recording
 from tupli_mcap.sampling import SamplingError
 
 torch = pytest.importorskip("torch")
@@ -68,6 +69,17 @@ def test_what_does_not_go_on_is_done(tmp_path: Path) -> None:
     assert np.flatnonzero(cut[:]["next", "terminated"])[:2].tolist() == [6, 13]
 
 
+def test_next_observations_that_were_not_recorded(tmp_path: Path) -> None:
+    episodes = [
+        EpisodeData([0, 1], [0, 0], [1.0, 1.0], [False] * 2, [False] * 2, final) for final in (2, None)
+    ]
+    path = tmp_path / "a.mcap"
+    write_recording(path, episodes, observation_space=spaces.Discrete(9), action_space=spaces.Discrete(2))
+    batch = RecordedStorage(TupliDataset.from_files(path).transitions())[:]
+    assert batch["mask"].tolist() == [True, True, True, False]
+    assert batch["next", "observation"].tolist() == [1, 2, 1, 1]
+
+
 def test_slices_of_episodes(tmp_path: Path) -> None:
     dataset = TupliDataset.from_files(record(tmp_path / "a.mcap", SPACES["box"], 70))
     sampler = SliceSampler(num_slices=4, end_key=("next", "done"))
@@ -94,6 +106,10 @@ def test_what_a_storage_refuses(tmp_path: Path) -> None:
     transitions = dataset.transitions()
     with pytest.raises(SamplingError, match=r"expected dataset\.transitions\(\) over one step, found <30"):
         RecordedStorage(dataset.transitions(3))
+    with pytest.raises(
+        SamplingError, match="expected transitions with all fields, found none of next_states, term"
+    ):
+        RecordedStorage(dataset.transitions(fields=["states", "actions", "rewards"]))
     with pytest.raises(SamplingError, match="expected to read only"):
         RecordedStorage(transitions).set(0, None)
     with pytest.raises(RuntimeError, match="doesn't allow writing"):

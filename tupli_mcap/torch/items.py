@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from torch.utils.data import get_worker_info
 
 from tupli_mcap.sampling import Items, SamplingError
+from tupli_mcap.sampling.items import checked_count
 from tupli_mcap.torch.packed import packed
 from tupli_mcap.torch.tensors import tensors
 
@@ -28,8 +29,10 @@ class ReadItems:
     """Reads items as tensors; in a DataLoader's worker within a budget (bytes) of its own, and with one thread."""
 
     def __init__(self, items: Items[Any], worker_cache_bytes: int) -> None:
+        if not isinstance(items, Items):
+            raise SamplingError(f"expected items such as dataset.windows(32), found {items!r:.80}")
         self.items = items
-        self._worker_cache_bytes = worker_cache_bytes
+        self._worker_cache_bytes = checked_count(worker_cache_bytes, 0, "a budget of workers in bytes")
         self._limited_in = 0  # the worker process that keeps to the budget
 
     def read(self, index: Any) -> dict[str, Any]:

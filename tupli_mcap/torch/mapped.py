@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,11 +37,11 @@ class MapDataset(Dataset[dict[str, Any]]):
         return len(self._reader.items)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        return self._reader.read(int(index))
+        return self._reader.read(operator.index(index))
 
     def __getitems__(self, indices: Sequence[int]) -> Samples:
         """The items of a batch, read together."""
-        return Samples(self._reader.read(np.asarray(indices, np.int64)), len(indices))
+        return Samples(self._reader.read(np.asarray(indices)), len(indices))
 
     def state_dict(self) -> dict[str, Any]:
         """Says which items these are; where an epoch stands, the sampler knows."""

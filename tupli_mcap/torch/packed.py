@@ -5,16 +5,20 @@ PyTorch passes each tensor as a file of its own, which costs more than reading a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from multiprocessing.reduction import ForkingPickler
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch.multiprocessing.reductions import reduce_storage
 
 __all__ = ["PackedBatch", "packed"]
 
 _ALIGNED = 64  # bytes
 _NUMBERS = (np.ndarray, np.generic)
+_DYING = 0.5  # seconds until a process that has closed its files is seen to be dead
 
 
 class _Place(NamedTuple):
@@ -35,10 +39,20 @@ class PackedBatch(dict[str, Any]):
         self._leaves = list(_leaves(self))
 
     def __reduce__(self) -> tuple[Any, ...]:
+        return (_unpacked, self._parts) if self._unchanged else (dict, (dict(self),))
+
+    def _handed_over(self) -> tuple[Any, ...]:
+        """What `ForkingPickler` passes to another process."""
+        if not self._unchanged:
+            return dict, (dict(self),)
+        buffer, places = self._parts
+        return _received, (*reduce_storage(buffer.untyped_storage()), places)  # type: ignore[no-untyped-call]
+
+    @property
+    def _unchanged(self) -> bool:
+        """Whether nobody has put other columns into it."""
         now = list(_leaves(self))
-        if len(now) == len(self._leaves) and all(map(_same, now, self._leaves)):
-            return _unpacked, self._parts
-        return dict, (dict(self),)  # somebody has put other columns into it
+        return len(now) == len(self._leaves) and all(map(_same, now, self._leaves))
 
     def __copy__(self) -> dict[str, Any]:
         return dict(self)  # what is changed is no longer what is in the buffer
@@ -80,6 +94,26 @@ def _placed(column: Any, arrays: list[np.ndarray[Any, Any]], ends: list[int]) ->
     if isinstance(column, Mapping):
         return {key: _placed(part, arrays, ends) for key, part in column.items()}
     return tuple(_placed(part, arrays, ends) for part in column) if isinstance(column, tuple) else column
+
+
+ForkingPickler.register(PackedBatch, PackedBatch._handed_over)
+
+
+def _received(rebuild: Callable[..., Any], arguments: tuple[Any, ...], places: dict[str, Any]) -> Any:
+    """The batch of another process, which is asked for the memory.
+
+    Raises:
+        RuntimeError: it is dead.
+    """
+    try:
+        storage = rebuild(*arguments)
+    except (EOFError, ConnectionError, FileNotFoundError) as err:
+        time.sleep(_DYING)  # then the DataLoader knows, too, which one it was
+        raise RuntimeError(
+            "a worker of the DataLoader has died while it handed over a batch; it may have been killed, for using too "
+            "much memory for example"
+        ) from err
+    return _unpacked(torch.empty(0, dtype=torch.uint8).set_(storage), places)
 
 
 def _unpacked(buffer: torch.Tensor, place: Any) -> Any:

@@ -9,6 +9,7 @@ import torch
 
 from tupli_mcap.errors import MissingExtraError
 from tupli_mcap.sampling import SamplingError, Transitions
+from tupli_mcap.sampling.transitions import TRANSITION_FIELDS
 from tupli_mcap.torch.items import check_state
 from tupli_mcap.torch.tensors import tensors
 
@@ -29,19 +30,24 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
 
         RecordedStorage(dataset.transitions())
 
-    A TensorDict of B transitions has the keys "observation", "action", "episode" (its place in the query), and under
-    "next": "observation", "reward", "done", "terminated", "truncated", the last four of shape (B, 1). "truncated" (and
-    "done") is also True where an episode was interrupted, or goes on with a step that a tuple filter left out: the
-    following row is not its next step. A Dict space gives a nested TensorDict, a Tuple space one with the keys "0",
-    "1", ..., and values that differ in size are non-tensor data. A pickled copy opens the files itself.
+    A TensorDict of B transitions has the keys "observation", "action", "episode" (its place in the query), "mask"
+    (False where the next observation was not recorded, and the own one stands in its place: leave such transitions
+    out), and under "next": "observation", "reward", "done", "terminated", "truncated", the last four of shape (B, 1).
+    "truncated" (and "done") is also True where an episode was interrupted, or goes on with a step that a tuple filter
+    left out: the following row is not its next step. A Dict space gives a nested TensorDict, a Tuple space one with the
+    keys "0", "1", ..., and values that differ in size are non-tensor data. A pickled copy opens the files itself.
 
     Raises:
-        SamplingError: these are no transitions over one step; TorchRL has `MultiStepTransform` for more.
+        SamplingError: these are no transitions over one step, or lack fields; TorchRL has `MultiStepTransform` for
+            several steps.
     """
 
     def __init__(self, transitions: Transitions) -> None:
         if not isinstance(transitions, Transitions) or transitions.n_step != 1:
             raise SamplingError(f"expected dataset.transitions() over one step, found {transitions!r:.80}")
+        missing = [field for field in TRANSITION_FIELDS if field not in transitions.fields]
+        if missing:
+            raise SamplingError(f"expected transitions with all fields, found none of {', '.join(missing)}")
         super().__init__(max_size=len(transitions))
         self._transitions = transitions
 
@@ -76,6 +82,7 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
             "observation": _nested(columns["states"], len(numbers)),
             "action": _nested(columns["actions"], len(numbers)),
             "episode": columns["episodes"],
+            "mask": columns["mask"],
             "next": TensorDict(following, [len(numbers)]),
         }
         return TensorDict(given, [len(numbers)])

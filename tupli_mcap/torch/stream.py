@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from tupli_mcap.sampling import Items, SamplingError
+from tupli_mcap.sampling.items import checked_count
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.order import Batches, Blocks, Part, blocks_of
 
@@ -60,11 +60,15 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         worker_cache_bytes: int = WORKER_CACHE_BYTES,
     ) -> None:
         self._reader = ReadItems(items, worker_cache_bytes)
-        self._size, self._drop_last, self._seed = _least(batch_size, 1, "a batch size"), drop_last, seed
+        self._size, self._drop_last, self._seed = (
+            checked_count(batch_size, 1, "a batch size"),
+            drop_last,
+            seed,
+        )
         self._rank, self._ranks = _place(rank, ranks)
-        self._streams = None if streams is None else _least(streams, 1, "a number of streams")
+        self._streams = None if streams is None else checked_count(streams, 1, "a number of streams")
         if seed is not None:
-            _least(seed, 0, "a seed")
+            checked_count(seed, 0, "a seed", (1 << 128) - 1)
         elif shuffle and self._ranks > 1:
             raise SamplingError("expected a seed, which all ranks share, found None with several ranks")
         self._mix = 1
@@ -76,6 +80,11 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         self._drawn: tuple[int, int] | None = None  # a worker's seed, and how often it has gone through
         self._loaded: dict[str, Any] | None = None
         self._state = self._state_of(None, 0)
+        if not len(self):
+            raise SamplingError(
+                f"expected at least {self._size * self._ranks} items for one full batch in each rank, found "
+                f"{len(items)}; take drop_last=False"
+            )
 
     def set_epoch(self, epoch: int) -> None:
         """Says which epoch begins with the next iteration; another number is another order.
@@ -83,7 +92,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         Raises:
             SamplingError: it is no integer from 0.
         """
-        self._epoch.fill_(_least(epoch, 0, "a number of an epoch"))
+        self._epoch.fill_(checked_count(epoch, 0, "a number of an epoch"))
 
     def __len__(self) -> int:
         """Batches of an epoch in this rank."""
@@ -154,7 +163,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             raise SamplingError(
                 f"expected workers, key and batches in a state dict, found {[*state_dict]!r:.80}"
             )
-        _least(state_dict["batches"], 0, "a state dict with a number of batches")
+        checked_count(state_dict["batches"], 0, "a state dict with a number of batches")
         self._loaded = self._state = dict(state_dict)
 
     def _options(self) -> dict[str, Any]:
@@ -199,12 +208,6 @@ def _place(rank: int | None, ranks: int | None) -> tuple[int, int]:
         if not (distributed.is_available() and distributed.is_initialized()):
             return 0, 1
         rank, ranks = distributed.get_rank(), distributed.get_world_size()
-    if not 0 <= _least(rank, 0, "a rank") < _least(ranks, 1, "a number of ranks"):
+    if not 0 <= checked_count(rank, 0, "a rank") < checked_count(ranks, 1, "a number of ranks"):
         raise SamplingError(f"expected a rank from 0 to {ranks - 1}, found {rank}")
     return rank, ranks
-
-
-def _least(value: int, least: int, what: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise SamplingError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
-    return int(value)
