@@ -274,6 +274,8 @@ class TestMerge:
             ),
             ([one, named], RecordingError, "records /info with other fields"),
             ([one, benchmark], RecordingError, "expected a recording of benchmark none"),
+            ([one, one], RecordingError, r"1\.mcap holds episode 0 of .*1\.mcap again"),
+            (one, RecordingError, "expected a list of recordings to merge, found PosixPath"),
             ([one, copy], RecordingError, r"copy\.mcap holds episode 0 of .*1\.mcap again"),
             ([], RecordingError, "expected recordings with episodes to merge, found none"),
         ):
@@ -329,8 +331,15 @@ class TestSplit:
             split_recording(path, tmp_path / "part.mcap", episodes=5)
         with pytest.raises(RecordingError, match=r"run\.mcap exists"):
             split_recording(path, path, episodes=5)
-        with pytest.raises(RecordingError, match="how many episodes or how many bytes"):
-            split_recording(path, tmp_path / "new.mcap")
+        for limits in (
+            {},
+            {"episodes": 1.5},
+            {"episodes": "5"},
+            {"max_bytes": 0},
+            {"episodes": 1, "max_bytes": 9},
+        ):
+            with pytest.raises(RecordingError, match="how many episodes or how many bytes"):
+                split_recording(path, tmp_path / "new.mcap", **limits)
         assert sorted(p.name for p in tmp_path.iterdir()) == ["part_0003.mcap", "run.mcap"]
 
 

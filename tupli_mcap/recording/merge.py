@@ -7,7 +7,7 @@ import os
 import time
 import uuid
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -83,6 +83,8 @@ def merge_recordings(
         FormatError: one is damaged.
     """
     target = Path(target)
+    if isinstance(sources, str | os.PathLike) or not isinstance(sources, Iterable):
+        raise RecordingError(f"expected a list of recordings to merge, found {sources!r:.80}")
     with contextlib.ExitStack() as stack:
         opened = [stack.enter_context(Recording(source)) for source in sources]
         _check_target(target, opened, overwrite=overwrite)
@@ -168,7 +170,7 @@ def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool
 def _check_alike(sources: Sequence[Recording]) -> None:
     first = sources[0]
     description = first.layout.to_metadata()
-    seen = {(first.uuid, int(number)): first.name for number in first.index["episode"]}
+    seen = {(first.uuid, int(number)): first for number in first.index["episode"]}
     rows = sum(recording.num_steps for recording in sources)
     if rows > LAST_ROW:
         raise RecordingError(f"expected at most {LAST_ROW} steps in a recording, found {rows}; merge fewer")
@@ -196,9 +198,11 @@ def _check_alike(sources: Sequence[Recording]) -> None:
                 f"found {other.benchmark_id or 'none'}"
             )
         for number in other.index["episode"].tolist():
-            before = seen.setdefault((other.uuid, number), other.name)
-            if before != other.name:
-                raise RecordingError(f"{other.name} holds episode {number} of {before} again; leave one out")
+            before = seen.setdefault((other.uuid, number), other)
+            if before is not other:
+                raise RecordingError(
+                    f"{other.name} holds episode {number} of {before.name} again; leave one out"
+                )
 
 
 def _envs(recording: Recording) -> str:
@@ -257,9 +261,11 @@ def split_recording(
             written.
         FormatError: the source is damaged.
     """
-    if (episodes is None) == (max_bytes is None) or (episodes or max_bytes or 0) < 1:
+    limit = episodes if max_bytes is None else max_bytes
+    if (episodes is None) == (max_bytes is None) or not isinstance(limit, int | np.integer) or limit < 1:
         raise RecordingError(
-            "expected how many episodes or how many bytes go into a file, at least 1 of either"
+            "expected how many episodes or how many bytes go into a file, at least 1 of either, found "
+            f"episodes={episodes!r:.40} and max_bytes={max_bytes!r:.40}"
         )
     target = Path(target)
     with Recording(source) as recording:
