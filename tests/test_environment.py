@@ -22,6 +22,8 @@ from hypothesis import strategies as st
 
 from tupli_mcap import trust
 from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture, record_environment
+from tupli_mcap.environment._attributes import HAS_LAZY_DICTS, attributes
+from tupli_mcap.environment._pickling import attribute_names
 from tupli_mcap.errors import FormatError, TupliError, UntrustedError
 
 
@@ -543,3 +545,56 @@ def test_a_damaged_document_is_the_right_one_or_a_format_error(data: st.DataObje
 GOOD = EnvironmentRecord(
     "cart", spec={"id": "CartPole-v1", "kwargs": {"a": [1, 2.5, None]}}, versions={"python": "3"}
 )
+
+
+class TestAttributesWithoutDict:
+    """Only Python 3.11 and 3.12 keep attributes outside a dict until they are asked for it."""
+
+    class Made:
+        kind = "made"
+
+        def __init__(self) -> None:
+            self.kind = "made"  # as the class has it
+            self.nothing = None
+            self.parts = [1]
+
+    NAMES = ("kind", "nothing", "parts")
+
+    @pytest.mark.skipif(not HAS_LAZY_DICTS, reason="there is always a dict, or asking for it costs nothing")
+    def test_they_are_those_of_the_dict(self) -> None:
+        made = self.Made()
+        found = attributes(made, self.NAMES)
+        assert found == {"kind": "made", "nothing": None, "parts": [1]}
+        assert found is not None
+        assert found["parts"] is made.parts
+        assert found == vars(made)
+        assert attributes(made, self.NAMES) is None, "asked for its dict now"
+
+    def test_other_attributes_are_noticed(self) -> None:
+        one, another, third = self.Made(), self.Made(), self.Made()
+        one.secret = None  # type: ignore[attr-defined]
+        assert attributes(one, self.NAMES) is None
+        del another.parts
+        assert attributes(another, self.NAMES) is None
+        del third.kind  # which the class has
+        assert attributes(third, self.NAMES) is None
+
+    @pytest.mark.skipif(not HAS_LAZY_DICTS, reason="there is always a dict, or asking for it costs nothing")
+    def test_an_environment_is_captured_without_asking_for_it(self) -> None:
+        made, touched = gym.make("CartPole-v1"), gym.make("CartPole-v1")
+        names = attribute_names(touched)
+        told = capture(made)
+        layers = [made]
+        while isinstance(layers[-1], gym.Wrapper):
+            layers.append(layers[-1].env)
+        for obj in [*layers, made.unwrapped.action_space, made.unwrapped.observation_space]:
+            assert attributes(obj, names[type(obj)]) is not None, type(obj)
+        assert told == capture(touched)
+
+    def test_what_was_changed_is_captured(self) -> None:
+        env = gym.make("CartPole-v1")
+        env.unwrapped.gravity = 5.0  # type: ignore[attr-defined]
+        env.unwrapped.secret = None  # type: ignore[attr-defined]
+        copy = build(capture(env), trust=True)
+        assert vars(copy.unwrapped)["gravity"] == 5.0
+        assert vars(copy.unwrapped)["secret"] is None

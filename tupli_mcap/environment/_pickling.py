@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copyreg
 import io
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from types import FunctionType
 from typing import Any, cast
 
@@ -14,10 +15,12 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import EzPickle
 
+from tupli_mcap.environment._attributes import attributes, has_lazy_dict
 from tupli_mcap.environment._local_code import by_value
 
-__all__ = ["InProcessCopy", "dump", "load", "rebuild_ezpickled", "state"]
+__all__ = ["InProcessCopy", "Names", "attribute_names", "dump", "load", "rebuild_ezpickled", "state"]
 
+Names = Mapping[type, Collection[str]]  # of attributes, by class
 _PROTOCOL = 5
 _PLAIN_ATOMS = (type(None), bool, int, float, complex, str, bytes)
 _MAX_PLAIN_DEPTH = 20
@@ -28,13 +31,14 @@ class InProcessCopy:
 
     Classes are kept as they are, by reference, so that any class can be copied (locally defined ones too)
     and copies are instances of the very same classes. So are objects that cannot be pickled (open files):
-    `shares` tells whether copies have such objects in common with the original.
+    `shares` tells whether copies have such objects in common with the original. Objects that have just the attributes
+    that `names` has for their class are not asked for their `__dict__`.
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], names: Names | None = None) -> None:
         self.shares = False
         try:
-            self._data, self._kept = _dump_in_process(_InProcessPickler, env)
+            self._data, self._kept = _dump_in_process(_InProcessPickler, env, names)
         except Exception:  # noqa: BLE001 - any class may fail to pickle in its own way
             self._data, self._kept = _dump_in_process(_SharingPickler, env)
             self.shares = True
@@ -42,6 +46,13 @@ class InProcessCopy:
     def restore(self) -> gym.Env[Any, Any]:
         """A new environment in the state that was captured."""
         return cast("gym.Env[Any, Any]", _InProcessUnpickler(io.BytesIO(self._data), self._kept).load())
+
+
+def attribute_names(env: gym.Env[Any, Any]) -> Names:
+    """The names of the attributes of an environment and of what it holds. Asks all of them for their `__dict__`."""
+    made = _NamesPickler(io.BytesIO())
+    made.dump(env)
+    return made.names
 
 
 def dump(env: gym.Env[Any, Any], *, by_reference: bool) -> bytes:
@@ -88,12 +99,16 @@ class _EnvPickler(cloudpickle.Pickler):  # type: ignore[misc]
     """cloudpickle, but objects that pickle as their constructor's arguments keep their plain attributes as
     well: `env.unwrapped.gravity = 5` is part of the environment."""
 
+    def attributes_of(self, obj: Any) -> dict[str, Any]:
+        """A dict of its own of the attributes of an object."""
+        return dict(vars(obj))
+
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, EzPickle) and type(obj).__getstate__ is EzPickle.__getstate__:
-            attributes = dict(vars(obj))
-            if "_ezpickle_args" in attributes:
-                args, kwargs = attributes.pop("_ezpickle_args"), attributes.pop("_ezpickle_kwargs")
-                plain = {name: value for name, value in attributes.items() if _is_plain(value)}
+            own = self.attributes_of(obj)
+            if "_ezpickle_args" in own:
+                args, kwargs = own.pop("_ezpickle_args"), own.pop("_ezpickle_kwargs")
+                plain = {name: value for name, value in own.items() if _is_plain(value)}
                 return rebuild_ezpickled, (type(obj), args, kwargs, plain)
         return super().reducer_override(obj)
 
@@ -108,10 +123,23 @@ class _ByReferencePickler(_EnvPickler):
 
 
 class _InProcessPickler(_EnvPickler):
-    def __init__(self, buffer: io.BytesIO) -> None:
+    def __init__(self, buffer: io.BytesIO, names: Names | None = None) -> None:
         super().__init__(buffer, _PROTOCOL)
+        self._names = names or {}
         self.kept: list[Any] = []
         self._numbers: dict[int, int] = {}
+
+    def attributes_of(self, obj: Any) -> dict[str, Any]:
+        names = self._names.get(type(obj))
+        found = None if names is None else attributes(obj, names)
+        return super().attributes_of(obj) if found is None else found
+
+    def reducer_override(self, obj: Any) -> Any:
+        reduced = super().reducer_override(obj)
+        if reduced is NotImplemented and type(obj) in self._names and _is_reduced_plainly(type(obj)):
+            # as `object.__reduce_ex__` has it, which asks for the `__dict__`
+            return copyreg.__newobj__, (type(obj),), self.attributes_of(obj)  # type: ignore[attr-defined]
+        return reduced
 
     def persistent_id(self, obj: Any) -> Any:
         return self._keep(obj) if isinstance(obj, type) else None
@@ -121,6 +149,19 @@ class _InProcessPickler(_EnvPickler):
             self._numbers[id(obj)] = len(self.kept)
             self.kept.append(obj)  # which also keeps its id from being used again
         return self._numbers[id(obj)]
+
+
+class _NamesPickler(_InProcessPickler):
+    """Notes the names of the attributes of what it pickles, by class."""
+
+    def __init__(self, buffer: io.BytesIO) -> None:
+        super().__init__(buffer)
+        self.names: dict[type, tuple[str, ...]] = {}
+
+    def reducer_override(self, obj: Any) -> Any:
+        if has_lazy_dict(type(obj)):
+            self.names[type(obj)] = tuple(vars(obj))
+        return super().reducer_override(obj)
 
 
 class _SharingPickler(_InProcessPickler):
@@ -157,9 +198,11 @@ class _StatePickler(_InProcessPickler):
         return super().reducer_override(obj)
 
 
-def _dump_in_process(pickler: type[_InProcessPickler], env: gym.Env[Any, Any]) -> tuple[bytes, list[Any]]:
+def _dump_in_process(
+    pickler: type[_InProcessPickler], env: gym.Env[Any, Any], names: Names | None = None
+) -> tuple[bytes, list[Any]]:
     buffer = io.BytesIO()
-    made = pickler(buffer)
+    made = pickler(buffer, names)
     made.dump(env)
     return buffer.getvalue(), made.kept
 
@@ -187,6 +230,17 @@ class _Unpickler(pickle.Unpickler):
 def _untracked(make: Callable[..., Any]) -> Callable[..., Any]:
     # The last two arguments of both functions are the class's tracker id and `extra`.
     return lambda *args: make(*args[:-2], None, args[-1])
+
+
+def _is_reduced_plainly(cls: type) -> bool:
+    """Whether instances are pickled as their class and their attributes."""
+    names = ("__reduce_ex__", "__reduce__", "__getstate__")
+    return (
+        all(getattr(cls, name) is getattr(object, name) for name in names)
+        and not any(hasattr(cls, name) for name in ("__getnewargs__", "__getnewargs_ex__"))
+        and not issubclass(cls, list | dict)
+        and cls not in copyreg.dispatch_table
+    )
 
 
 def _is_plain(value: Any, depth: int = 0) -> bool:

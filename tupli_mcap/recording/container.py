@@ -55,6 +55,9 @@ CHUNK_ROWS = np.dtype(
 COMPRESSIONS = ["none", "zstd", "lz4"]
 _ROW = struct.Struct("<QQQQIIIHBB")  # of CHUNK_ROWS
 _TOGETHER = 64  # chunks compressed and written at once
+# Steps are recorded once and read hundreds of times. Beside level 1, rows of CartPole take 8% more room, are compressed
+# in 0.75 of the time and decompressed in 0.6 of it; walks of 17 float64 take 5% more, 0.4 and 0.2.
+_LEVEL = -1
 
 
 def _built(builder: RecordBuilder) -> bytes:
@@ -234,7 +237,7 @@ class Container:
 
     def _zstd(self) -> zstandard.ZstdCompressor:
         if not hasattr(self._local, "zstd"):
-            self._local.zstd = zstandard.ZstdCompressor(level=1)
+            self._local.zstd = zstandard.ZstdCompressor(level=_LEVEL)
         found: zstandard.ZstdCompressor = self._local.zstd
         return found
 
