@@ -6,6 +6,7 @@ rows' own headers must agree with the chunk table.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import struct
@@ -34,6 +35,7 @@ _CHUNK_HEAD = struct.Struct(
 )  # opcode, length, start, end, uncompressed size, crc, compression length
 
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
+_ROW_HEAD_DTYPE = np.dtype((np.void, _ROW_HEAD.size))
 _TIME, _TIME_OFFSET = struct.Struct("<Q"), 15  # in a Message record
 
 
@@ -85,6 +87,10 @@ class ChunkCache:
         return self._lock
 
     def get(self, key: tuple[int, int]) -> KeptChunk | None:
+        if (
+            not self._kept
+        ):  # as in reading all of a recording, whose threads need not wait for each other here
+            return None
         with self._held():
             if key in self._kept:
                 self._kept.move_to_end(key)
@@ -120,6 +126,12 @@ class Decoder(Protocol):
 
 
 _numbers = itertools.count()
+
+
+@functools.lru_cache(maxsize=4)  # most chunks of a channel have as many rows
+def _heads(rows: int, length: int, channel: int) -> bytes:
+    """What all the rows of a chunk begin with."""
+    return _ROW_HEAD.pack(5, length, channel) * rows
 
 
 class ChunkStore:
@@ -277,8 +289,8 @@ class ChunkStore:
                 f"{self._source.name}: chunk {i} expected {n} rows of {dtype.itemsize} bytes, found {len(data)} bytes"
             )
         rows = np.frombuffer(data, dtype)
-        head = _ROW_HEAD.pack(5, dtype.itemsize - 9, channel)
-        if np.ndarray(n, f"V{len(head)}", data, strides=dtype.itemsize).tobytes() != head * n:
+        heads = np.ndarray(n, _ROW_HEAD_DTYPE, data, 0, (dtype.itemsize,)).tobytes()
+        if heads != _heads(n, dtype.itemsize - 9, channel):
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
         kept.rows = rows
         return rows

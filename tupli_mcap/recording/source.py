@@ -114,8 +114,11 @@ class PathSource:
         if length > _LARGEST_LENT or not hasattr(os, "preadv"):
             return memoryview(self.read(offset, length))
         buffer = _lent_buffer(length)
-        found = _refusals_told(self.name, offset, length, lambda: os.preadv(self._fd, [buffer], offset))
-        return buffer if found == length else memoryview(self.read(offset, length))
+        try:
+            found = os.preadv(self._fd, [buffer], offset)
+        except OSError:
+            found = -1
+        return buffer if found == length else memoryview(self.read(offset, length))  # which tells of refusals
 
     def view(self, offset: int, length: int) -> memoryview:
         self._check(offset, length)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import struct
-import zlib
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -24,6 +23,7 @@ from mcap.records import (
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.container import MAGIC, PROFILE
+from tupli_mcap.recording.crc import crc32
 from tupli_mcap.recording.source import Source
 
 __all__ = [
@@ -98,7 +98,7 @@ def read_summary(source: Source) -> Summary:
     if not len(MAGIC) <= start <= end or end - start > _MAX_SUMMARY:
         raise FormatError(f"{source.name}: expected the summary before offset {end}, the footer says {start}")
     data = source.read(start, end - start)
-    if zlib.crc32(footer[:-4], zlib.crc32(data)) != crc:
+    if crc32(footer[:-4], crc32(data)) != crc:
         raise FormatError(f"{source.name}: the summary at offset {start} is damaged (its CRC differs)")
     summary = Summary({}, {}, {}, {}, 0, start)
     chunks = 0
@@ -194,7 +194,7 @@ def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
     if record[:1] != bytes([Opcode.ATTACHMENT]) or fixed + index.data_size + 4 != len(record):
         raise FormatError(f"{source.name}: expected the attachment {index.name!r} at offset {index.offset}")
     crc = int.from_bytes(record[-4:], "little")
-    if zlib.crc32(memoryview(record)[9:-4]) != crc:
+    if crc32(memoryview(record)[9:-4]) != crc:
         raise FormatError(
             f"{source.name}: the attachment {index.name!r} at offset {index.offset} is damaged (its CRC differs)"
         )
