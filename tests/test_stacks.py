@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.wrappers import FrameStackObservation
 from mcap.reader import make_reader
 
@@ -145,9 +146,32 @@ def test_without_the_wrapper_nothing_is_a_stack(tmp_path: Path) -> None:
         assert np.array_equal(recording.read().states, np.array(states))
 
 
-def test_sub_environments(tmp_path: Path) -> None:
+class Older(gym.ObservationWrapper[Any, Any, Any]):
+    """A wrapper of somebody else's, which says how many frames it stacks as Gymnasium's did before 1.0."""
+
+    def __init__(self, env: gym.Env[Any, Any], num_stack: int) -> None:
+        super().__init__(env)
+        self.num_stack = num_stack
+        self.observation_space = spaces.Box(0, 255, (num_stack, H, W), np.uint8)
+        self._frames = deque([np.zeros((H, W), np.uint8)] * num_stack, maxlen=num_stack)
+
+    def observation(self, observation: Any) -> Any:
+        self._frames.append(observation)
+        return np.array(self._frames)
+
+
+def test_sub_environments_are_asked_before(tmp_path: Path) -> None:
+    env = AsyncVectorEnv([lambda: Screen((4, H, W))] * 2)
+    with RecordVector(env, tmp_path / "r.mcap") as recorded:
+        recorded.reset(seed=1)  # they live on, though they stack nothing
+        recorded.step(recorded.action_space.sample())
+
+
+@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
+@pytest.mark.parametrize("stacked", [FrameStackObservation, Older])
+def test_sub_environments(tmp_path: Path, kind: Any, stacked: Any) -> None:
     path = tmp_path / "r.mcap"
-    env = RecordVector(SyncVectorEnv([lambda: FrameStackObservation(Screen(), 4)] * 3), path)
+    env = RecordVector(kind([lambda: stacked(Screen(), 4)] * 3), path)
     taken: list[list[Array]] = [[], [], []]
     states, _ = env.reset(seed=1)
     for t in range(200):
@@ -157,6 +181,7 @@ def test_sub_environments(tmp_path: Path) -> None:
         states = env.step(env.action_space.sample())[0]
     env.close()
     with Recording(path) as recording:
+        assert recording.layout is not None and recording.layout.stacks == ["state"]
         for i in range(3):
             mine = np.concatenate([e.states for e in recording.episodes if e.env == i])
             assert np.array_equal(mine, np.array(taken[i]))

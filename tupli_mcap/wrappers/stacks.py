@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import gymnasium as gym
@@ -11,21 +12,46 @@ from tupli_mcap.recording.pictures import ImageFormat
 
 __all__ = ["format_version", "with_stacks"]
 
+_SIZES = ("stack_size", "num_stack")  # of FrameStackObservation, and of Gymnasium's FrameStack before it
+
 
 def with_stacks(env: Any, spaces: StepLayout) -> StepLayout:
-    """`spaces`, with the leaves that a `FrameStackObservation` around `env` stacks.
+    """`spaces`, with the leaves that a wrapper around `env` stacks: the first axis is as long as an attribute
+    `stack_size` or `num_stack` of it says.
 
     A wrapper outside of it may change what it gives: then, too, what is stored is what the environment returned.
     """
-    sizes = set()
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, gym.wrappers.FrameStackObservation):
-            sizes.add(env.stack_size)
-        env = env.env
-    stacks = [leaf.name for leaf in spaces.state if can_stack(leaf) and leaf.shape[0] in sizes]
+    frames = [leaf for leaf in spaces.state if can_stack(leaf)]
+    sizes = _sizes(env) if frames else set()
+    stacks = [leaf.name for leaf in frames if leaf.shape[0] in sizes]
     if not stacks:
         return spaces
     return StepLayout(spaces.observation_space, spaces.action_space, spaces.reward_space, stacks=stacks)
+
+
+def _sizes(env: Any) -> set[Any]:
+    """How many frames the windows of an environment have."""
+    if isinstance(env, gym.vector.VectorEnv | gym.vector.VectorWrapper):
+        base = env.unwrapped
+        if type(base) is gym.vector.AsyncVectorEnv:
+            return _sizes_elsewhere(base)
+        inner = getattr(base, "envs", None)
+        return _sizes(inner[0]) if inner else set()
+    found = set()
+    while isinstance(env, gym.Wrapper):
+        found |= {vars(env)[name] for name in _SIZES if isinstance(vars(env).get(name), int)}
+        env = env.env
+    return found
+
+
+def _sizes_elsewhere(env: gym.vector.AsyncVectorEnv) -> set[Any]:
+    """The same of environments in other processes."""
+    found: set[Any] = set()
+    with contextlib.suppress(gym.error.Error):  # it is closed, or busy
+        for name in _SIZES:
+            if all(env.call("has_wrapper_attr", name)):  # else the question would end its process
+                found |= {size for size in env.get_attr(name) if isinstance(size, int)}
+    return found
 
 
 def format_version(spaces: StepLayout, images: ImageFormat) -> str:

@@ -99,7 +99,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         self._spaces = spaces = StepLayout(
             env.single_observation_space, env.single_action_space, reward_space
         )
-        self._spaces = spaces = with_stacks(next(iter(getattr(env.unwrapped, "envs", [])), None), spaces)
+        self._spaces = spaces = with_stacks(env, spaces)
         spaces.to_metadata()
         self.rotation = Rotation(path, mode, max_bytes, max_seconds)
         self._options = WriterOptions(
