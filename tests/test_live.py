@@ -246,12 +246,71 @@ def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:
         for _ in range(100):
             env.step(env.action_space.sample())
             time.sleep(0.01)
-    rows, values = shown(tmp_path / "r.rrd", "/state/cam", "Image:buffer")
+    for number in range(2):
+        rows, values = shown(tmp_path / "r.rrd", f"/env_{number}/state/cam", "Image:buffer")
+        with Recording(path) as recording:
+            cams = np.concatenate([e.states["cam"] for e in recording.episodes if e.env == number])
+        assert len(rows) > 5
+        for row, value in zip(rows, values, strict=True):
+            assert np.array(value[0], np.uint8).tobytes() == cams[row].tobytes()
+
+
+class Told(gym.Wrapper[Any, Any, Any, Any]):
+    """Says something of each step; a sub-environment's episodes are over after `length` steps."""
+
+    def __init__(self, length: int) -> None:
+        super().__init__(gym.make("Pendulum-v1", max_episode_steps=length))
+        self._number = 0
+
+    def step(self, action: Any) -> Any:
+        *rest, _ = self.env.step(action)
+        self._number += 1
+        return *rest, {"number": self._number, "half": self._number / 2, "word": "yes"}
+
+
+@pytest.mark.parametrize("num_envs", [0, 12])
+def test_numbers_among_infos_come_to_rerun(num_envs: int, tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    options: Any = {"record_info": True, "live": url(port)}
+    with receiver(port, tmp_path / "r.rrd"):
+        if num_envs:
+            inner = gym.vector.SyncVectorEnv([lambda: Told(7)] * num_envs)
+            env: Any = RecordVectorEpisodes(inner, path, **options)
+        else:
+            env = RecordEpisodes(Told(7), path, **options)
+        with env:
+            env.reset(seed=1)
+            for _ in range(200):
+                *_, timeout, _ = env.step(env.action_space.sample())
+                if not num_envs and timeout:
+                    env.reset()
+                time.sleep(0.005)
     with Recording(path) as recording:
-        cams = np.concatenate([e.states["cam"] for e in recording.episodes if e.env == 0])
-    assert len(rows) > 10
-    for row, value in zip(rows, values, strict=True):
-        assert np.array(value[0], np.uint8).tobytes() == cams[row].tobytes()
+        first = [e for e in recording.episodes if e.env == 0]
+        wanted = [info["half"] for episode in first for info in episode.infos or ()]
+        root = "/env_0" if num_envs else ""
+    rows, values = shown(tmp_path / "r.rrd", "/info/half")
+    found = [(row, half) for row, (half,) in zip(rows, values, strict=True) if not np.isnan(half)]
+    assert len(found) > 10
+    assert all(wanted[row] == half for row, half in found)
+    assert len(shown(tmp_path / "r.rrd", f"{root}/return")[0]) > 10
+    assert not len(shown(tmp_path / "r.rrd", "/info/word")[0])
+
+
+def test_sub_environments_of_short_episodes_stay_beside_the_others(tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    inner = gym.vector.SyncVectorEnv([lambda: Told(500), lambda: Told(1)])
+    with receiver(port, tmp_path / "r.rrd"), RecordVectorEpisodes(inner, path, live=url(port)) as env:
+        env.reset(seed=1)
+        for _ in range(500):
+            env.step(env.action_space.sample())
+            time.sleep(0.004)
+    with Recording(path) as recording:
+        steps = [sum(len(e) for e in recording.episodes if e.env == i) for i in range(2)]
+    assert steps[0] - steps[1] > 240  # each of its steps is followed by a reset
+    long, short = (shown(tmp_path / "r.rrd", f"/env_{i}/return")[0] for i in range(2))
+    assert (np.diff(long) > 0).all() and (np.diff(short) > 0).all()
+    assert abs(long[-1] - short[-1]) <= 100
 
 
 def test_the_newest_steps_are_a_heat_map_in_rerun(tmp_path: Path) -> None:

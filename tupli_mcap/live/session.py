@@ -23,7 +23,7 @@ from tupli_mcap.recording.writer import RecordingWriter
 __all__ = ["LiveSession", "LiveView", "open_session"]
 
 _SHORTEST_REST = 1 / 30  # seconds between two looks
-_LONGEST_REST = 1.0
+_LONGEST_REST, _LONGEST_VECTOR_REST = 1.0, 3.0  # there is more to show of several sub-environments
 _REST = 25.0  # times as long as showing kept a core busy
 _FAREWELL = 3.0  # seconds that closing waits for the thread, at most
 
@@ -78,6 +78,7 @@ class LiveSession:
         self._next: list[Watcher] = []
         self._stopping = threading.Event()
         self._meter = _Meter()
+        self._longest_rest = _LONGEST_VECTOR_REST if writer.is_vector else _LONGEST_REST
         self._thread: threading.Thread | None = threading.Thread(
             target=self._run, name="tupli-mcap-live", daemon=True
         )
@@ -96,7 +97,7 @@ class LiveSession:
                     self._watcher = watcher
                     self._view.go_on(watcher.writer)
                     self._show()
-                rest = min(max(_SHORTEST_REST, _REST * (self._meter.busy() - began)), _LONGEST_REST)
+                rest = min(max(_SHORTEST_REST, _REST * (self._meter.busy() - began)), self._longest_rest)
         except Exception as err:  # noqa: BLE001 - the rollout must not notice
             _warn(f"the live view has ended ({type(err).__name__}: {err}); the recording goes on")
         finally:

@@ -7,7 +7,8 @@ checked by its sequence numbers afterwards, and what was torn or overtaken is le
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+import struct
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,15 +19,17 @@ from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.cameras import EncodedFrame, decode_frame
 from tupli_mcap.recording.index import EPISODE_ROWS
+from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.logs import EventLog, StepLog, iter_records
 from tupli_mcap.recording.rows import HOLE, SingleRows
 from tupli_mcap.recording.writer import RecordingWriter
 
-__all__ = ["NewSteps", "Watcher"]
+__all__ = ["NewInfo", "NewSteps", "Watcher"]
 
 Array = np.ndarray[Any, Any]
 _EPISODES = 4096  # ended episodes looked at in one go
 _HEADER = RECORD_HEADER.size
+_PAIR = struct.Struct("<II")  # episode and step, with which the messages of infos begin
 
 
 class NewSteps(NamedTuple):
@@ -54,6 +57,11 @@ class NewSteps(NamedTuple):
         env, first, _, messages, *columns = self
         return NewSteps(env, first + skip, rows, messages[skip:], *(column[skip:] for column in columns))
 
+    def moved(self, rows: int) -> NewSteps:
+        """The same, so many rows later."""
+        env, first, table, messages, *columns = self
+        return NewSteps(env, first + rows, table, messages, *columns)
+
     def cdr(self) -> Iterator[tuple[int, bytes]]:
         """(log_time, CDR message with its header) of each step."""
         if self.rows is None:
@@ -62,6 +70,14 @@ class NewSteps(NamedTuple):
         data, size = self.rows.tobytes(), self.rows.dtype.itemsize
         for i, time_ns in enumerate(self.times.tolist()):
             yield time_ns, data[i * size + _HEADER : (i + 1) * size]
+
+
+class NewInfo(NamedTuple):
+    """The recorded infos of the step in row `row` of a sub-environment's channel; `time_ns` is wall clock."""
+
+    row: int
+    time_ns: int
+    values: Mapping[str, Any]
 
 
 class Watcher:
@@ -77,6 +93,7 @@ class Watcher:
         self._episodes = writer.index.count  # of earlier sessions: not shown
         # frames of steps that have not been looked at: episode, step, message
         self._pictures: dict[int, list[tuple[int, int, bytes]]] = {}
+        self._infos: list[tuple[int, bytes]] = []  # of such steps: log_time, message
         self._places: dict[str, tuple[int, int]] = {}  # log -> half and position
 
     @property
@@ -162,6 +179,31 @@ class Watcher:
             for (_, step, picture), row in zip(found, rows, strict=True)
             if row >= 0
         ][-most:]
+
+    def infos(self, env: int, most: int) -> list[NewInfo]:
+        """The newest of the new infos of a sub-environment: always of the same one."""
+        log, channel = self._writer.infos, self._writer.channels.info
+        if log is None or channel is None:
+            return []
+        new = [(time_ns, message) for _, time_ns, message in self._new_events("infos", log)]
+        found: list[tuple[int, int, bytes]] = []
+        waiting = []
+        begins: dict[int, int] = {}
+        for time_ns, message in [*self._infos, *new][-most * self.num_envs :]:
+            episode, step = _PAIR.unpack_from(message, BODY - _HEADER)
+            begin = begins.get(episode)
+            if begin is None:
+                begin = begins[episode] = self._begin_of(env, episode, -1)
+            if begin >= 0:
+                found.append((begin + step, time_ns, message))
+            else:  # of another sub-environment, or of steps that have not been looked at yet
+                waiting.append((time_ns, message))
+        self._infos = waiting[-most:]
+        decoder = InfoDecoder(self._writer.container.channels[channel].metadata)
+        return [
+            NewInfo(row, time_ns, decoder.decode(memoryview(message)[BODY - _HEADER :])[2])
+            for row, time_ns, message in found[-most:]
+        ]
 
     def _new_records(self, env: int) -> tuple[int, int, Array | None, list[tuple[int, bytes]]] | None:
         writer, seen = self._writer, self._seen.get(env, -1)

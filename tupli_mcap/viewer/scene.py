@@ -17,7 +17,7 @@ from tupli_mcap.viewer.blocks import Array
 from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, escaped, magnitudes, title_of
 from tupli_mcap.viewer.panels import Panel, Rewards, Series
 from tupli_mcap.viewer.pictures import Camera, Grid, HeatMap, Picture
-from tupli_mcap.viewer.words import Lanes, Words, infos_of
+from tupli_mcap.viewer.words import Lanes, LiveInfos, Words, infos_of
 
 __all__ = ["Scene", "live_scene", "scene_of"]
 
@@ -84,16 +84,34 @@ def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = Fa
     return scene
 
 
-def live_scene(layout: StepLayout, labels: Labels, sample: Sequence[Any], camera: str | None) -> Scene:
-    """The panels for a rollout that goes on; `sample` has columns of its first steps."""
+def live_scene(
+    layout: StepLayout,
+    labels: Labels,
+    sample: Sequence[Any],
+    camera: str | None,
+    infos: Sequence[str],
+    *,
+    apart: bool,
+) -> Scene:
+    """The panels for a rollout that goes on.
+
+    Args:
+        sample: columns of its first steps.
+        infos: keys of infos that are numbers.
+        apart: each dimension gets a view of its own, for several sub-environments to be in it.
+    """
     scene = Scene(rewards=[Rewards(layout.reward)], grows=True)
     if camera is not None:
         scene.beside.append(Camera(camera, f"/camera/{escaped(camera)}", f"camera {camera}"))
-    material = _Material(labels, sample, _MOST_LANE_ROWS + 1, False)
+    material = _Material(labels, sample, _MOST_LANE_ROWS + 1, apart)
     for leaf in layout.state:
         _add(scene, scene.states, leaf, "states", material)
     for leaf in layout.action:
         _add(scene, scene.actions, leaf, "actions", material)
+    if infos:
+        title = "infos of env 0" if apart else "infos"
+        entities = {key: f"/info/{escaped(key)}" for key in infos}
+        scene.beside.append(LiveInfos(entities, {}, title))
     return scene
 
 

@@ -47,6 +47,10 @@ class Times:
         """Of some of the rows."""
         return Times(self._step[rows], self._wall[rows], self._step_seconds)
 
+    def moved(self, steps: int) -> Times:
+        """So many steps later, at the same wall clock."""
+        return Times(self._step + steps, self._wall, self._step_seconds)
+
     def inserted(self, before: Array, step: Array, wall: Array) -> Times:
         """With other rows, each before one of these."""
         return Times(

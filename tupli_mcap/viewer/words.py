@@ -15,7 +15,7 @@ from tupli_mcap.viewer.names import escaped
 from tupli_mcap.viewer.panels import PALETTE, Place, named, plot
 from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
 
-__all__ = ["Infos", "Lanes", "Words", "infos_of"]
+__all__ = ["Infos", "Lanes", "LiveInfos", "Words", "infos_of", "numbers_in"]
 
 _LONGEST = 2000  # characters of a text that is shown
 _NO_STATE = ""  # as the viewer reads it: a gap in the lane
@@ -159,6 +159,27 @@ class Infos:
         return views[0] if len(views) == 1 else rrb.Tabs(*views, name=self.title)
 
 
+class LiveInfos(Infos):
+    """Numbers among the infos of the first sub-environment of a rollout that goes on: they are below no root."""
+
+    def send_numbers(
+        self, place: Place, infos: Sequence[Mapping[str, Any]], times: Times, *, missed: bool
+    ) -> None:
+        """Sends the numbers of `infos`, one a row of `times`; `missed` ones before them break the lines."""
+        for key, entity in self.numbers.items():
+            rows = [row for row, info in enumerate(infos) if _is_number(info.get(key))]
+            if not rows:
+                continue
+            values = np.array([float(np.asarray(infos[row][key]).reshape(())) for row in rows])
+            if missed:
+                before = times.at(np.array(rows[:1])).moved(-1)
+                send_scalars(place.stream, place.root + entity, before, np.full((1, 1), np.nan))
+            send_scalars(place.stream, place.root + entity, times.at(np.array(rows)), values[:, None])
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        return super().view([""], axis)
+
+
 def infos_of(recording: Recording, positions: Sequence[int], most: int) -> tuple[Infos | None, list[str]]:
     """The panel of the infos that the given episodes have, and what of them is not shown."""
     kinds: dict[str, str] = {}
@@ -175,6 +196,15 @@ def infos_of(recording: Recording, positions: Sequence[int], most: int) -> tuple
         return None, unseen
     entities = {key: f"/info/{escaped(key)}" for key in (*numbers[:most], *texts[:most])}
     return Infos({k: entities[k] for k in numbers[:most]}, {k: entities[k] for k in texts[:most]}), unseen
+
+
+def numbers_in(infos: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Keys whose values are all numbers."""
+    kinds: dict[str, bool] = {}
+    for info in infos:
+        for key, value in info.items():
+            kinds[key] = kinds.get(key, True) and _is_number(value)
+    return [key for key, numeric in kinds.items() if numeric]
 
 
 def _is_number(value: Any) -> bool:

@@ -1,0 +1,294 @@
+"""One sub-environment of a rollout that goes on, in the panels of a replay."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.layout import BODY, RECORD_HEADER
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.watching import NewInfo, NewSteps, Watcher
+from tupli_mcap.viewer.blocks import Array, Block, Piece
+from tupli_mcap.viewer.panels import Panel, Place, Rewards, Series
+from tupli_mcap.viewer.pictures import Camera, HeatMap
+from tupli_mcap.viewer.scene import Scene
+from tupli_mcap.viewer.sending import Times, send_scalars
+from tupli_mcap.viewer.words import LiveInfos
+
+__all__ = ["MOST_INFOS", "LiveEnv", "columns_of"]
+
+_STEPS = 1000  # of the newest, at a time, of all sub-environments together
+_DECODED = 200  # where each message is decoded on its own
+MOST_INFOS = 300
+_IMAGES = 3
+_MAP_STEPS = 400
+_CDR = BODY - RECORD_HEADER.size
+_TERMINAL, _TIMEOUT, _INTERRUPTED = range(3)
+
+
+class _Columns(NamedTuple):
+    states: Any
+    actions: Any
+    rewards: Any
+
+
+@dataclass(frozen=True)
+class _Ends:
+    """What panels ask a recording: how its episodes ended, by position."""
+
+    index: dict[str, Array]
+
+
+class _NewestMap:
+    """The heat map of the newest steps, whatever their episodes: those of a replay are of whole episodes."""
+
+    def __init__(self, panel: HeatMap) -> None:
+        self._panel = panel
+        self._values = np.empty((0, panel.leaf.size), np.float32)
+
+    def take(self, columns: _Columns) -> None:
+        values = self._panel.leaf.get(getattr(columns, self._panel.column))
+        new = values.reshape(len(values), -1)[-_MAP_STEPS:].astype(np.float32)
+        self._values = np.concatenate([self._values, new])[-_MAP_STEPS:]
+        finite = np.isfinite(new)
+        panel = self._panel
+        low = np.minimum(panel.low, np.where(finite, new, np.inf).min(axis=0, initial=np.inf))
+        high = np.maximum(panel.high, np.where(finite, new, -np.inf).max(axis=0, initial=-np.inf))
+        self._panel = replace(panel, low=low, high=high)
+
+    def send(self, place: Place, times: Times) -> None:
+        self._panel.send_map(place, self._values, times)
+
+
+class LiveEnv:
+    """Sends the steps of sub-environment `env`, numbered through all its episodes.
+
+    Args:
+        scene: the panels that all sub-environments have.
+        place: below which root they are; without a stream still.
+        share: one of so many that are shown.
+    """
+
+    def __init__(
+        self, layout: StepLayout, seconds: float | None, scene: Scene, env: int, place: Place, share: int
+    ) -> None:
+        self._env = env
+        self._place = place
+        self._layout = layout
+        self._decoder = None if layout.constant else MessageDecoder(layout)
+        self._seconds = seconds
+        self._most = max(1, (_STEPS if layout.constant else _DECODED) // share)
+        self._images = max(1, _IMAGES // share)
+        self._rows = 0  # looked at
+        self._shift = 0  # of its rows on the timeline
+        self._next = 0  # the number after the last one sent
+        self._missed = False  # whether steps were left out since the last infos
+        self._rewards = Rewards(layout.reward)  # it remembers
+        shown = [*scene.states, *scene.actions, *scene.beside]
+        # cameras, infos and maps come by themselves
+        self._panels = [
+            self._rewards,
+            *(panel for panel in shown if not isinstance(panel, HeatMap | Camera | LiveInfos)),
+        ]
+        self._cameras = [panel for panel in shown if isinstance(panel, Camera)]
+        self._infos = next((panel for panel in shown if isinstance(panel, LiveInfos) and not env), None)
+        self._maps = [_NewestMap(panel) for panel in shown if isinstance(panel, HeatMap)]
+
+    @property
+    def _alone(self) -> Place:
+        """Where there is what only this sub-environment has."""
+        return Place(self._place.stream)
+
+    @property
+    def end(self) -> int:
+        """The number after the last row that is known of."""
+        return self._rows + self._shift
+
+    def expect(self, new: NewSteps) -> None:
+        """These steps are sent next."""
+        self._rows = new.first + len(new)
+
+    def catch_up(self, end: int) -> None:
+        """Numbers rows from here on so that the last one known of is before `end`.
+
+        There are fewer rows where episodes are shorter: a reset is none.
+        """
+        self._shift = max(self._shift, end - self._rows)
+
+    def on(self, stream: Any) -> None:
+        """Sends to this stream from now on."""
+        self._place = self._place._replace(stream=stream)
+
+    def declare(self) -> None:
+        """Sends what does not change."""
+        for panel in self._panels:
+            panel.declare(self._place)
+        if self._infos is not None:
+            self._infos.declare(self._alone)
+
+    def send(self, watcher: Watcher, new: NewSteps) -> None:
+        """Sends the newest of new steps."""
+        shown = new.newest(self._most).moved(self._shift)
+        if shown.first != self._next:
+            self._leave_out(shown)
+        self._next = shown.first + len(shown)
+        self._send_steps(shown)
+        self._send_images(watcher, shown)
+        newest = self._times(np.array([self._next - 1]), shown.times[-1:])
+        for heat_map in self._maps:
+            heat_map.send(self._place, newest)
+
+    def send_infos(self, found: Sequence[NewInfo]) -> None:
+        """Sends the numbers among infos."""
+        if not found or self._infos is None:
+            return
+        rows = np.array([info.row for info in found]) + self._shift
+        self._infos.send_numbers(
+            self._alone,
+            [info.values for info in found],
+            self._times(rows, np.array([info.time_ns for info in found])),
+            missed=self._missed or len(found) >= MOST_INFOS,
+        )
+        self._missed = False
+
+    def _leave_out(self, after: NewSteps) -> None:
+        """Breaks the lines where steps are missing before those that follow."""
+        self._rewards.miss()
+        self._missed = True
+        times = self._times(np.array([after.first - 1]), after.times[:1])
+        lines = [(panel.entity, len(panel.dims)) for panel in self._panels if isinstance(panel, Series)]
+        for entity, width in (*lines, ("/reward", 1)):
+            send_scalars(self._place.stream, self._place.root + entity, times, np.full((1, width), np.nan))
+
+    def _send_steps(self, steps: NewSteps) -> None:
+        columns = columns_of(self._layout, self._decoder, steps)
+        for heat_map in self._maps:
+            heat_map.take(columns)
+        bounds = [0, *(np.flatnonzero(np.diff(steps.episodes)) + 1).tolist(), len(steps)]
+        ends = _ends_of(columns, self._flags(steps), bounds)
+        whole = _block(steps, columns, (0, len(steps)), bounds, ends)
+        times = self._times(whole.number, whole.times)
+        for panel in self._panels:
+            if panel is not self._rewards and not _is_apart(panel):
+                panel.send(self._place, whole, times)
+        # the return goes on from one block to the next only where an episode is alone in its block
+        head = bounds[1] if steps.steps[0] else 0
+        tail = bounds[-2] if ends[-1] is None else bounds[-1]
+        for cut in itertools.pairwise(sorted({0, head, tail, len(steps)})):
+            block = _block(steps, columns, cut, bounds, ends)
+            self._rewards.send(self._place, block, self._times(block.number, block.times))
+
+    def _send_images(self, watcher: Watcher, steps: NewSteps) -> None:
+        stop = steps.first + len(steps)
+        first = max(steps.first, stop - self._images)
+        wanted = range(first - self._shift, stop - self._shift)
+        for number, leaf in enumerate(self._layout.images):
+            found = watcher.images(number, self._env, wanted)
+            for panel in self._panels:
+                if found and getattr(panel, "leaf", None) is leaf:
+                    rows = np.array(sorted(found))
+                    images = np.stack([found[row]["data"] for row in rows.tolist()])
+                    rows += self._shift
+                    times = steps.times[rows - steps.first]
+                    part: Any = _Columns(self._nested(leaf, images), None, None)
+                    nobody: Any = None  # a picture asks only for its values
+                    block = Block(nobody, part, [], rows, times)
+                    panel.send(self._place, block, self._times(rows, times))
+
+    def send_frames(self, watcher: Watcher) -> None:
+        """Sends the newest frames."""
+        import rerun as rr
+
+        stream = self._place.stream
+        for panel in self._cameras:
+            for row, frame in watcher.frames(self._env, self._images):
+                stream.reset_time()
+                stream.set_time("step", sequence=row + self._shift)
+                stream.set_time("time", timestamp=np.datetime64(frame.time_ns, "ns"))
+                if self._seconds is not None:
+                    stream.set_time("episode_time", duration=(row + self._shift) * self._seconds)
+                image = rr.EncodedImage(contents=frame.data, media_type=f"image/{frame.form}")
+                stream.log(self._place.root + panel.entity, image)
+
+    def _nested(self, leaf: Leaf, values: Array) -> Any:
+        """A state of this leaf only."""
+        return self._layout.nest_state([values if other is leaf else None for other in self._layout.state])
+
+    def _times(self, rows: Array, times: Array) -> Times:
+        return Times(rows, times, self._seconds)
+
+    def _flags(self, steps: NewSteps) -> tuple[Array, Array]:
+        if steps.rows is not None:
+            return steps.rows["terminal"], steps.rows["timeout"]
+        flags = np.array([tuple(message[-2:]) for _, message in steps.messages], np.bool_)
+        return flags[:, 0], flags[:, 1]
+
+
+def columns_of(layout: StepLayout, decoder: MessageDecoder | None, steps: NewSteps) -> _Columns:
+    """States, actions and rewards of some steps; `decoder` is None if the layout is constant."""
+    if steps.rows is not None:
+        named: dict[str, Any] = {leaf.name: steps.rows[leaf.name] for leaf in layout.step_leaves if leaf.size}
+    else:
+        decoder = decoder or MessageDecoder(layout)
+        decoded = [decoder.step(memoryview(message)[_CDR:]) for _, message in steps.messages]
+        named = {
+            leaf.name: [step[leaf.name] for step in decoded]
+            if leaf.dtype is None
+            else np.array([step[leaf.name] for step in decoded])
+            for leaf in layout.step_leaves
+            if leaf.dtype is None or leaf.size
+        }
+    states, actions, rewards = (
+        [named.get(leaf.name) for leaf in leaves] for leaves in (layout.state, layout.action, layout.reward)
+    )
+    return _Columns(layout.nest_state(states), layout.nest_action(actions), layout.nest_reward(rewards))
+
+
+def _block(
+    steps: NewSteps, columns: _Columns, cut: tuple[int, int], bounds: list[int], ends: Sequence[int | None]
+) -> Block:
+    """The steps from one of the bounds of episodes to another."""
+    begin, end = cut
+    pieces: list[Piece] = []
+    codes: list[int] = []
+    for (a, b), how in zip(itertools.pairwise(bounds), ends, strict=True):
+        if begin <= a < b <= end:
+            pieces.append(Piece(a - begin, b - begin, len(pieces), int(steps.steps[a]), how is not None))
+            codes.append(_INTERRUPTED if how is None else how)
+    part: Any = _Columns(*(_sliced(value, begin, end) for value in columns))
+    asked: Any = _Ends({"end": np.array(codes)})
+    rows = np.arange(steps.first + begin, steps.first + end)
+    return Block(asked, part, pieces, rows, steps.times[begin:end])
+
+
+def _ends_of(columns: _Columns, flags: tuple[Array, Array], bounds: list[int]) -> list[int | None]:
+    """How each stretch of an episode ends: None where it goes on after the last row."""
+    terminal, timeout = flags
+    found: list[int | None] = []
+    for end in bounds[1:]:
+        if terminal[end - 1] or timeout[end - 1]:
+            found.append(_TERMINAL if terminal[end - 1] else _TIMEOUT)
+        else:
+            found.append(_INTERRUPTED if end < bounds[-1] else None)
+    return found
+
+
+def _sliced(value: Any, begin: int, end: int) -> Any:
+    """Rows of a nested column."""
+    if isinstance(value, dict):
+        return {key: _sliced(item, begin, end) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return tuple(_sliced(item, begin, end) for item in value)
+    return None if value is None else value[begin:end]
+
+
+def _is_apart(panel: Panel) -> bool:
+    """Whether what a panel shows is not in the rows of steps."""
+    leaf = getattr(panel, "leaf", None)
+    return isinstance(leaf, Leaf) and leaf.apart
