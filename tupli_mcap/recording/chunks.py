@@ -35,6 +35,7 @@ _CHUNK_HEAD = struct.Struct(
 )  # opcode, length, start, end, uncompressed size, crc, compression length
 
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
+_MANY_ROWS = 1 << 16
 _ROW_HEAD_DTYPE = np.dtype((np.void, _ROW_HEAD.size))
 _TIME, _TIME_OFFSET = struct.Struct("<Q"), 15  # in a Message record
 
@@ -87,9 +88,7 @@ class ChunkCache:
         return self._lock
 
     def get(self, key: tuple[int, int]) -> KeptChunk | None:
-        if (
-            not self._kept
-        ):  # as in reading all of a recording, whose threads need not wait for each other here
+        if not self._kept:  # as while a whole recording is read, whose threads need not wait for each other
             return None
         with self._held():
             if key in self._kept:
@@ -290,7 +289,8 @@ class ChunkStore:
             )
         rows = np.frombuffer(data, dtype)
         heads = np.ndarray(n, _ROW_HEAD_DTYPE, data, 0, (dtype.itemsize,)).tobytes()
-        if heads != _heads(n, dtype.itemsize - 9, channel):
+        expected = _heads if n < _MANY_ROWS else _heads.__wrapped__
+        if heads != expected(n, dtype.itemsize - 9, channel):
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
         kept.rows = rows
         return rows
