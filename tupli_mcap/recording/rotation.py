@@ -120,6 +120,7 @@ class Rotation:
         attachments = writer.container.attachment_indexes
         self._head = sum(index.length for index in attachments if index.name != INDEX_NAME)
         self._opened = time.monotonic()
+        self._counted, self._most = -1, 0  # chunks in the file, and rows of the channel that has most
         return writer
 
     def is_due(self, writer: RecordingWriter) -> bool:
@@ -138,7 +139,12 @@ class Rotation:
             return True
         if self._max_seconds is not None and time.monotonic() - self._opened >= share * self._max_seconds:
             return True
-        return max(container.counts.values(), default=0) >= most_rows
+        if len(container.chunk_indexes) != self._counted:
+            self._counted, self._most = (
+                len(container.chunk_indexes),
+                max(container.counts.values(), default=0),
+            )
+        return self._most >= most_rows
 
     def open_next(self, options: WriterOptions) -> RecordingWriter:
         """A writer of the next file; the caller closes the one before.
