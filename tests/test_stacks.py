@@ -187,6 +187,20 @@ def test_sub_environments(tmp_path: Path, kind: Any, stacked: Any) -> None:
             assert np.array_equal(mine, np.array(taken[i]))
 
 
+def test_frames_that_ale_stacks(tmp_path: Path) -> None:
+    ale = pytest.importorskip("ale_py.vector_env")
+    path, states = tmp_path / "r.mcap", []
+    with RecordVector(ale.AtariVectorEnv("breakout", 2), path) as env:
+        state, _ = env.reset(seed=1)
+        for _ in range(60):
+            states.append(state[1].copy())
+            state = env.step(env.action_space.sample())[0]
+    with Recording(path) as recording:
+        assert recording.layout is not None and recording.layout.stacks == ["state"]
+        assert np.array_equal(recording.episodes[1].states, np.array(states))
+        assert recording.episodes[1].env == 1
+
+
 def test_killed_appended_rewritten_and_repaired(tmp_path: Path) -> None:
     path, killed = tmp_path / "r.mcap", tmp_path / "killed.mcap"
     env = RecordEpisodes(FrameStackObservation(Screen(), 4), path, chunk_size=4000)

@@ -35,6 +35,8 @@ def _sizes(env: Any) -> set[Any]:
         base = env.unwrapped
         if type(base) is gym.vector.AsyncVectorEnv:
             return _sizes_elsewhere(base)
+        if type(base).__module__ == "ale_py.vector_env":  # which stacks by itself, frames first
+            return set((base.single_observation_space.shape or ())[:1])
         inner = getattr(base, "envs", None)
         return _sizes(inner[0]) if inner else set()
     found = set()
