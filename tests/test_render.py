@@ -421,18 +421,22 @@ class TestCommandLine:
         assert "found some of 2 in" in err and "(one.mcap, two.mcap); give the path of one of them" in err
         assert not (tmp_path / "all.mcap").exists()
 
+    @pytest.mark.parametrize(
+        ("drift", "frames", "kept"),
+        [("2", "3 frames", "the 3 before it are kept"), ("0", "1 frame", "the one before it is kept")],
+    )
     def test_a_divergence_is_said_and_its_frames_are_kept(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, drift: str, frames: str, kept: str
     ) -> None:
         path = recorded(tmp_path / "r.mcap")
-        monkeypatch.setenv("DRIFT", "2")
+        monkeypatch.setenv("DRIFT", drift)
         code, out, err = run("render", path, "-o", tmp_path / "new.mcap", "--episodes", "1")
         assert code == 1
-        assert "new.mcap: 3 frames of 1 episode" in out
-        assert "error: episode 1 diverges at step 3: state[0] is " in err
-        assert "no frames from there on, the 3 before it are kept" in err
+        assert f"new.mcap: {frames} of 1 episode" in out
+        assert f"error: episode 1 diverges at step {int(drift) + 1}: state[0] is " in err
+        assert f"no frames from there on, {kept}" in err
         with Recording(tmp_path / "new.mcap") as recording:
-            assert len(recording.episodes[1].frames) == 3
+            assert len(recording.episodes[1].frames) == int(drift) + 1
 
     @pytest.mark.parametrize(
         ("args", "code", "message"),

@@ -158,6 +158,8 @@ def _print(report: RenderReport) -> None:
         kept = (
             "nothing was written"
             if report.path is None
+            else "the one before it is kept"
+            if report.frames == 1
             else f"the {number(report.frames)} before it are kept"
         )
         hint = f". {report.divergence.hint}" if report.divergence.hint else ""
