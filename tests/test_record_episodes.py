@@ -750,7 +750,18 @@ def test_the_journal_stays_where_the_recording_is(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize(
-    ("options", "match"), [({"chunk_size": 0}, "chunk_size"), ({"journal_dir": "/nowhere"}, "journal_dir")]
+    ("options", "match"),
+    [
+        *(
+            ({"chunk_size": size}, "chunk_size: expected an integer from 1 to")
+            for size in (0, 1.5, "9", 2**30 + 1)
+        ),
+        *(
+            ({"flush_seconds": time}, "flush_seconds: expected seconds from 0")
+            for time in (-1, "1", float("nan"))
+        ),
+        ({"journal_dir": "/nowhere"}, "journal_dir"),
+    ],
 )
 def test_options_are_checked_before_a_file_is_made(tmp_path: Path, options: Any, match: str) -> None:
     with pytest.raises(RecordingError, match=match):

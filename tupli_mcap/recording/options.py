@@ -7,7 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import numpy as np
+
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.durability import Durability, check_durability
 from tupli_mcap.recording.pictures import ImageFormat
 from tupli_mcap.system import refused
@@ -15,6 +18,7 @@ from tupli_mcap.system import refused
 __all__ = ["Mode", "WriterOptions", "check_local", "check_options"]
 
 Mode = Literal["x", "w", "a"]
+_MOST = MAX_CHUNK // 2  # a chunk may come out larger; readers refuse those beyond
 
 
 class WriterOptions(NamedTuple):
@@ -50,8 +54,11 @@ def check_local(path: str | os.PathLike[str]) -> None:
 def check_options(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:
     """The options, with a place for the journal that does not depend on the process's directory."""
     check_local(path)
-    if options.chunk_size < 1:
-        raise RecordingError(f"chunk_size: expected at least 1 byte, found {options.chunk_size!r}")
+    size, seconds = options.chunk_size, options.flush_seconds
+    if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= _MOST:
+        raise RecordingError(f"chunk_size: expected an integer from 1 to {_MOST} (bytes), found {size!r:.80}")
+    if seconds is not None and not (isinstance(seconds, int | float | np.number) and seconds >= 0):
+        raise RecordingError(f"flush_seconds: expected seconds from 0 on, or None, found {seconds!r:.80}")
     check_durability(options.durability)
     if options.journal_dir is None:
         return options
