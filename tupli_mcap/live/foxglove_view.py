@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from tupli_mcap.errors import MissingExtraError
 from tupli_mcap.live.target import Target
 from tupli_mcap.messages.layout import IMAGE_SCHEMA, RECORD_HEADER
@@ -14,7 +16,7 @@ from tupli_mcap.recording.writer import RecordingWriter
 __all__ = ["FoxgloveView"]
 
 _STEPS = 500  # of a sub-environment at a time
-_IMAGES = 4
+_IMAGES = 2
 _ENVS = 8
 _EVENTS = 500
 
@@ -85,7 +87,8 @@ class FoxgloveView:
                 continue
             found = watcher.images(leaf, steps.env, range(max(steps.first, stop - _IMAGES), stop))
             for row in sorted(found):
-                out.log(found[row].tobytes()[RECORD_HEADER.size :], log_time=int(found[row]["#log_time"]))
+                message = np.frombuffer(found[row], np.uint8)[RECORD_HEADER.size :].tobytes()
+                out.log(message, log_time=int(found[row]["#log_time"]))
 
     def go_on(self, writer: RecordingWriter) -> None:
         self._close_channels()
