@@ -465,6 +465,19 @@ def test_state_dicts_of_other_options_are_refused(dataset: TupliDataset, tmp_pat
         stream_of(columns, 0).load_state_dict(state)
     with pytest.raises(SamplingError, match="expected workers, key and batches in a state dict"):
         stream_of(dataset, 0).load_state_dict({name: part for name, part in state.items() if name != "key"})
+    for key in ("x", {}, []):
+        with pytest.raises(
+            SamplingError, match="expected a list of numbers as the key of a state dict, found"
+        ):
+            stream_of(dataset, 0).load_state_dict({**state, "key": key})
+    with pytest.raises(SamplingError, match="a key of numbers that is an integer from 0, found -1"):
+        stream_of(dataset, 0).load_state_dict({**state, "key": [0, -1]})
+    other = stream_of(dataset, 0)
+    other.load_state_dict({**state, "batches": 10_000})
+    with pytest.raises(
+        SamplingError, match=r"expected a state dict after at most \d+ batches of a worker, found 10"
+    ):
+        next(iter(other))
     other = stream_of(dataset, 0)
     other.load_state_dict({**state, "workers": 2})
     with pytest.raises(SamplingError, match="of a run with 1 workers.*, found 2"):

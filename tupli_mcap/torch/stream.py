@@ -116,6 +116,11 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
 
     def _read(self, key: list[int] | None, done: int, worker: int, workers: int) -> Iterator[dict[str, Any]]:
         batches = self._batches(key, workers)
+        mine = len(range(worker, len(batches), workers))
+        if done > mine:
+            raise SamplingError(
+                f"expected a state dict after at most {mine} batches of a worker, found {done}"
+            )
         for number in range(worker + done * workers, len(batches), workers):
             batch = self._reader.read(batches[number])
             done += 1
@@ -164,6 +169,11 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
                 f"expected workers, key and batches in a state dict, found {[*state_dict]!r:.80}"
             )
         checked_count(state_dict["batches"], 0, "a state dict with a number of batches")
+        key = state_dict["key"]
+        if key is not None and not (isinstance(key, list) and key):
+            raise SamplingError(f"expected a list of numbers as the key of a state dict, found {key!r:.80}")
+        for part in key or ():
+            checked_count(part, 0, "a state dict with a key of numbers", (1 << 128) - 1)
         self._loaded = self._state = dict(state_dict)
 
     def _options(self) -> dict[str, Any]:
