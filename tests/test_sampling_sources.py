@@ -28,7 +28,7 @@ from tupli_mcap.dataset.materialize import Wanted, materialized
 from tupli_mcap.dataset.sources import FilesSource
 from tupli_mcap.errors import FormatError, NotFoundError, SpaceError
 from tupli_mcap.recording import EpisodeData, write_recording
-from tupli_mcap.sampling import FIELDS, ListedEpisodes, RecordedSteps, SamplingError, steps_of
+from tupli_mcap.sampling import FIELDS, ListedEpisodes, RecordedSteps, SamplingError, Windows, steps_of
 from tupli_mcap.sampling.mapped import MappedSteps
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -337,6 +337,7 @@ BAD: list[tuple[Callable[[TupliDataset], Any], str]] = [
         "expected a known time of a step, found '1'",
     ),
     (lambda d: d.episode_values("n_tuples"), "expected an expression, such as .*, found 'n_tuples'"),
+    (lambda d: Windows(d, 2), "expected steps, such as dataset.steps, found "),
     (lambda d: steps_of("run.mcap"), "expected a Recording, found 'run.mcap'"),
     (lambda d: d.with_cache(-1), f"expected a budget in bytes {COUNT} 0, found -1"),
     (lambda d: d.with_cache(1, 0), f"expected a number of threads {COUNT} 1, found 0"),

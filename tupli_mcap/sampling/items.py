@@ -46,6 +46,8 @@ class Items(ABC, Generic[T]):
     """
 
     def __init__(self, steps: Steps, parameters: Sequence[object]) -> None:
+        if not hasattr(steps, "breaks"):
+            raise SamplingError(f"expected steps, such as dataset.steps, found {steps!r:.80}")
         self.source = steps
         self._values_of: Callable[[F | BaseFilter], Array] | None = None
         told = " ".join(map(repr, (type(self).__name__, *parameters)))
