@@ -187,12 +187,13 @@ class ChunkStore:
                 f"found {self.count(channel)} rows"
             )
         chosen, firsts = self._by_channel[channel]
-        at = int(np.searchsorted(firsts, first, side="right")) - 1
+        sizes = self.table["rows"]
+        at = int(firsts.searchsorted(first, side="right")) - 1
         while count > 0:
-            rows = int(self.table["rows"][chosen[at]])
+            chunk = int(chosen[at])
             begin = first - int(firsts[at])
-            end = min(rows, begin + count)
-            yield Span(int(chosen[at]), begin, end)
+            end = min(int(sizes[chunk]), begin + count)
+            yield Span(chunk, begin, end)
             count -= end - begin
             first += end - begin
             at += 1
