@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import struct
 import threading
 import zlib
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +20,8 @@ from hypothesis import strategies as st
 
 from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
+from tupli_mcap.recording.container import CHUNK_ROWS
 from tupli_mcap.recording.crc import crc32
 from tupli_mcap.recording.source import PathSource, open_source
 from tupli_mcap.recording.together import do_all
@@ -106,6 +109,31 @@ def test_damage_in_rows_that_are_not_compressed(tmp_path: Path) -> None:
     for _ in range(2):
         with pytest.raises(FormatError, match="its CRC differs"):
             Recording(tmp_path / "a.mcap").read()
+
+
+def test_records_that_are_no_rows(tmp_path: Path) -> None:
+    """All that a row begins with is looked at: its opcode, length and channel."""
+    (tmp_path / "empty").touch()
+    table, dtype = np.zeros(1, CHUNK_ROWS), np.dtype([("record", "V31"), ("x", "<u4")])
+    table["offset"], table["rows"], table["channel"] = IN_MEMORY, 3, 0x0107
+    good = struct.pack("<BQH20xI", 5, 26, 0x0107, 9) * 3
+
+    def rows(data: bytes) -> Any:
+        return ChunkStore(PathSource(tmp_path / "empty"), table, [data], 0).rows(0, dtype)
+
+    assert rows(good)["x"].tolist() == [9, 9, 9]
+    table["rows"] = 0
+    assert rows(b"")["x"].tolist() == []
+    table["rows"] = 3
+    for row in range(3):
+        for at in range(12):
+            data = bytearray(good)
+            data[35 * row + at] ^= 0x40
+            if at == 11:  # the sequence
+                assert rows(bytes(data))["x"].tolist() == [9, 9, 9]
+                continue
+            with pytest.raises(FormatError, match="chunk 0 holds records that are no rows of its channel"):
+                rows(bytes(data))
 
 
 def test_a_file_that_grows_is_mapped_anew(tmp_path: Path) -> None:

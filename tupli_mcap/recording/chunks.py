@@ -36,7 +36,10 @@ _CHUNK_HEAD = struct.Struct(
 
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
 _MANY_ROWS = 1 << 16
-_ROW_HEAD_DTYPE = np.dtype((np.void, _ROW_HEAD.size))
+_HEAD, _REST = (
+    np.dtype("V8"),
+    np.dtype("V4"),
+)  # bytes 0 to 7 and 7 to 10: NumPy copies them faster than items of 11
 _TIME, _TIME_OFFSET = struct.Struct("<Q"), 15  # in a Message record
 
 
@@ -128,9 +131,19 @@ _numbers = itertools.count()
 
 
 @functools.lru_cache(maxsize=4)  # most chunks of a channel have as many rows
-def _heads(rows: int, length: int, channel: int) -> bytes:
-    """What all the rows of a chunk begin with."""
-    return _ROW_HEAD.pack(5, length, channel) * rows
+def _heads(rows: int, length: int, channel: int) -> tuple[bytes, bytes]:
+    """What all the rows of a chunk begin with, as `_HEAD` and `_REST`."""
+    head = _ROW_HEAD.pack(5, length, channel)
+    return head[:8] * rows, head[7:] * rows
+
+
+def _are_rows(data: Any, rows: int, size: int, channel: int) -> bool:
+    """Whether each of the rows, `size` bytes long, begins as a row of the channel does."""
+    if not rows:
+        return True
+    heads, rests = (_heads if rows < _MANY_ROWS else _heads.__wrapped__)(rows, size - 9, channel)
+    found: bool = np.ndarray(rows, _HEAD, data, 0, (size,)).tobytes() == heads
+    return found and np.ndarray(rows, _REST, data, 7, (size,)).tobytes() == rests
 
 
 class ChunkStore:
@@ -289,9 +302,7 @@ class ChunkStore:
                 f"{self._source.name}: chunk {i} expected {n} rows of {dtype.itemsize} bytes, found {len(data)} bytes"
             )
         rows = np.frombuffer(data, dtype)
-        heads = np.ndarray(n, _ROW_HEAD_DTYPE, data, 0, (dtype.itemsize,)).tobytes()
-        expected = _heads if n < _MANY_ROWS else _heads.__wrapped__
-        if heads != expected(n, dtype.itemsize - 9, channel):
+        if not _are_rows(data, n, dtype.itemsize, channel):
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
         kept.rows = rows
         return rows
