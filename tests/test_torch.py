@@ -563,6 +563,7 @@ def test_a_worker_that_dies_while_a_batch_is_handed_over() -> None:
 
     process = multiprocessing.get_context("fork").Process(target=worker)
     process.start()
+    assert ours.poll(60)
     batch = ours.recv_bytes()
     process.kill()
     process.join()
