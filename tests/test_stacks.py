@@ -165,6 +165,8 @@ def test_sub_environments_are_asked_before(tmp_path: Path) -> None:
     with RecordVector(env, tmp_path / "r.mcap") as recorded:
         recorded.reset(seed=1)  # they live on, though they stack nothing
         recorded.step(recorded.action_space.sample())
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert recording.num_steps == 2
 
 
 @pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
