@@ -100,7 +100,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         self.id = benchmark_id
         self.metadata_callback = metadata_callback
         self.rl_tuple_cls = rl_tuple_cls
-        self._snapshot = Snapshot(env)
+        self._snapshot = Snapshot(env, at_speed=True)
         self._tap = Tap(env)
         self._recording = True
         self._recorder: RecordEpisodes | None = None
