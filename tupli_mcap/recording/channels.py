@@ -139,12 +139,10 @@ def plan_areas(
         areas.append(RowArea("steps", row, rows_per_half(row, size), n))
     for leaf in layout.images:
         row = layout.image_messages[leaf.name].dtype.itemsize
-        stored = (
-            row // leaf.shape[0] if leaf.kind == "stack" else row
-        )  # of a stack, most rows store one frame
-        rows = rows_per_half(
-            stored, max(size, min(16 * stored, 2 << 20))
-        )  # some images a chunk, within 2 MiB
+        # of a stack, most rows store one frame
+        stored = row // leaf.shape[0] if leaf.kind == "stack" else row
+        # some images a chunk, within 2 MiB
+        rows = rows_per_half(stored, max(size, min(16 * stored, 2 << 20)))
         rows = max(1, min(rows, _HALF // row))
         areas += [RowArea(f"{leaf.name}/{i}", row, rows) for i in range(n)]
     areas.append(LogArea("events", 512 * 1024))
