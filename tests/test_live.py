@@ -608,10 +608,11 @@ class Broken:
     def __init__(self) -> None:
         self.looks = 0
 
-    def show(self, watcher: Watcher) -> None:
+    def show(self, watcher: Watcher) -> bool:
         self.looks += 1
         if self.looks == 3:
             raise KeyError("broken")
+        return True
 
     def close(self) -> None:
         raise ValueError("broken too")

@@ -15,10 +15,10 @@ from tupli_mcap.recording.writer import RecordingWriter
 
 __all__ = ["FoxgloveView"]
 
-_STEPS = 500  # of a sub-environment at a time
+_STEPS = 250  # of a sub-environment at a time
 _IMAGES = 2
 _ENVS = 8
-_EVENTS = 500
+_EVENTS = 250
 
 
 class FoxgloveView:
@@ -45,9 +45,11 @@ class FoxgloveView:
         )
         self.port = int(self._server.port)
 
-    def show(self, watcher: Watcher) -> None:
+    def show(self, watcher: Watcher) -> bool:
         if not self._channels:
             self._announce()
+        if not any(channel.has_sinks() for channel in self._channels.values()):
+            return False
         steps, _ = watcher.look(_ENVS)
         channels = self._writer.channels
         for new in steps:
@@ -56,6 +58,7 @@ class FoxgloveView:
             self._show_images(watcher, shown)
         for channel, time_ns, message in watcher.events()[-_EVENTS:]:
             self._publish(channel, [(time_ns, message)])
+        return True
 
     def _announce(self) -> None:
         """The channels that the file has, in its own order."""

@@ -100,20 +100,21 @@ class RerunView:
         )
         self._expected = time.monotonic() + _STARTING
 
-    def show(self, watcher: Watcher) -> None:
+    def show(self, watcher: Watcher) -> bool:
         if self._stream is None and not self._is_there():
-            return
+            return False
         if self._picture is None:
             self._picture = self._draw(watcher)
         if self._picture is None:
-            return
+            return True
         if self._stream is None:
             self._connect(self._picture)
         patience = _FAREWELL if watcher.is_over else _PATIENCE
         if self._is_behind and not self._caught_up(patience):
-            return
+            return True
         self._picture.send(self._stream, watcher)
         self._caught_up(patience)
+        return True
 
     def go_on(self, writer: RecordingWriter) -> None:
         """Another recording in the viewer: rows, episodes and steps count from 0 again."""

@@ -1,8 +1,8 @@
 """The thread that shows a rollout: it looks at the recording's journal now and then, within a budget of time.
 
 `step()` knows nothing of it, so the rollout loses only what this thread takes of the interpreter, and what the viewer's
-library takes of the cores: both are measured, and the thread rests 25 times as long. Whatever happens here, the rollout
-goes on; what went wrong is said once, as a warning.
+library takes of the cores: both are measured, and the thread rests 40 times as long, and longer where nobody looks.
+Whatever happens here, the rollout goes on; what went wrong is said once, as a warning.
 """
 
 from __future__ import annotations
@@ -22,17 +22,19 @@ from tupli_mcap.recording.writer import RecordingWriter
 
 __all__ = ["LiveSession", "LiveView", "open_session"]
 
-_SHORTEST_REST = 1 / 30  # seconds between two looks
+_SHORTEST_REST = 1 / 20  # seconds between two looks
+_IDLE_REST = 0.25  # the same where nobody looks
 _LONGEST_REST, _LONGEST_VECTOR_REST = 1.0, 3.0  # there is more to show of several sub-environments
-_REST = 25.0  # times as long as showing kept a core busy
+_REST = 40.0  # times as long as showing kept a core busy
+_HANDOVER = 0.001  # seconds that the stepping thread waits beside, as the interpreter comes and goes
 _FAREWELL = 3.0  # seconds that closing waits for the thread, at most
 
 
 class LiveView(Protocol):
     """A viewer, or a server that viewers connect to. Only the session's thread calls `show` and `close`."""
 
-    def show(self, watcher: Watcher) -> None:
-        """Shows what is new. May take a while; must return where there is nobody to see it.
+    def show(self, watcher: Watcher) -> bool:
+        """Shows what is new. May take a while; must return, and say False, where there is nobody to see it.
 
         Raises:
             Exception: whatever: the session is over then.
@@ -92,21 +94,23 @@ class LiveSession:
                 last = self._stopping.wait(rest)  # what came in the meantime is shown before the end
                 began = self._meter.busy()
                 following, self._next = self._next, []  # before the look: what came until then is shown
-                self._show()
+                seen = self._show()
                 for watcher in following:
                     self._watcher = watcher
                     self._view.go_on(watcher.writer)
-                    self._show()
-                rest = min(max(_SHORTEST_REST, _REST * (self._meter.busy() - began)), self._longest_rest)
+                    seen = self._show()
+                shortest = _SHORTEST_REST if seen else _IDLE_REST
+                wanted = _REST * (self._meter.busy() - began + _HANDOVER)
+                rest = min(max(shortest, wanted), self._longest_rest)
         except Exception as err:  # noqa: BLE001 - the rollout must not notice
             _warn(f"the live view has ended ({type(err).__name__}: {err}); the recording goes on")
         finally:
             with contextlib.suppress(Exception):
                 self._view.close()
 
-    def _show(self) -> None:
-        if self._watcher.layout is not None:
-            self._view.show(self._watcher)
+    def _show(self) -> bool:
+        """False if nobody looks; before the first step, who does is not known."""
+        return self._watcher.layout is None or self._view.show(self._watcher)
 
     def go_on(self, writer: RecordingWriter) -> None:
         """Shows the rest of the recording, then what `writer` records."""

@@ -27,7 +27,7 @@ __all__ = ["LivePicture", "Sketch"]
 _ENVS = 8
 _SAMPLE, _PATIENCE = 100, 1.0  # steps, and seconds to wait for them, before it is decided what shares an axis
 _BARS = 500
-_EVERY = 1.0  # seconds between two overviews
+_EVERY = 2.0  # seconds between two overviews
 _APART = 100  # rows that a sub-environment may be behind the first on the timeline
 _MOST_KEYS = 6  # of infos
 

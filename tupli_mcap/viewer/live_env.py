@@ -172,17 +172,11 @@ class LiveEnv:
             heat_map.take(columns)
         bounds = [0, *(np.flatnonzero(np.diff(steps.episodes)) + 1).tolist(), len(steps)]
         ends = _ends_of(columns, self._flags(steps), bounds)
-        whole = _block(steps, columns, (0, len(steps)), bounds, ends)
-        times = self._times(whole.number, whole.times)
+        block = _block(steps, columns, bounds, ends)
+        times = self._times(block.number, block.times)
         for panel in self._panels:
-            if panel is not self._rewards and not _is_apart(panel):
-                panel.send(self._place, whole, times)
-        # the return goes on from one block to the next only where an episode is alone in its block
-        head = bounds[1] if steps.steps[0] else 0
-        tail = bounds[-2] if ends[-1] is None else bounds[-1]
-        for cut in itertools.pairwise(sorted({0, head, tail, len(steps)})):
-            block = _block(steps, columns, cut, bounds, ends)
-            self._rewards.send(self._place, block, self._times(block.number, block.times))
+            if not _is_apart(panel):
+                panel.send(self._place, block, times)
 
     def _send_images(self, watcher: Watcher, steps: NewSteps) -> None:
         stop = steps.first + len(steps)
@@ -250,21 +244,15 @@ def columns_of(layout: StepLayout, decoder: MessageDecoder | None, steps: NewSte
     return _Columns(layout.nest_state(states), layout.nest_action(actions), layout.nest_reward(rewards))
 
 
-def _block(
-    steps: NewSteps, columns: _Columns, cut: tuple[int, int], bounds: list[int], ends: Sequence[int | None]
-) -> Block:
-    """The steps from one of the bounds of episodes to another."""
-    begin, end = cut
-    pieces: list[Piece] = []
-    codes: list[int] = []
-    for (a, b), how in zip(itertools.pairwise(bounds), ends, strict=True):
-        if begin <= a < b <= end:
-            pieces.append(Piece(a - begin, b - begin, len(pieces), int(steps.steps[a]), how is not None))
-            codes.append(_INTERRUPTED if how is None else how)
-    part: Any = _Columns(*(_sliced(value, begin, end) for value in columns))
-    asked: Any = _Ends({"end": np.array(codes)})
-    rows = np.arange(steps.first + begin, steps.first + end)
-    return Block(asked, part, pieces, rows, steps.times[begin:end])
+def _block(steps: NewSteps, columns: _Columns, bounds: list[int], ends: Sequence[int | None]) -> Block:
+    """The steps, and between each two of the bounds an episode, or what there is of it."""
+    pieces = [
+        Piece(begin, end, i, int(steps.steps[begin]), how is not None)
+        for i, ((begin, end), how) in enumerate(zip(itertools.pairwise(bounds), ends, strict=True))
+    ]
+    asked: Any = _Ends({"end": np.array([_INTERRUPTED if how is None else how for how in ends])})
+    told: Any = columns
+    return Block(asked, told, pieces, np.arange(steps.first, steps.first + len(steps)), steps.times)
 
 
 def _ends_of(columns: _Columns, flags: tuple[Array, Array], bounds: list[int]) -> list[int | None]:
@@ -277,15 +265,6 @@ def _ends_of(columns: _Columns, flags: tuple[Array, Array], bounds: list[int]) -
         else:
             found.append(_INTERRUPTED if end < bounds[-1] else None)
     return found
-
-
-def _sliced(value: Any, begin: int, end: int) -> Any:
-    """Rows of a nested column."""
-    if isinstance(value, dict):
-        return {key: _sliced(item, begin, end) for key, item in value.items()}
-    if isinstance(value, tuple):
-        return tuple(_sliced(item, begin, end) for item in value)
-    return None if value is None else value[begin:end]
 
 
 def _is_apart(panel: Panel) -> bool:

@@ -183,10 +183,10 @@ class Rewards:
         else:  # what is not finite stays in its episode
             for piece in block.pieces:
                 np.cumsum(rewards[piece.begin : piece.end], out=returns[piece.begin : piece.end])
-        piece = block.pieces[0]  # where an episode is in several blocks, it is alone in each
-        if piece.step:
-            returns += self._running
-        self._running = 0.0 if piece.last else float(returns[-1])
+        head, tail = block.pieces[0], block.pieces[-1]
+        if head.step:  # its episode began in an earlier block
+            returns[head.begin : head.end] += self._running
+        self._running = 0.0 if tail.last else float(returns[-1])
         return returns
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -127,10 +127,9 @@ def tensor_array(values: Sequence[Array], names: Sequence[str]) -> Any:
     Made without a cast: the first one of a process takes pyarrow a tenth of a second.
     """
     import pyarrow as pa
-    import rerun as rr
 
     rows = len(values)
-    goal = rr.components.TensorDataBatch(None).as_arrow_array().type
+    goal = _tensor_type()
     fields = [goal.field(i) for i in range(goal.num_fields)]  # shape, names, buffer
     each = pa.array(np.arange(0, rows * len(names) + 1, len(names), dtype=np.int32))
     shapes = pa.array(np.array([value.shape for value in values], np.uint64).reshape(-1))
@@ -143,6 +142,13 @@ def tensor_array(values: Sequence[Array], names: Sequence[str]) -> Any:
         ],
         fields=fields,
     )
+
+
+@cache
+def _tensor_type() -> Any:
+    import rerun as rr
+
+    return rr.components.TensorDataBatch(None).as_arrow_array().type
 
 
 def _tensor_buffers(values: Sequence[Array], union: Any) -> Any:
