@@ -244,10 +244,11 @@ class Forger(transfer.Target):
         super().__init__(container)
         add = self.index.add
 
-        def row(values: EpisodeRow, metadata: str) -> None:
-            add(self.changed_row(values), metadata)
+        def row(*facts: Any) -> None:
+            *values, metadata = facts
+            add(*self.changed_row(EpisodeRow(*values)), metadata)
 
-        self.index.add = row  # type: ignore[method-assign, assignment]
+        self.index.add = row  # type: ignore[method-assign]
 
     def copy_first(self, *_: Any) -> int:
         return 0

@@ -60,7 +60,11 @@ MOMENTS = {
         Moment("step", ("RecordEpisodes.step",), times=40),
         Moment("stores", ("put", "StepLog.commit", "VectorRows.put", "ImageRows.put"), times=60),
         Moment("reset", ("SingleRecorder.reset", "VectorRecorder.reset"), times=6),
-        Moment("episode log", ("EventLog.append", "EventLog.drop_last"), times=20),
+        Moment(
+            "episode log",
+            ("EventLog.append", "EpisodeLog.start", "EpisodeLog.end", "EventLog.drop_last"),
+            times=20,
+        ),
         Moment(
             "switch",
             ("SingleRows._switch", "StepLog._switch", "VectorRows._switch", "ImageRows._emit"),

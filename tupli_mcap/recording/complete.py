@@ -174,7 +174,7 @@ def _index(episodes: _Episodes, table: np.ndarray[Any, Any]) -> EpisodeIndex:
             end.first_row, end.length, end.episode_return, start_time, end_time, seed, start_row, end_row, final,
             number, end.env, end.end,
         )  # fmt: skip
-        builder.add(row, end.metadata)
+        builder.add(*row, end.metadata)
     return EpisodeIndex.decode(builder.encode(table.tobytes()), "recovered index")
 
 

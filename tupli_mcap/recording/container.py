@@ -250,7 +250,7 @@ class Container:
 
         Whatever needs the interpreter lock is done now, or then: a thread that compresses waits for it once.
         """
-        codecs = [self.codecs.get(rows.channel) for rows in chunks]
+        codecs = [self.codecs.get(rows.channel) for rows in chunks] if self.codecs else ()
         if any(codecs):
             return lambda: self._packed(
                 [
@@ -274,15 +274,16 @@ class Container:
         records, notes = [], []
         position = self.position
         for (rows, skip, data, crc), body in zip(chunks, packed, strict=True):
-            start, end, size = int(rows.times[0]), int(rows.times[-1]), len(data)
-            record = _chunk_record(name, body, (start, end, size, crc))
-            index = _message_index(rows, skip)
-            found = (start, end, position, len(record), rows.channel, position + len(record), len(index))
+            start, end, size, count = rows.times.item(0), rows.times.item(-1), len(data), len(rows.offsets)
+            head = _chunk_head(name, len(body), (start, end, size, crc))
+            index = _message_index(rows, count, skip)
+            length, index_length = len(head) + len(body), len(index)
+            found = (start, end, position, length, rows.channel, position + length, index_length)
             entry = _chunk_index(name, found, (len(body), size))
-            row = (position, len(record), size, rows.first, len(rows.offsets), skip, crc, rows.channel)
-            notes.append((entry, start, end, (*row, method, 0)))
-            records += [record, index]
-            position += len(record) + len(index)
+            row = (position, length, size, rows.first, count, skip, crc, rows.channel, method, 0)
+            notes.append((entry, start, end, row))
+            records += [head, body, index]
+            position += length + index_length
         self.write(b"".join(records))
         for note in notes:
             self._note(*note)
@@ -354,13 +355,13 @@ _CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last time, uncomp
 # opcode, length, first and last time, place and length of the chunk; the map of one message index; its length
 _CHUNK_INDEX = struct.Struct("<BQQQQQIHQQ")
 _SIZES = struct.Struct("<QQ")  # compressed, uncompressed
+_MESSAGE_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the entries
 
 
-def _chunk_record(name: bytes, packed: bytes, facts: tuple[int, int, int, int]) -> bytes:
-    """A Chunk record; `name` is the compression with its length."""
-    length = _CHUNK.size - 9 + len(name) + 8 + len(packed)
-    head = _CHUNK.pack(Opcode.CHUNK, length, *facts)
-    return b"".join((head, name, len(packed).to_bytes(8, "little"), packed))
+def _chunk_head(name: bytes, packed: int, facts: tuple[int, int, int, int]) -> bytes:
+    """A Chunk record up to its `packed` bytes; `name` is the compression with its length."""
+    length = _CHUNK.size - 9 + len(name) + 8 + packed
+    return _CHUNK.pack(Opcode.CHUNK, length, *facts) + name + packed.to_bytes(8, "little")
 
 
 def _chunk_index(name: bytes, facts: tuple[int, ...], sizes: tuple[int, int]) -> bytes:
@@ -371,14 +372,11 @@ def _chunk_index(name: bytes, facts: tuple[int, ...], sizes: tuple[int, int]) ->
     return head + name + _SIZES.pack(*sizes)
 
 
-def _message_index(rows: Rows, skip: int) -> bytes:
+def _message_index(rows: Rows, n: int, skip: int) -> bytes:
     """A MessageIndex record, built as one array (the package's own writer takes 1 µs a message)."""
-    n = len(rows.offsets)
     entries = np.empty((n, 2), dtype="<u8")
     entries[:, 0] = rows.times
-    entries[:, 1] = rows.offsets + np.uint64(skip)
-    body = entries.tobytes()
-    head = bytearray()
-    head += bytes([Opcode.MESSAGE_INDEX]) + (6 + len(body)).to_bytes(8, "little")
-    head += rows.channel.to_bytes(2, "little") + len(body).to_bytes(4, "little")
-    return bytes(head) + body
+    entries[:, 1] = rows.offsets
+    if skip:
+        entries[:, 1] += np.uint64(skip)
+    return _MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 16 * n, rows.channel, 16 * n) + entries.tobytes()

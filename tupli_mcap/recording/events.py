@@ -10,20 +10,22 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
 
 __all__ = [
+    "END_FIELDS",
     "END_NAME",
     "END_NAMES",
     "END_SCHEMA",
     "INTERRUPTED",
+    "START_FIELDS",
     "START_NAME",
     "START_SCHEMA",
     "TERMINAL",
     "TIMEOUT",
     "EpisodeEnd",
     "EpisodeStart",
-    "encode_end",
-    "encode_start",
+    "end_texts",
     "read_strings",
     "record",
+    "start_texts",
 ]
 
 END_NAMES = ("terminal", "timeout", "interrupted")
@@ -41,8 +43,8 @@ END_SCHEMA = (
 )
 
 _SEED = re.compile(r"-?[0-9]{1,80}", re.ASCII)
-_START = struct.Struct("<IIQ??2x")
-_END = struct.Struct("<IIQQdB?2x")
+START_FIELDS = struct.Struct("<IIQ??2x")
+END_FIELDS = struct.Struct("<IIQQdB?2x")
 _LENGTH = struct.Struct("<I")
 
 
@@ -107,34 +109,26 @@ class EpisodeStart(NamedTuple):
         return int(self.seed) if _SEED.fullmatch(self.seed) else None
 
     def encode(self) -> bytes:
-        return encode_start(*self)
+        return START_FIELDS.pack(*self[:5]) + start_texts(*self[5:])
 
     @classmethod
     def decode(cls, body: memoryview) -> EpisodeStart:
-        if len(body) < _START.size:
-            raise FormatError(f"/episode_start: expected at least {_START.size} bytes, found {len(body)}")
-        texts = read_strings(body, _START.size, 3)
-        return cls._make([*_START.unpack_from(body, 0), *texts])
+        if len(body) < START_FIELDS.size:
+            raise FormatError(
+                f"/episode_start: expected at least {START_FIELDS.size} bytes, found {len(body)}"
+            )
+        texts = read_strings(body, START_FIELDS.size, 3)
+        return cls._make([*START_FIELDS.unpack_from(body, 0), *texts])
 
 
-_PLAIN_START = _strings(_START.size, b"", b"", b"{}")
+_PLAIN_START = _strings(START_FIELDS.size, b"", b"", b"{}")
 
 
-def encode_start(
-    episode: int,
-    env: int,
-    first_row: int,
-    seed_given: bool,
-    continued: bool,
-    seed: str,
-    options: str,
-    info: str,
-) -> bytes:
-    """The CDR body of an `EpisodeStart` of these fields."""
-    fixed = _START.pack(episode, env, first_row, seed_given, continued)
-    if seed == "" and options == "" and info == "{}":
-        return fixed + _PLAIN_START
-    return fixed + _strings(_START.size, seed.encode(), options.encode(), info.encode())
+def start_texts(seed: str, options: str, reset_info: str) -> bytes:
+    """The end of an `EpisodeStart`'s CDR body, which follows its `START_FIELDS`."""
+    if seed == "" and options == "" and reset_info == "{}":
+        return _PLAIN_START
+    return _strings(START_FIELDS.size, seed.encode(), options.encode(), reset_info.encode())
 
 
 class EpisodeEnd(NamedTuple):
@@ -150,31 +144,21 @@ class EpisodeEnd(NamedTuple):
     metadata: str
 
     def encode(self) -> bytes:
-        return encode_end(*self)
+        return END_FIELDS.pack(*self[:7]) + end_texts(self.metadata)
 
     @classmethod
     def decode(cls, body: memoryview) -> EpisodeEnd:
-        if len(body) < _END.size:
-            raise FormatError(f"/episode_end: expected at least {_END.size} bytes, found {len(body)}")
-        message = cls._make([*_END.unpack_from(body, 0), *read_strings(body, _END.size, 1)])
+        if len(body) < END_FIELDS.size:
+            raise FormatError(f"/episode_end: expected at least {END_FIELDS.size} bytes, found {len(body)}")
+        message = cls._make([*END_FIELDS.unpack_from(body, 0), *read_strings(body, END_FIELDS.size, 1)])
         if message.end >= len(END_NAMES):
             raise FormatError(f"/episode_end: expected an end of 0, 1 or 2, found {message.end}")
         return message
 
 
-_PLAIN_END = _strings(_END.size, b"{}")
+_PLAIN_END = _strings(END_FIELDS.size, b"{}")
 
 
-def encode_end(
-    episode: int,
-    env: int,
-    first_row: int,
-    length: int,
-    total: float,
-    end: int,
-    has_final: bool,
-    metadata: str,
-) -> bytes:
-    """The CDR body of an `EpisodeEnd` of these fields."""
-    fixed = _END.pack(episode, env, first_row, length, total, end, has_final)
-    return fixed + (_PLAIN_END if metadata == "{}" else _strings(_END.size, metadata.encode()))
+def end_texts(metadata: str) -> bytes:
+    """The end of an `EpisodeEnd`'s CDR body, which follows its `END_FIELDS`."""
+    return _PLAIN_END if metadata == "{}" else _strings(END_FIELDS.size, metadata.encode())

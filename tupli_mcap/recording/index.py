@@ -52,7 +52,6 @@ class EpisodeRow(NamedTuple):
     end: int
 
 
-_Fields = tuple[int, int, float, int, int, int | None, int, int, int, int, int, int]  # of an EpisodeRow
 _ROW = struct.Struct("<QQdqqqQQqQIIIBB2x")
 
 
@@ -64,17 +63,29 @@ class IndexBuilder:
         self.metadata = bytearray()
         self.count = 0
 
-    def add(self, row: EpisodeRow | _Fields, metadata: str) -> None:
+    def add(
+        self,
+        first_row: int,
+        length: int,
+        total: float,
+        start_time: int,
+        end_time: int,
+        seed: int | None,
+        start_row: int,
+        end_row: int,
+        final_row: int,
+        number: int,
+        env: int,
+        end: int,
+        metadata: str,
+    ) -> None:
+        """Adds an episode: the fields of an `EpisodeRow`, and its metadata as JSON."""
         text = b"" if metadata == "{}" else metadata.encode()
-        first, length, total, start, end, seed, start_row, end_row, final_row, number, env, how = row
-        if seed is None or not -(2**63) <= seed < 2**63:  # larger ones are in `/episode_start`
-            has_seed, seed = False, 0
-        else:
-            has_seed = True
+        has_seed = seed is not None and -(2**63) <= seed < 2**63  # larger ones are in `/episode_start`
         try:
             self.rows += _ROW.pack(
-                first, length, total, start, end, seed, start_row, end_row, final_row, len(self.metadata), len(text),
-                number, env, how, has_seed,
+                first_row, length, total, start_time, end_time, seed if has_seed else 0, start_row, end_row,
+                final_row, len(self.metadata), len(text), number, env, end, has_seed,
             )  # fmt: skip
         except struct.error as err:  # only what was read from a damaged journal
             raise FormatError(f"episode {number}: its facts do not fit the index: {err}") from err

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -23,15 +24,22 @@ from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.journal import LogArea
 
-__all__ = ["Encoder", "EventLog", "StepLog", "group_records", "iter_records", "leaf_encoders"]
+__all__ = [
+    "FRONT",
+    "Encoder",
+    "EventLog",
+    "Sink",
+    "StepLog",
+    "group_records",
+    "iter_records",
+    "leaf_encoders",
+]
 
 Sink = Callable[[Rows], None]
 Encoder = Callable[[Any, bytearray, int], None]
-_Groups = dict[
-    int, tuple[int, list[bytes], list[int]]
-]  # by channel: the first sequence, whole records, log_times
 _HEADER = 64
-_FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
+FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
+_LOG_TIME = FRONT.size - 8
 
 
 def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
@@ -56,40 +64,31 @@ def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, i
 def group_records(data: memoryview, *, sealed: bool = False) -> list[Rows]:
     """The records in `data` by channel, in their order; of a journal (`sealed`), with their `publish_time`."""
     whole = bytes(data)
-    groups: _Groups = {}
-    for start, end, channel, sequence, time_ns in iter_records(data):
-        _, records, times = groups.setdefault(channel, (sequence, [], []))
-        records.append(whole[start:end])
-        times.append(time_ns)
-    return _rows_of(groups, sealed=sealed)
+    groups: dict[int, tuple[int, list[bytes]]] = {}
+    for start, end, channel, sequence, _ in iter_records(data):
+        groups.setdefault(channel, (sequence, []))[1].append(whole[start:end])
+    return [_rows_of(channel, *group, sealed=sealed) for channel, group in groups.items()]
 
 
-def _rows_of(groups: _Groups, *, sealed: bool) -> list[Rows]:
-    rows = []
-    for channel, (first, records, times) in groups.items():
-        if not records:
-            continue
-        sizes = [len(record) for record in records]
-        offsets = np.zeros(len(sizes), dtype=np.uint64)
-        np.cumsum(sizes[:-1], out=offsets[1:])
-        joined = bytearray().join(records)
-        at = np.array(times, dtype="<u8")
-        if sealed:
-            _publish(joined, offsets, at)
-        rows.append(Rows(channel, first, joined, offsets, at))
-    return rows
-
-
-def _publish(records: bytearray, offsets: Any, times: Any) -> None:
-    """Sets `publish_time`, where a journal keeps checksums, to `log_time`."""
-    places = offsets[:, None] + np.arange(23, 31, dtype=np.uint64)
-    np.frombuffer(records, np.uint8)[places] = times.view(np.uint8).reshape(-1, 8)
+def _rows_of(channel: int, first: int, records: list[bytes], *, sealed: bool) -> Rows:
+    """Whole records of one channel, of which the first has sequence `first`."""
+    sizes = [len(record) for record in records]
+    offsets = np.zeros(len(sizes), dtype=np.uint64)
+    np.cumsum(sizes[:-1], out=offsets[1:])
+    joined = bytearray().join(records)
+    log_times = offsets[:, None] + np.arange(_LOG_TIME, _LOG_TIME + 8, dtype=np.uint64)
+    content = np.frombuffer(joined, np.uint8)
+    times = content[log_times]
+    if sealed:  # a journal keeps checksums there
+        content[log_times + np.uint64(8)] = times
+    return Rows(channel, first, joined, offsets, times.reshape(-1).view("<u8"))
 
 
 class EventLog:
     """Records of several channels in one half; when it is full they go to the file, a chunk a channel.
 
-    `sequences` counts the messages of each channel, those of earlier sessions included.
+    `sequences` counts the messages of each channel, those of earlier sessions included; `latest_ns` is the log_time of
+    the last message, and that of the next one is not less.
     """
 
     def __init__(
@@ -97,8 +96,9 @@ class EventLog:
     ) -> None:
         self.sequences = sequences
         self._sink = sink
-        self._time = time_ns
-        self._groups: _Groups = {}  # what the journal holds, so that a flush need not take it apart
+        self.latest_ns = time_ns
+        # what the journal holds by channel, so that a flush need not take it apart
+        self._whole: defaultdict[int, list[bytes]] = defaultdict(list)
         self._last = 0  # where the last message began
         self._last_channel = 0
         self._can_drop = False
@@ -112,45 +112,35 @@ class EventLog:
         self._position = 0
         self._commit[0] = 0
 
-    @property
-    def latest_ns(self) -> int:
-        """The log_time of the last message; that of the next one is not less."""
-        return self._time
-
     def append(self, time_ns: int, *messages: tuple[int, bytes]) -> int:
         """Adds messages (channel, CDR body), all or none of them after a crash; returns their log_time."""
-        if time_ns > self._time:
-            self._time = time_ns
+        if time_ns > self.latest_ns:
+            self.latest_ns = time_ns
         else:
-            time_ns = self._time
-        end = self._position + BODY * len(messages)
+            time_ns = self.latest_ns
+        size = 0
         for _, body in messages:
-            end += len(body)
-        if end > self._capacity:
-            end -= self._position
+            size += BODY + len(body)
+        if self._position + size > self._capacity:
             self.flush()
-        data, sequences, groups, channel = [], self.sequences, self._groups, 0
+        fits = size <= self._capacity
+        sequences, position, channel = self.sequences, self._position, 0
+        self._last = position
         for channel, body in messages:
-            sequence = sequences[channel]
-            sequences[channel] = sequence + 1
-            front = _FRONT.pack(5, BODY - 9 + len(body), channel, sequence, time_ns)
+            sequences[channel] = 1 + (sequence := sequences[channel])
+            front = FRONT.pack(5, BODY - 9 + len(body), channel, sequence, time_ns)
             tail = CDR_HEADER + body
             record = front + crc32(tail, crc32(front)).to_bytes(8, "little") + tail
-            data.append(record)
-            group = groups.get(channel)
-            if group is None:
-                groups[channel] = (sequence, [record], [time_ns])
-            else:
-                group[1].append(record)
-                group[2].append(time_ns)
-        if end > self._capacity:  # more than the journal holds
-            self._write_groups()
+            self._whole[channel].append(record)
+            if fits:
+                begin, position = position, position + len(record)
+                self._records[begin:position] = record
+        if not fits:
+            self._write()
             self._can_drop = False
             return time_ns
-        self._last, self._last_channel, self._can_drop = self._position, channel, True
-        self._records[self._last : end] = b"".join(data)
-        self._position = end
-        self._commit[0] = end
+        self._last_channel, self._can_drop = channel, True
+        self._position = self._commit[0] = position
         return time_ns
 
     def committed(self) -> memoryview:
@@ -161,34 +151,30 @@ class EventLog:
         """Takes back the message of the last `append`, which was one of `channel`, unless it is in the file already."""
         if not self._can_drop:
             return
-        self._pop(channel)
+        self._whole[channel].pop()
         self._position = self._last
         self._commit[0] = self._last
         self.sequences[channel] -= 1
 
-    def _pop(self, channel: int) -> tuple[bytes, int]:
-        _, records, times = self._groups[channel]
-        return records.pop(), times.pop()
-
     def flush(self, *, keep_last: bool = False) -> None:
         """Writes the records to the file; with `keep_last` the last one stays, so that it can still be dropped."""
         keep_last = keep_last and self._can_drop
-        last, kept = b"", {}
+        kept = self._whole[self._last_channel].pop() if keep_last else b""
+        self._write(1 if keep_last else 0)
         if keep_last:
-            channel = self._last_channel
-            last, time_ns = self._pop(channel)
-            kept[channel] = (self.sequences[channel] - 1, [last], [time_ns])
-        self._write_groups()
-        self._groups = kept
+            self._whole[self._last_channel].append(kept)
         self._commit[0] = 0
-        self._records[: len(last)] = last
-        self._last, self._position, self._can_drop = 0, len(last), keep_last
-        self._commit[0] = len(last)
+        self._records[: len(kept)] = kept
+        self._last, self._position, self._can_drop = 0, len(kept), keep_last
+        self._commit[0] = len(kept)
 
-    def _write_groups(self) -> None:
-        for rows in _rows_of(self._groups, sealed=True):
-            self._sink(rows)
-        self._groups = {}
+    def _write(self, kept: int = 0) -> None:
+        """Writes the records to the file, but the last `kept` of the last channel, which are taken out."""
+        whole, self._whole = self._whole, defaultdict(list)
+        for channel, records in whole.items():
+            if records:
+                before = len(records) + (kept if channel == self._last_channel else 0)
+                self._sink(_rows_of(channel, self.sequences[channel] - before, records, sealed=True))
 
 
 def leaf_encoders(layout: StepLayout, leaves: Sequence[Leaf]) -> list[tuple[Leaf, Encoder]]:
@@ -313,7 +299,7 @@ class StepLog:
         self._reserve(len(out) + len(pending))
         self._time = max(time.time_ns(), self._time)
         out[BODY : BODY + 8] = self._pending[BODY : BODY + 8]  # a new episode may have begun in between
-        _FRONT.pack_into(out, 0, 5, len(out) - 9, self._channel, self.count, self._time)
+        FRONT.pack_into(out, 0, 5, len(out) - 9, self._channel, self.count, self._time)
         seal(out, 0, len(out), memoryview(pending)[STATE:])
         records, start = self._records[self._half], self._position
         end = start + len(out)

@@ -22,7 +22,7 @@ from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import record
 from tupli_mcap.recording.imagecodecs import image_codecs, image_format, uses_codecs
-from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_frames import OldCameras, kept_frames
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
@@ -248,12 +248,9 @@ class RepairWriter:
             start = episode.start[1]._replace(first_row=first)
             moved[episode.number] = (start, end)
             self._index.add(
-                EpisodeRow(
-                    first, end.length, end.episode_return, episode.start[0], episode.end[0], start.seed_number,
-                    start_rows[end.episode], end_rows[end.episode], final_rows.get(end.episode, -1),
-                    end.episode, end.env, end.end,
-                ),
-                text,
+                first, end.length, end.episode_return, episode.start[0], episode.end[0], start.seed_number,
+                start_rows[end.episode], end_rows[end.episode], final_rows.get(end.episode, -1),
+                end.episode, end.env, end.end, text,
             )  # fmt: skip
         resets = {
             e.number: [(time, reset._replace(first_row=rows[e.number])) for time, reset in e.resets]

@@ -125,6 +125,8 @@ class Rotation:
 
     def is_due(self, writer: RecordingWriter) -> bool:
         """Whether the file is to be left once no episode is running."""
+        if not self.limited and len(writer.container.chunk_indexes) == self._counted:
+            return self._most >= _MOST_ROWS
         return self._is_beyond(writer, 1.0, _MOST_ROWS) and (
             writer.journal is not None or writer.index.count > 0
         )

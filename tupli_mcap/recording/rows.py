@@ -23,9 +23,10 @@ from tupli_mcap.recording.journal import RowArea
 
 __all__ = ["HOLE", "ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
 
-# three calls take a tenth of the time that fields of a structured row do
-_TIMES, _STAMP, _SEQUENCE = struct.Struct("<QQ"), struct.Struct("<iI"), struct.Struct("<I")
-_TIMES_AT = SEQUENCE_OFFSET + 4  # log_time and publish_time follow the sequence
+# sequence, log_time, publish_time, the CDR header, and the stamp of an image: they follow each other, and one call
+# takes a fraction of the time that fields of a structured row do
+_IMAGE_HEAD = struct.Struct(f"<IQQ{len(CDR_HEADER)}siI")
+_EPISODE_AND_STEP = struct.Struct("<II")
 HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 Array = np.ndarray[Any, Any]
 Sink = Callable[[Rows], None]
@@ -124,12 +125,17 @@ class SingleRows:
         """Rows of the channel so far, those of earlier sessions included."""
         return self.cursor.sequence
 
+    @property
+    def total(self) -> Any:
+        """The running episode's return so far."""
+        return self.cursor.total
+
     def begin_episode(self, episode: int) -> None:
         """The rows that follow belong to `episode`."""
-        self.cursor.prefix = self._header + episode.to_bytes(4, "little") + bytes(4)
-        self.cursor.total = 0.0
-        start = self.cursor.offset
-        self._buffer[start : start + len(self.cursor.prefix)] = self.cursor.prefix
+        cursor, start = self.cursor, self.cursor.offset
+        cursor.prefix = prefix = self._header + _EPISODE_AND_STEP.pack(episode, 0)
+        cursor.total = 0.0
+        self._buffer[start : start + len(prefix)] = prefix
 
     def committed(self) -> tuple[int, int, Array]:
         """The running half, its committed rows, and the rows of both halves; for another thread to copy from."""
@@ -215,8 +221,9 @@ class ImageRows:
         """Goes on in another journal, with the rows before the running one in the file: only that one moves."""
         running = self._rows[self._half, self._row].copy() if hasattr(self, "_rows") else None
         self._area = area
+        self._full, self._row_size = area.rows, area.row_size
         self._buffer = buffer
-        self._row = self._half = self._flushed = 0
+        self._row = self._half = self._flushed = self._start = 0
         layout, channel, dtype = self._layout, self._channel, self._layout.dtype
         self._rows: Array = np.frombuffer(buffer, dtype).reshape(2, area.rows + 1)
         self._rows["fixed"] = np.frombuffer(layout.body[8:], np.uint8)
@@ -226,6 +233,8 @@ class ImageRows:
             self._rows[name] = template[name]
         self._rows["#sequence"] = HOLE  # zeros would look like the first row as soon as a time is written
         self._data: Array = self._rows["data"]
+        self._times: Array = self._rows["#log_time"]
+        self._offsets = np.arange(area.rows, dtype=np.uint64) * np.uint64(area.row_size)
         if running is not None:
             self._rows[0, 0] = running
 
@@ -237,20 +246,29 @@ class ImageRows:
 
     def put(self, image: Array) -> None:
         """Writes the image of the state that follows the running row's; every step before must be committed."""
-        self._write_due(self._start_chunks)
-        self._advance()
+        if self._due is not None:
+            self._write_due(self._start_chunks)
+        self._row += 1
+        self._sequence += 1
+        self._start += self._row_size
+        if self._row == self._full:
+            self._switch()
         self.put_first(image)
 
     def put_first(self, image: Array) -> None:
         """Overwrites the running row: the image of a reset."""
         self._data[self._half, self._row] = image
-        self._time = now = max(time.time_ns(), self._time)
-        buffer, start = self._buffer, self._half * self._area.half + self._row * self._area.row_size
-        _TIMES.pack_into(buffer, start + _TIMES_AT, now, now)
-        _STAMP.pack_into(buffer, start + BODY, *divmod(now, 10**9))
-        _SEQUENCE.pack_into(buffer, start + SEQUENCE_OFFSET, self._sequence)
+        now = time.time_ns()
+        if now < self._time:
+            now = self._time
+        self._time = now
+        start, seconds = self._start, now // 10**9
+        _IMAGE_HEAD.pack_into(
+            self._buffer, start + SEQUENCE_OFFSET,
+            self._sequence, now, now, CDR_HEADER, seconds, now - seconds * 10**9,
+        )  # fmt: skip
         if self._sealed:
-            seal(self._buffer, start, start + self._area.row_size, b"")
+            seal(self._buffer, start, start + self._row_size, b"")
 
     def rows(self) -> Array:
         """The rows of both halves, for another thread to copy from; their `#sequence` says which they are."""
@@ -261,14 +279,12 @@ class ImageRows:
         data: bytes = self._data[self._half, self._row].tobytes()
         return data
 
-    def _advance(self) -> None:
-        self._row += 1
-        self._sequence += 1
-        if self._row < self._area.rows:
-            return
-        half, rows, flushed = self._half, self._area.rows, self._flushed
-        self._wait(1 - half)  # a half is used again only when its chunk is in the file
+    def _switch(self) -> None:
+        """The half is full: goes on in the other one, whose chunk must be in the file."""
+        half, rows, flushed = self._half, self._full, self._flushed
+        self._wait(1 - half)
         self._half, self._row, self._flushed = 1 - half, 0, 0
+        self._start = self._half * self._area.half
         # not now: the step of its last image is not committed yet, and the file must not have more images than steps
         self._due = (half, flushed, rows, self._sequence - rows + flushed)
 
@@ -293,15 +309,15 @@ class ImageRows:
     def _emit(self, half: int, begin: int, end: int, first: int, start_chunks: StartChunks | None) -> None:
         if begin == end:
             return
-        size = self._area.row_size
+        size = self._row_size
         start = half * self._area.half
         data: Any = self._buffer[start + begin * size : start + end * size]
+        times = self._times[half, begin:end].copy()
         if self._sealed:
             data = bytearray(data)
-        table: Array = np.frombuffer(data, self._rows.dtype)
-        if self._sealed:
-            table["#publish_time"] = table["#log_time"]
-        rows = even_rows(self._channel, first, data, table)
+            table: Array = np.frombuffer(data, self._rows.dtype)
+            table["#publish_time"] = times
+        rows = Rows(self._channel, first, data, self._offsets[: end - begin], times)
         if start_chunks is None:
             self._sink(rows)
         else:

@@ -111,30 +111,25 @@ class SingleRecorder:
 
     def end(self, end: int, metadata: str = "{}", *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
-        if self._episode is not None and self._writer.failed is None:
-            try:  # as `writer.whole`, which costs a call more
-                self._end(end, metadata, has_final_state)
-            except BaseException as err:
-                self._writer.stop(err)
-                raise
-
-    def _end(self, end: int, metadata: str, has_final_state: bool) -> None:
-        episode, rows = self._episode, self._writer.rows
-        self._episode = None
-        if episode is None or rows is None:
+        episode, writer = self._episode, self._writer
+        rows = writer.rows
+        if episode is None or rows is None or writer.failed is not None:
             return
-        length = rows.count - episode.first_row
-        if length == 0:
-            self._writer.drop_start()
-            return
-        total = rows.cursor.total if hasattr(rows, "cursor") else rows.total
-        final = None
-        if has_final_state:
-            final = rows.pending_state()
-            for sinks in self._writer.images:
-                final += sinks[0].pending()
-        self._writer.end_episode(episode, end, length, total, final, metadata)
-        self.put = self._continue
+        try:  # as `writer.whole`, which costs a call more
+            self._episode = None
+            length = rows.count - episode.first_row
+            if length == 0:
+                writer.drop_start()
+                return
+            final = rows.pending_state() if has_final_state else None
+            if final is not None:
+                for sinks in writer.images:
+                    final += sinks[0].pending()
+            writer.end_episode(episode, end, length, rows.total, final, metadata)
+            self.put = self._continue
+        except BaseException as err:
+            writer.stop(err)
+            raise
 
     def refuse(self, metadata: str = "{}") -> None:
         """After a step that could not be stored: the episode ends before it, and a reset must follow."""

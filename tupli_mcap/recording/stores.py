@@ -9,6 +9,8 @@ import numpy as np
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import FRAMES_AREA, Channels
 from tupli_mcap.recording.container import Container, Rows
+from tupli_mcap.recording.episode_log import EpisodeLog
+from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.journal import Journal
 from tupli_mcap.recording.logs import EventLog, StepLog
 from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
@@ -26,6 +28,7 @@ class Stores:
         layout, channels: what the stores hold.
         container: counts the messages that are in the file already.
         journal: has the areas of `plan_areas`.
+        index: is told of every episode that ends.
         add_chunk: writes a chunk, durably where that is asked for.
         start_chunks: begins to compress several chunks; what it returns writes them, durably where that is asked for.
         vector: steps of sub-environments.
@@ -48,6 +51,7 @@ class Stores:
         channels: Channels,
         container: Container,
         journal: Journal,
+        index: IndexBuilder,
         add_chunk: Callable[[Rows], None],
         start_chunks: Callable[[Sequence[Rows]], Callable[[], None]],
         *,
@@ -107,8 +111,9 @@ class Stores:
                 layout, rows_area("steps"), buffer("steps"), channel, add_chunk,
                 [sinks[0] for sinks in self.images], counts[channel], RowDeriver(time_ns=before_ns), sealed=sealed,
             )  # fmt: skip
-        events = {c: counts[c] for c in (channels.final_state, channels.start, channels.end)}
-        self.events = EventLog(log_area("events"), buffer("events"), add_chunk, events, before_ns)
+        self.events = EpisodeLog(
+            log_area("events"), buffer("events"), add_chunk, channels, counts, index, before_ns
+        )
         self.infos: EventLog | None = None
         if channels.info is not None:
             info = {channels.info: counts[channels.info]}

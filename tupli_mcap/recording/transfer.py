@@ -12,7 +12,7 @@ from tupli_mcap.recording.cameras import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.copies import first_chunks
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
-from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.rows import even_rows
@@ -260,7 +260,7 @@ class Transfer:
             if row["final_row"] >= 0:
                 final = begins[_FINAL] + final_places[len(finals)]
                 finals += self._messages(topics[_FINAL], int(row["final_row"]), 1)
-            index_row = EpisodeRow(
+            target.index.add(
                 int(first),
                 end.length,
                 end.episode_return,
@@ -273,8 +273,8 @@ class Transfer:
                 end.episode,
                 end.env,
                 end.end,
+                end.metadata,
             )
-            target.index.add(index_row, end.metadata)
             ends.append((end_time, end.encode()))
         self._write(topics[_START], _in_time(starts))
         self._write(topics[_END], _in_time(_in_order(ends, end_places)))

@@ -20,7 +20,6 @@ from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.exact import decide_dtype, leaf_value, shorten
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.batches import EndedEpisode, StartingEpisode, end_episodes, start_episodes
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.logs import Encoder, StepLog, leaf_encoders
@@ -286,44 +285,30 @@ class VectorRecorder:
         waiting = sorted(i for i in self._waiting if active is None or active[i])
         if not waiting:
             return
-        starting: list[StartingEpisode] = []
+        writer, counts, facts_of = self._writer, self._counts(), self._facts
         for i in waiting:
-            facts, self._facts[i] = self._facts[i], None
+            facts, facts_of[i] = facts_of[i], None
             if facts is None:  # stepped on after an end, without a reset
                 facts = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
-            if self._earlier[i] or i in self._writer.lost_streams:
-                self._started(start_episodes(self._writer, starting))
-                starting = []
+            if self._earlier[i]:
                 for earlier in self._earlier[i]:
-                    self._writer.start_episode(i, self._count(i), earlier)
-                    self._writer.keep_start()
+                    writer.start_episode(i, counts[i], earlier)
+                    writer.keep_start()
                 self._earlier[i] = []
-                self._started([self._writer.start_episode(i, self._count(i), facts)])
-            else:
-                starting.append(StartingEpisode(i, self._count(i), facts))
-        self._started(start_episodes(self._writer, starting))
+            self._episodes[i] = writer.start_episode(i, counts[i], facts)
+            if isinstance(writer.vector, list):
+                writer.vector[i].begin_episode(writer.next_episode - 1)
+        first = writer.next_episode - len(waiting)
+        self._episode_numbers[waiting] = range(first, writer.next_episode)
+        self._lengths[waiting] = 0
+        self._totals[waiting] = 0.0
         self._waiting.difference_update(waiting)
         self._fresh = bool(self._waiting)
 
-    def _started(self, episodes: Sequence[StartedEpisode]) -> None:
-        numbers, lengths, totals, store = (
-            self._episode_numbers,
-            self._lengths,
-            self._totals,
-            self._writer.vector,
-        )
-        for episode in episodes:
-            i = episode.env
-            self._episodes[i] = episode
-            numbers[i] = episode.number
-            lengths[i] = 0
-            totals[i] = 0.0
-            if isinstance(store, list):
-                store[i].begin_episode(episode.number)
-
-    def _count(self, i: int) -> int:
-        store = self._writer.vector
-        return int(store.counts[i]) if isinstance(store, VectorRows) else store[i].count  # type: ignore[index]
+    def _counts(self) -> list[int]:
+        """The rows of each sub-environment so far."""
+        store: Any = self._writer.vector
+        return store.counts.tolist() if isinstance(store, VectorRows) else [log.count for log in store]
 
     def _store(
         self,
@@ -405,7 +390,7 @@ class VectorRecorder:
 
     def _end(self, ends: Iterable[tuple[int, int]]) -> None:
         """Ends the running episodes of sub-environments: (sub-environment, how)."""
-        ended = []
+        writer, final_rows, now = self._writer, self._final_rows, None
         for i, how in ends:
             episode, self._episodes[i] = self._episodes[i], None
             text, self._texts[i] = self._texts[i], "{}"
@@ -413,13 +398,12 @@ class VectorRecorder:
                 continue
             self._fresh = True
             self._waiting.add(i)
+            now = time.time_ns() if now is None else now
             facts = episode, how, int(self._lengths[i]), float(self._totals[i])
-            if i in self._final_rows:
-                ended.append(EndedEpisode(*facts, None, text, self._final_rows.pop(i)))
+            if i in final_rows:
+                writer.end_episode(*facts, None, text, final_rows.pop(i), now)
             else:
-                ended.append(EndedEpisode(*facts, self._pending_state(i), text))
-        if ended:
-            end_episodes(self._writer, ended)
+                writer.end_episode(*facts, self._pending_state(i), text, -1, now)
 
     def _pending_state(self, i: int) -> bytes:
         store: Any = self._writer.vector

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import struct
 import time
 import uuid
 import warnings
@@ -17,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
-from tupli_mcap.recording.events import encode_end, encode_start
+from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_info, journal_path
 from tupli_mcap.recording.lock import FileLock
@@ -49,7 +48,6 @@ __all__ = [
 ]
 
 RECORDING_METADATA = "tupli_mcap.recording"
-EPISODE_AND_ENV = struct.Struct("<II")
 LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
 
 
@@ -81,7 +79,7 @@ class RecordingWriter:
         self.syncs_steps = self._sealed = options.durability == "step"
         self.images: list[list[ImageRows]] = []
         self.worker = ChunkWorker()
-        self.events: EventLog | None = None
+        self.events: EpisodeLog | None = None
         self.infos: EventLog | None = None
         self.frames: list[EventLog] = []
         # set by the recorder: told of a fork (its encoder knows only its buffer), and asked whether the last event
@@ -98,6 +96,7 @@ class RecordingWriter:
         self.rewritten = ""
         self.journal_place = self._choose_journal_place()
         self._is_cut = True  # False on append, while the file still is as it was found
+        self._flush_seconds = options.flush_seconds
         self._flushed_at = time.monotonic()
         self.lock = FileLock(self.path, options.mode)
         try:
@@ -200,7 +199,7 @@ class RecordingWriter:
             raise RecordingError(f"{self.path} has no step yet, so its layout is not known")
         return self.layout
 
-    def _events(self) -> EventLog:
+    def _events(self) -> EpisodeLog:
         if self.events is None:
             raise RecordingError(f"{self.path} has no step yet, so it has no episodes")
         return self.events
@@ -210,7 +209,7 @@ class RecordingWriter:
         self.journal = self._new_journal(areas)
         self.journal.publish(durable=self._durable)
         self._stores = stores = Stores(
-            layout, channels, self.container, self.journal, self.add_chunk, self._start_chunks,
+            layout, channels, self.container, self.journal, self.index, self.add_chunk, self._start_chunks,
             vector=self.is_vector, sealed=self._sealed, durable=self._durable, grow=self._grow,
         )  # fmt: skip
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
@@ -222,22 +221,9 @@ class RecordingWriter:
         """Writes `/episode_start`; it is taken back by `drop_start` if no step follows."""
         if env in self.lost_streams:
             self._mark_lost_stream(env, first_row, reset)
-        seed = reset.seed if reset.seed is not None else reset.drawn_seed
-        number, events, channel = self.next_episode, self._events(), self.channels.start
-        body = encode_start(
-            number,
-            env,
-            first_row,
-            reset.seed is not None,
-            reset.continued,
-            "" if seed is None else str(seed),
-            reset.options,
-            reset.info,
-        )
-        row = events.sequences[channel]
-        start_time = events.append(reset.time_ns, (channel, body))
-        self.next_episode = number + 1
-        return StartedEpisode(number, env, first_row, start_time, seed, row)
+        started = (self.events or self._events()).start(self.next_episode, env, first_row, reset)
+        self.next_episode += 1
+        return started
 
     def _mark_lost_stream(self, env: int, first_row: int, reset: ResetFacts) -> None:
         """A start without a step says that the random stream of this episode is not that of the one before."""
@@ -265,29 +251,16 @@ class RecordingWriter:
         final_state: bytes | None,
         metadata: str,
         final_row: int = -1,
+        time_ns: int | None = None,
     ) -> None:
         """Writes `/final_state` (unless it is there already, as `final_row`) and `/episode_end`, and the episode's row
-        of the index."""
-        channels, events = self.channels, self._events()
-        sequences = events.sequences
+        of the index. `time_ns` is the same for episodes that end in one batch; now, by default."""
+        events = self.events or self._events()
         total = total if type(total) is float else float(np.sum(total))
-        number, env, first_row = episode.number, episode.env, episode.first_row
-        has_final = final_state is not None or final_row >= 0
-        message = encode_end(number, env, first_row, length, total, end, has_final, metadata)
-        end_row = sequences[channels.end]
-        now = time.time_ns()
-        if final_state is None:
-            now = events.append(now, (channels.end, message))
-        else:
-            final_row = sequences[channels.final_state]
-            body = EPISODE_AND_ENV.pack(number, env) + final_state
-            now = events.append(now, (channels.final_state, body), (channels.end, message))
-        self.index.add(
-            (first_row, length, total, episode.start_time, now, episode.seed, episode.start_row, end_row, final_row,
-             number, env, end),
-            metadata,
-        )  # fmt: skip
-        self.flush_if_due()
+        now = time.time_ns() if time_ns is None else time_ns
+        events.end(now, episode, end, length, total, final_state, final_row, metadata)
+        if self._flush_seconds is not None:
+            self.flush_if_due()
 
     def put_final_states(self, finals: Sequence[tuple[StartedEpisode, bytes]]) -> int:
         """Writes `/final_state` ahead of the step that ends the episodes; returns the first one's row."""
@@ -299,7 +272,7 @@ class RecordingWriter:
 
     def flush_if_due(self) -> None:
         """Flushes if `flush_seconds` were asked for and have passed since the last flush."""
-        seconds = self.options.flush_seconds
+        seconds = self._flush_seconds
         if seconds is not None and time.monotonic() - self._flushed_at > seconds:
             self.flush()
 
@@ -329,7 +302,7 @@ class RecordingWriter:
         with self.whole:
             pack = container.start_chunks(chunks)
             # a thread that needs the interpreter lock for every chunk would wait for it again and again
-            in_thread = container.packs_together or len(chunks) == 1
+            in_thread = len(chunks) == 1 or container.packs_together
             packed = self.worker.submit(pack) if in_thread else pack
 
         def finish() -> None:
@@ -556,33 +529,6 @@ def _uuid_of(path: Path) -> str:
     with contextlib.suppress(RecordingError, FormatError), contextlib.closing(PathSource(path)) as source:
         return head(source).get("uuid", "")
     return ""
-
-
-class ResetFacts(NamedTuple):
-    """What a reset was given and gave; `options` and `info` are JSON texts."""
-
-    seed: int | None
-    drawn_seed: int | None
-    options: str
-    info: str
-    time_ns: int
-    continued: bool = False
-
-    @property
-    def goes_on(self) -> bool:
-        """True if the reset had no seed, so that it went on with the random stream of what came before it."""
-        return self.seed is None and self.drawn_seed is None and not self.continued
-
-
-class StartedEpisode(NamedTuple):
-    """An episode whose start is in the journal."""
-
-    number: int
-    env: int
-    first_row: int
-    start_time: int
-    seed: int | None
-    start_row: int
 
 
 def _abandon_all() -> None:

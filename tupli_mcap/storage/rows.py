@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.schema import EpisodeHeader
+from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.values import classify, tag_float
 from tupli_mcap.storage.tables import EPISODE_BITS
 
@@ -23,9 +24,6 @@ INT64_MAX: Final = 2**63 - 1
 _UNUSUAL: Final = re.compile('[\\\\\x01\ud7ff\ud800-\udfff]|"\\$')
 _TO_ESCAPE: Final = re.compile("[\x00\x01\ud7ff\ud800-\udfff]")
 _ESCAPED: Final = re.compile("\x01[\x01\x02]|\ud7ff[\x01\u0100-\u08ff]")
-_ALL_FIELDS: Final = set(EpisodeHeader.model_fields)
-_NEW: Final = EpisodeHeader.__new__
-_SET: Final = object.__setattr__
 _SURROGATES_AT: Final = 0x100
 _LONGEST_INT_BITS: Final = 1024  # what a float can hold
 
@@ -102,17 +100,8 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
 
 
 def header(row: StoredRow, uuid: str, benchmark_id: str, path: str) -> EpisodeHeader:
-    """The header of a stored row; the other arguments come from its recording, as stored.
-
-    Built without validation, and without `model_construct`, which would cost more than the rest of a query.
-    """
-    found = _NEW(EpisodeHeader)
-    _SET(found, "__pydantic_fields_set__", _ALL_FIELDS)  # all of them are: nothing is ever added to it
-    _SET(found, "__pydantic_extra__", None)
-    _SET(found, "__pydantic_private__", None)
-    _SET(
-        found,
-        "__dict__",
+    """The header of a stored row; the other arguments come from its recording, as stored."""
+    return unchecked_header(
         {
             "id": f"{uuid}-{row.episode}",
             "created_by": unescape_text(row.created_by),
@@ -129,9 +118,8 @@ def header(row: StoredRow, uuid: str, benchmark_id: str, path: str) -> EpisodeHe
             "env": row.env,
             "episode": row.episode,
             "recording": unescape_text(path),
-        },
+        }
     )
-    return found
 
 
 def searchable(text: str) -> tuple[str, str | None]:

@@ -218,7 +218,11 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
                         self._frames.step(0, number, step, bool(terminal or timeout), self.env.render)
         finally:  # a callback that raises changes nothing about what the environment did
             if terminal or timeout:
-                self._end(TERMINAL if terminal else TIMEOUT)
+                end = TERMINAL if terminal else TIMEOUT
+                if self._watches:
+                    self._end(end)
+                else:
+                    self._recorder.end(end)
                 if self.rotation.is_due(self._writer):
                     self._rotate(state)
         if not self._plain:
@@ -267,7 +271,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             if self.rotation.is_due(self._writer):
                 self._rotate(state)
             self._recorder.reset(state, facts, self._taken_metadata())
-            self._start_frames()
+            if self._frames is not None:
+                self._start_frames()
         except BaseException:  # wherever the environment is now: the running episode is over
             self._recorder.forget_reset(self._taken_metadata())
             if self._frames is not None:
