@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,6 +19,7 @@ from tupli_mcap.dataset.selection import TupleFilter, selector_of
 from tupli_mcap.dataset.sources import Source
 from tupli_mcap.errors import TupliError
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Recording
 from tupli_mcap.sampling import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
 from tupli_mcap.sampling.mapped import MAPPED_FIELDS, MappedSteps
 from tupli_mcap.sampling.recorded import CACHE_BYTES, THREADS
@@ -109,9 +111,9 @@ class Query:
             raise AssertionError("reading leaves the selection behind")
         return self._selected
 
-    def refresh(self) -> list[EpisodeHeader]:
-        """Lists the episodes anew; columns stay if the episodes are the same."""
-        headers = self.source.episodes(self.benchmark_filter, self.episode_filter)
+    def refresh(self, seen: dict[str, Recording] | None = None) -> list[EpisodeHeader]:
+        """Lists the episodes anew; columns stay if the episodes are the same. `seen` as in `Source.episodes`."""
+        headers = self.source.episodes(self.benchmark_filter, self.episode_filter, seen)
         if self._headers is None or _identity(headers) != _identity(self._headers):
             self._selected, self.layout, self._columns = None, None, {}
             self._recorded, self._mapped = None, None
@@ -126,10 +128,12 @@ class Query:
         if self._mapped is not None:
             return self._mapped
         if self._recorded is None:
+            seen: dict[str, Recording] = {}
+            headers = self.refresh(seen) if self._headers is None else self._headers
             mask = None if self._selector is None else self.selected.mask
             self._recorded = RecordedSteps(
-                _listed(self.headers),
-                self.source.open,
+                _listed(headers),
+                lambda name: nullcontext(seen.pop(name)) if name in seen else self.source.open(name),
                 mask,
                 cache_bytes=self.cache_bytes,
                 threads=self.threads,

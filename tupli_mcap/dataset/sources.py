@@ -24,6 +24,7 @@ from tupli_mcap.schema import (
     FilterIN,
     compile_predicate,
 )
+from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.storage import FileStorage, TupliStorage
 from tupli_mcap.storage.document import restored
 from tupli_mcap.storage.sidecar import Sidecar
@@ -33,7 +34,6 @@ __all__ = ["DatasetError", "FilesSource", "Source", "StorageSource", "episode_he
 
 _ENDS = ("terminal", "timeout", "interrupted")
 _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two blocks share it
-_HEADER_FIELDS = set(EpisodeHeader.model_fields)
 
 
 class DatasetError(TupliError, ValueError):
@@ -46,9 +46,15 @@ class Source(Protocol):
     def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]: ...
 
     def episodes(
-        self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None
+        self,
+        benchmark_filter: BaseFilter | None,
+        episode_filter: BaseFilter | None,
+        seen: dict[str, Recording] | None = None,
     ) -> list[EpisodeHeader]:
-        """The episodes both filters are true of; those of one recording follow each other."""
+        """The episodes both filters are true of; those of one recording follow each other.
+
+        What has been opened for it is put into `seen` by name, closed again: it still says where its steps lie.
+        """
         ...
 
     def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str: ...
@@ -72,7 +78,10 @@ class StorageSource:
         return self.storage.list_benchmarks(filter)
 
     def episodes(
-        self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None
+        self,
+        benchmark_filter: BaseFilter | None,
+        episode_filter: BaseFilter | None,
+        seen: dict[str, Recording] | None = None,
     ) -> list[EpisodeHeader]:
         wanted = self._wanted(benchmark_filter, episode_filter)
         return cast("list[EpisodeHeader]", self.storage.list_episodes(wanted))
@@ -140,7 +149,10 @@ class FilesSource:
         return list(found.values())
 
     def episodes(
-        self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None
+        self,
+        benchmark_filter: BaseFilter | None,
+        episode_filter: BaseFilter | None,
+        seen: dict[str, Recording] | None = None,
     ) -> list[EpisodeHeader]:
         of_benchmark = compile_predicate(benchmark_filter, BenchmarkHeader)
         matches = compile_predicate(episode_filter, EpisodeHeader)
@@ -153,6 +165,8 @@ class FilesSource:
                 if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                     continue
                 headers = list(episode_headers(recording, name, deleted))
+            if seen is not None:
+                seen[name] = recording
             copies = [header for header in headers if header.id in files]
             if copies:
                 warnings.warn(
@@ -222,29 +236,30 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
     columns: list[Any] = [
         index[field].tolist() for field in ("episode", "env", "length", "end", "return", "has_seed", "seed")
     ]
+    uuid, benchmark_id = recording.uuid, recording.benchmark_id
     for number, env, length, end, total, has_seed, seed, time, metadata in zip(
         *columns, times.tolist(), recording.all_metadata(), strict=True
     ):
         if number in deleted:
             continue
-        # Built without validation, which would cost more than all the rest.
-        yield EpisodeHeader.model_construct(
-            _HEADER_FIELDS,
-            id=f"{recording.uuid}-{number}",
-            created_by="",
-            published_in=[],
-            created_at=f"{time}+00:00",
-            benchmark_id=recording.benchmark_id,
-            metadata={} if metadata == "{}" else _metadata(metadata, name, number),
-            n_tuples=length,
-            terminated=_ENDS[end] == "terminal",
-            timeout=_ENDS[end] == "timeout",
-            end=_ENDS[end],
-            episode_return=total,
-            seed=seed if has_seed else None,
-            env=env,
-            episode=number,
-            recording=name,
+        yield unchecked_header(
+            {
+                "id": f"{uuid}-{number}",
+                "created_by": "",
+                "published_in": [],
+                "created_at": f"{time}+00:00",
+                "benchmark_id": benchmark_id,
+                "metadata": {} if metadata == "{}" else _metadata(metadata, name, number),
+                "n_tuples": length,
+                "terminated": _ENDS[end] == "terminal",
+                "timeout": _ENDS[end] == "timeout",
+                "end": _ENDS[end],
+                "episode_return": total,
+                "seed": seed if has_seed else None,
+                "env": env,
+                "episode": number,
+                "recording": name,
+            }
         )
 
 

@@ -21,6 +21,10 @@ __all__ = ["TIME", "Column", "ConstantRows", "DecodedRows", "RowFormat", "Rows"]
 TIME = "#log_time"  # the column of times (uint64, ns), named as in the records
 _TIME_STRUCT, _TIME_OFFSET = struct.Struct("<Q"), 15
 
+# Threads that decode small chunks take the interpreter from each other at every one: for so few, one thread is quicker.
+_FEW_CHUNKS = 128
+_LARGE_CHUNK = 1 << 20  # bytes
+
 Array = np.ndarray[Any, Any]
 
 
@@ -126,9 +130,16 @@ class ConstantRows:
 
     def _fill(self, held: _HeldColumns, rows: Array, threads: int) -> None:
         missing = held.missing(rows)
+        if len(missing) <= _FEW_CHUNKS and self._stored(missing) < len(missing) * _LARGE_CHUNK:
+            threads = 1
         do_all([partial(self._fill_unit, held, unit) for unit in missing], threads)
         if missing:
             held.whole = bool(held.there.all())
+
+    def _stored(self, units: list[int]) -> int:
+        """Bytes of the chunks once they are decompressed."""
+        places = zip(self.segments.file_of[units], self.segments.chunk_of[units], strict=True)
+        return sum(int(self._formats[file].store.table["uncompressed"][chunk]) for file, chunk in places)
 
     def _fill_unit(self, held: _HeldColumns, unit: int) -> None:
         file, chunk = int(self.segments.file_of[unit]), int(self.segments.chunk_of[unit])
