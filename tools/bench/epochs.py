@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from tools.bench.contenders import CannotError, Contender
+from tools.bench.contenders.base import LOADED
 from tools.bench.data import Array, Data
 from tools.bench.measure import check
 from tools.bench.workloads import SEED, Workload
 
 BATCH = 256
-FIELDS = ("states", "actions", "rewards")
+MOST = 20_000  # windows of an epoch
 
 
 def places_of(data: Data, length: int, stride: int) -> Array:
@@ -61,7 +62,7 @@ class OneByOne:
 def _numbers(found: Any) -> dict[str, Any]:
     """What a loader gives: PyTorch knows no texts, so who has no way of its own leaves them out."""
     return {
-        name: leaf for name, leaf in found.items() if name.startswith(FIELDS) and leaf.dtype.kind not in "OU"
+        name: leaf for name, leaf in found.items() if name.startswith(LOADED) and leaf.dtype.kind not in "OU"
     }
 
 
@@ -87,7 +88,7 @@ def epoch(
     count = min(count, len(places))
     chosen = np.random.default_rng(SEED).permutation(len(places))[:count]
     want = _sums(data, places[chosen], work.window)
-    mapped = getattr(contender, "batches", False)
+    mapped = in_batches(contender)
     gc.collect()
     began = time.perf_counter()
     collate: Any = None
@@ -130,8 +131,13 @@ def _sums(data: Data, places: Array, length: int) -> list[Array]:
     ]
 
 
+def in_batches(contender: Contender) -> bool:
+    """Whether its loader reads a batch at once; what one window takes then says nothing of an epoch."""
+    return hasattr(contender, "loader_parts") or getattr(contender, "batches", False)
+
+
 def speed_of_window(seconds: float, budget: float) -> int:
-    """How many windows fit into `budget` seconds."""
+    """How many windows fit into `budget` seconds, where they are read one by one."""
     if not seconds:
         raise CannotError("no windows")
-    return int(min(20_000, max(32, budget / seconds)))
+    return int(min(MOST, max(32, budget / seconds)))

@@ -14,6 +14,7 @@ from tools.bench.measure import Stopwatch
 from tools.bench.workloads import STEPS, Workload
 
 BLOCK = 4096  # rows that are kept before they are written
+LOADED = ("states", "actions", "rewards")  # what a loader reads; the names of leaves begin so
 
 
 class CannotError(Exception):
@@ -37,7 +38,7 @@ class Session:
     def windows(
         self, places: Sequence[tuple[int, int]], length: int
     ) -> list[dict[str, Any]] | dict[str, Any]:
-        """Several windows: one by one, unless there is a quicker way; then stacked."""
+        """`LOADED` of several windows: all leaves one by one, unless there is a quicker way; then stacked."""
         return [self.window(number, start, length) for number, start in places]
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tools.bench.contenders.base import Blocks, Contender, Session
+from tools.bench.contenders.base import LOADED, Blocks, Contender, Session
 from tools.bench.data import Array, Data
 from tools.bench.workloads import Workload
 
@@ -63,7 +63,7 @@ class Columns(Session):
     def windows(self, places: Sequence[tuple[int, int]], length: int) -> dict[str, Any]:
         at = np.asarray(places)
         rows = (self._starts[at[:, 0]] + at[:, 1])[:, None] + np.arange(length)
-        return {name: leaf[rows] for name, leaf in self._leaves.items()}
+        return {name: leaf[rows] for name, leaf in self._leaves.items() if name.startswith(LOADED)}
 
 
 def chosen(leaves: dict[str, Array], lengths: Array, returns: Array, least: float) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tools.bench.contenders.base import CannotError, Contender, Session
+from tools.bench.contenders.base import LOADED, CannotError, Contender, Session
 from tools.bench.data import Array, flat
 from tools.bench.measure import Stopwatch
 from tools.bench.workloads import STEPS, Workload
@@ -92,7 +92,7 @@ class Ours(Contender):
         """A map-style dataset of windows for PyTorch, and what its DataLoader collates with."""
         from tupli_mcap.torch import MapDataset, collate
 
-        windows = self.dataset(path).windows(length, stride, fields=("states", "actions", "rewards"))
+        windows = self.dataset(path).windows(length, stride, fields=LOADED)
         return MapDataset(windows), collate
 
 
