@@ -529,17 +529,24 @@ def test_two_ranks_share_an_epoch(tmp_path: Path) -> None:
 # ---- what goes wrong
 
 
+# the worker kills itself where it holds no lock: one that PyTorch's own DataLoader shares with its workers would never
+# be let go of, and the DataLoader would wait for it for ever
 KILLED = """
 import os, signal, sys
 from torch.utils.data import DataLoader
 from tupli_mcap import TupliDataset
 from tupli_mcap.torch import StreamDataset, collate
 
+seen = []
+
+def last(batch):
+    seen.append(batch)
+    if len(seen) == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return collate(batch)
+
 stream = StreamDataset(TupliDataset.from_files(sys.argv[1]).windows(2), 8, seed=0)
-batches = iter(DataLoader(stream, None, num_workers=1, collate_fn=collate))
-next(batches)
-os.kill(batches._workers[0].pid, signal.SIGKILL)
-list(batches)
+list(DataLoader(stream, None, num_workers=1, collate_fn=last))
 """
 
 
