@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel
 
-from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.cameras import FRAME_LAYOUT
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.container import CHUNK_ROWS, Rows
 from tupli_mcap.recording.contents import Contents
-from tupli_mcap.recording.events import INTERRUPTED, EpisodeEnd, EpisodeStart, record
+from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart, record
+from tupli_mcap.recording.facts import Run, runs
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.salvage import to_rows
+from tupli_mcap.recording.salvage import FinalHole, to_rows
 from tupli_mcap.recording.scan import Scan
 from tupli_mcap.recording.source import Source
 
@@ -27,10 +27,14 @@ __all__ = ["Unwritten", "chunk_table", "complete"]
 
 @dataclass
 class Unwritten:
-    """What the journal adds to the file, as rows that are not in it; `pending` are states by sub-environment."""
+    """What the journal adds to the file, as rows that are not in it; `pending` are states by sub-environment.
+
+    `finals`: what follows the last steps of episodes, by sub-environment and the row after.
+    """
 
     rows: list[Rows] = field(default_factory=list)
     pending: dict[int, bytes] = field(default_factory=dict)
+    finals: dict[tuple[int, int], FinalHole] = field(default_factory=dict)
     left_out: int = 0  # steps in the journal that a power loss may have torn
     final_lost: bool = (
         False  # a final state that is not there may have been: `pending` may be of the next episode
@@ -125,30 +129,93 @@ def complete(
     available = [_available(store, topics, layout, found.channels[channel]) for channel in steps]
     tail.left_out += sum(map(store.count, steps)) - sum(available)
     contents.used_episodes = max(episodes.drop_ends(available), _beyond_frames(store, topics))
-    for start, time in _unstarted(store, layout, steps, available, set(episodes.starts)):
-        episodes.make_start(start, time)
-    for number in sorted(set(episodes.starts) - set(episodes.ends)):
-        _, _, start = episodes.starts[number]
-        facts = _rows_of(store, layout, steps, available, start, number)
-        if facts is None:
-            continue  # a reset without a step is no episode
-        length, total, how, time = facts
-        if how == INTERRUPTED:  # what is there is that of a later step, which was lost
-            episodes.finals.pop(number, None)
-        final = None
-        at_end = start.first_row + length == available[start.env] == store.count(steps[start.env])
-        if number not in episodes.finals and at_end and (how == INTERRUPTED or not tail.final_lost):
-            final = tail.pending.get(start.env)
-        if final is not None:
-            final = number.to_bytes(4, "little") + start.env.to_bytes(4, "little") + final
-        has_final = final is not None or number in episodes.finals
-        end = EpisodeEnd(number, start.env, start.first_row, length, total, how, has_final, "{}")
-        episodes.make_end(end, time, final)
+    found_runs = _Runs(store, layout, steps, available, episodes)
+    _make_starts(episodes, found_runs, tail)
+    _make_ends(episodes, found_runs, store, tail)
     tail.rows += to_rows(episodes.made)
     contents.memory = [bytes(rows.data) for rows in tail.rows]
     contents.table = chunk_table(found, tail.rows)
     contents.tail = tail.rows
     contents.index = _index(episodes, contents.table)
+
+
+class _Runs:
+    """The rows of episodes that have no start or no end."""
+
+    def __init__(
+        self,
+        store: ChunkStore,
+        layout: StepLayout,
+        steps: list[int],
+        available: list[int],
+        episodes: _Episodes,
+    ) -> None:
+        self._store, self.layout = store, layout
+        self.steps, self.available = steps, available
+        # starts made for episodes that have steps and none, and the times of their first steps
+        self.unstarted: list[tuple[EpisodeStart, int]] = []
+        self._begun: dict[tuple[int, int], Run] = {}
+        for env, channel in enumerate(steps):
+            last = -1
+            for run in runs(store, layout, channel, 0, available[env]):
+                if run.episode != last and run.episode not in episodes.starts:
+                    start = EpisodeStart(run.episode, env, run.row, False, False, "", "", "{}")
+                    self.unstarted.append((start, run.first_time))
+                if run.episode not in episodes.ends:
+                    self._begun[env, run.row] = run
+                last = run.episode
+
+    def of(self, start: EpisodeStart) -> Run | None:
+        """The rows of an episode without an end; None if it has no step."""
+        run = self._begun.get((start.env, start.first_row))
+        if run is None and start.env < len(self.steps):
+            # none, unless its start is wrong
+            count = max(0, self.available[start.env] - start.first_row)
+            rows = runs(self._store, self.layout, self.steps[start.env], start.first_row, count)
+            run = next(rows, None)
+        return run if run is not None and run.episode == start.episode else None
+
+
+def _make_starts(episodes: _Episodes, found: _Runs, tail: Unwritten) -> None:
+    """Makes the missing starts, in the order of time."""
+    missing = []
+    for start, time in found.unstarted:
+        hole = tail.finals.get((start.env, start.first_row))
+        missing.append((time if hole is None else hole.time_ns, start.episode, start))
+    for time, _, start in sorted(missing):
+        episodes.make_start(start, time)
+
+
+def _make_ends(episodes: _Episodes, found: _Runs, store: ChunkStore, tail: Unwritten) -> None:
+    """Makes the missing ends, in the order of time."""
+    missing = []
+    for number in set(episodes.starts) - set(episodes.ends):
+        start = episodes.starts[number][2]
+        run = found.of(start)
+        if run is not None:  # a reset without a step is no episode
+            missing.append((run.last_time, number, start, run))
+    for time, number, start, run in sorted(missing, key=lambda made: made[:2]):
+        how = TERMINAL if run.terminal else TIMEOUT if run.timeout else INTERRUPTED
+        if how == INTERRUPTED:  # what is there is that of a later step, which was lost
+            episodes.finals.pop(number, None)
+        final = None
+        if number not in episodes.finals:
+            final = _final_state(found, store, tail, start.env, run)
+        if final is not None:
+            final = number.to_bytes(4, "little") + start.env.to_bytes(4, "little") + final
+        has_final = final is not None or number in episodes.finals
+        end = EpisodeEnd(number, start.env, run.row, run.steps, run.total, how, has_final, "{}")
+        episodes.make_end(end, time, final)
+
+
+def _final_state(found: _Runs, store: ChunkStore, tail: Unwritten, env: int, run: Run) -> bytes | None:
+    """The state after a run, from the journal; None if it is not there."""
+    stop, ended = run.row + run.steps, run.terminal or run.timeout
+    hole = tail.finals.get((env, stop))
+    if ended and hole is not None and not found.layout.images:  # images are where the next ones are by now
+        return hole.state
+    at_end = stop == found.available[env] == store.count(found.steps[env])
+    return tail.pending.get(env) if at_end and not (ended and tail.final_lost) else None
 
 
 def _beyond_frames(store: ChunkStore, topics: dict[str, int]) -> int:
@@ -178,73 +245,8 @@ def _index(episodes: _Episodes, table: np.ndarray[Any, Any]) -> EpisodeIndex:
     return EpisodeIndex.decode(builder.encode(table.tobytes()), "recovered index")
 
 
-def _unstarted(
-    store: ChunkStore, layout: StepLayout, steps: list[int], available: list[int], known: set[int]
-) -> Iterator[tuple[EpisodeStart, int]]:
-    """Starts made for episodes that have steps but lost their `/episode_start` (with the journal), and their times."""
-    for env, channel in enumerate(steps):
-        row, last = 0, -1
-        for episode, _, _, time in _step_facts(store, layout, channel, 0, available[env]):
-            if episode != last and episode not in known:
-                yield EpisodeStart(episode, env, row, False, False, "", "", "{}"), time
-            row, last = row + 1, episode
-
-
 def _available(store: ChunkStore, topics: dict[str, int], layout: StepLayout, channel: Channel) -> int:
     """Steps of a sub-environment that are whole: of which all images are there."""
     top = channel.topic.removesuffix("/step")
     images = [topics.get(f"{top}/image/{leaf.name}", 0) for leaf in layout.images]
     return min(store.count(one) for one in (channel.id, *images))
-
-
-def _rows_of(
-    store: ChunkStore,
-    layout: StepLayout,
-    steps: list[int],
-    available: list[int],
-    start: EpisodeStart,
-    number: int,
-) -> tuple[int, float, int, int] | None:
-    """(length, return, end, time of the last step) of an episode without an end; None if it has no step."""
-    if start.env >= len(steps):
-        return None
-    channel = steps[start.env]
-    count = available[start.env] - start.first_row
-    if count <= 0:
-        return None
-    total, length, last, time = 0.0, 0, (False, False), 0
-    for episode, reward, flags, at in _step_facts(store, layout, channel, start.first_row, count):
-        if episode != number:
-            break
-        total, length, last, time = total + reward, length + 1, flags, at
-        if any(flags):
-            break
-    if not length:
-        return None
-    return length, total, 0 if last[0] else 1 if last[1] else 2, time
-
-
-def _step_facts(
-    store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int
-) -> Iterator[tuple[int, float, tuple[bool, bool], int]]:
-    names = [leaf.name for leaf in layout.reward]
-    if layout.constant:
-        for span in store.spans(channel, first, count):
-            rows = store.rows(span.chunk, layout.step_message.dtype)[span.begin : span.end]
-            rewards = sum(rows[name].reshape(len(rows), -1).sum(axis=1, dtype=np.float64) for name in names)
-            yield from zip(
-                rows["episode"].tolist(),
-                np.asarray(rewards).tolist(),
-                zip(rows["terminal"].tolist(), rows["timeout"].tolist(), strict=True),
-                rows["#log_time"].tolist(),
-                strict=True,
-            )
-        return
-    decoder = MessageDecoder(layout)
-    for span in store.spans(channel, first, count):
-        data = memoryview(store.load(span.chunk))
-        for start, end in store.messages(span.chunk)[span.begin : span.end]:
-            values = decoder.step(data[start + BODY : end])
-            reward = float(sum(np.sum(values[name]) for name in names))
-            time = int.from_bytes(data[start + 15 : start + 23], "little")
-            yield values["episode"], reward, (values["terminal"], values["timeout"]), time

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.headers import message_headers
 
-__all__ = ["StepFacts", "step_facts"]
+__all__ = ["Run", "StepFacts", "runs", "step_facts", "sum_up"]
 
 Array = np.ndarray[Any, Any]
 
@@ -48,6 +49,71 @@ def step_facts(
             yield _constant(rows, layout)
         else:
             yield _variable(memoryview(store.load(span.chunk, keep=False)), layout, span.begin, span.end)
+
+
+class Run(NamedTuple):
+    """Consecutive rows of one episode, up to a flag: their first one, how many, their rewards, times in ns."""
+
+    row: int
+    steps: int
+    episode: int
+    total: float
+    terminal: bool
+    timeout: bool
+    first_time: int
+    last_time: int
+
+
+def runs(store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int) -> Iterator[Run]:
+    """The runs of the rows `first:first + count`, in their order.
+
+    Raises:
+        FormatError: as `step_facts`, or a row is no step of the layout.
+    """
+    last: Run | None = None
+    row = first
+    for facts in step_facts(store, layout, channel, first, count):
+        if facts.bad:
+            raise FormatError(next(iter(facts.bad.values())))
+        for run in _runs(facts, row, last):
+            if last is not None and run.row != last.row:
+                yield last
+            last = run
+        row += len(facts.episode)
+    if last is not None:
+        yield last
+
+
+def _runs(facts: StepFacts, row: int, last: Run | None) -> Iterator[Run]:
+    """The runs of one batch of rows, which starts at `row`; the first one may go on with the last one before."""
+    n = len(facts.episode)
+    if not n:
+        return
+    flagged = (facts.terminal != 0) | (facts.timeout != 0)
+    begins = np.flatnonzero((facts.episode[1:] != facts.episode[:-1]) | flagged[:-1]) + 1
+    edges = [0, *begins.tolist(), n]
+    begin, end = np.array(edges[:-1]), np.array(edges[1:]) - 1
+    found = zip(
+        itertools.pairwise(edges),
+        facts.episode[begin].tolist(),
+        (facts.terminal[end] != 0).tolist(),
+        (facts.timeout[end] != 0).tolist(),
+        facts.time[begin].tolist(),
+        facts.time[end].tolist(),
+        strict=True,
+    )
+    for (low, high), episode, terminal, timeout, first_time, last_time in found:
+        at, steps, total = row + low, high - low, 0.0
+        if low == 0 and last is not None and last.episode == episode and not (last.terminal or last.timeout):
+            at, steps, total, first_time = last.row, last.steps + steps, last.total, last.first_time
+        total = sum_up(facts.reward[low:high], total)
+        yield Run(at, steps, episode, total, terminal, timeout, first_time, last_time)
+
+
+def sum_up(rewards: Array, total: float = 0.0) -> float:
+    """`total` and the rewards, added one after another as a recorder does."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return float(np.cumsum(np.concatenate(((total,), rewards)))[-1])
 
 
 def _constant(rows: Array, layout: StepLayout) -> StepFacts:

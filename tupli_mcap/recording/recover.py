@@ -261,8 +261,11 @@ def _salvage(
             rows, _ = committed_rows(salvage, first, channel, last)
             total = first + (0 if rows is None else len(rows.offsets))
             tail.left_out += salvage.left_out
+            holes = {(env, hole.row): hole for hole in salvage.finals(layout.state_end) if hole.row <= total}
+            tail.finals |= holes
             following = salvage.following(total - 1, layout.state_end)
-            if following is not None:
+            # behind a hole, the image that was running is the next state's
+            if following is not None and not (layout.images and (env, total) in holes):
                 tail.pending[env] = following
         else:
             log = _log_area(journal, f"steps/{env}")

@@ -20,6 +20,7 @@ from tupli_mcap.recording.container import CHUNK_ROWS, MAGIC, PROFILE
 from tupli_mcap.recording.contents import CHANNEL_KEYS, RECORDING_KEYS, RECORDING_METADATA, is_ours
 from tupli_mcap.recording.headers import ChunkRecords, chunk_records, message_headers
 from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.salvage import FinalHole
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import parse_record
 from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey
@@ -90,7 +91,8 @@ class Pieces(Sequence[bytes]):
 class Gathered:
     """`pieces` of a channel are in order and do not overlap; `damages` are in the order of the file.
 
-    `metadata` is None where the recording's is lost. `states` are those of the running steps, by sub-environment.
+    `metadata` is None where the recording's is lost. `states` are those of the running steps, by sub-environment;
+    `finals` what follows the last steps of episodes, by sub-environment and the row after.
     `at_journal`: where each channel's rows from the journal begin.
     """
 
@@ -105,6 +107,7 @@ class Gathered:
     pieces: dict[int, list[Piece]] = field(default_factory=dict)
     damages: list[Damage] = field(default_factory=list)
     states: dict[int, bytes] = field(default_factory=dict)
+    finals: dict[tuple[int, int], FinalHole] = field(default_factory=dict)
     final_lost: bool = (
         False  # after a power loss: a state may be the one after a final state that is not here
     )

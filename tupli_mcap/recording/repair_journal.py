@@ -181,7 +181,12 @@ def _add_rows(
                 same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
                 rows["step"][:same] = first - begun + np.arange(same)
             _add(gathered, channel, first, len(rows), rows.view(np.uint8).tobytes())
-    return salvage.following(_stop(gathered, channel) - 1, layout.state_end)
+    stop = _stop(gathered, channel)
+    finals = {(env, hole.row): hole for hole in salvage.finals(layout.state_end) if hole.row <= stop}
+    gathered.finals |= finals
+    if layout.images and (env, stop) in finals:  # the image that is running is the next state's
+        return None
+    return salvage.following(stop - 1, layout.state_end)
 
 
 def _row_before(gathered: Gathered, channel: int, first: int, dtype: np.dtype[Any]) -> tuple[int, int, int]:

@@ -13,8 +13,9 @@ from tupli_mcap.recording.index import EpisodeIndex
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
 from tupli_mcap.recording.repair_segments import Channels, Ranges, Segment, messages, segments
 
-__all__ = ["Plan", "PlannedEpisode", "Told", "make_plan"]
+__all__ = ["IN_A_HOLE", "RUNNING", "Plan", "PlannedEpisode", "Told", "make_plan"]
 
+RUNNING, IN_A_HOLE = -1, -2  # instead of the row of a final state: where in the journal it is
 _END = 1 << 64  # beyond any row number
 
 
@@ -36,7 +37,7 @@ class PlannedEpisode(NamedTuple):
     """An episode of the new recording. `whole`: it is one of the old, all of it.
 
     `head`, `tail`: its first step was the old one's first, its last one the old one's last. `length`: of the old
-    episode, None if not known. `final`: its row in the old `/final_state` (as packed), -1 for the running state, None
+    episode, None if not known. `final`: its row in the old `/final_state` (as packed), RUNNING, IN_A_HOLE, or None
     if there is none. `orphan`: metadata of the old episode, whose end is not here. `resets`: without a step, before it.
     """
 
@@ -121,18 +122,20 @@ def make_plan(gathered: Gathered, store: PackedStore, layout: StepLayout, channe
             if made is not None:
                 told.ends[number] = made
     found = list(segments(gathered, store, layout, channels))
-    return _Planner(gathered, told, found).run(channels)
+    return _Planner(gathered, told, found, images=bool(layout.images)).run(channels)
 
 
 class _Planner:
-    def __init__(self, gathered: Gathered, told: Told, found: list[Segment]) -> None:
+    def __init__(self, gathered: Gathered, told: Told, found: list[Segment], *, images: bool) -> None:
         self._gathered = gathered
+        self._images = images
         self._told = told
         self._found = found
         self._plan = Plan()
         known = [s.episode for s in found] + list(told.starts) + list(told.ends) + list(told.index)
         told_next = (gathered.metadata or {}).get("next_episode", "")
         self._next = max([*known, int(told_next) - 1 if told_next.isdecimal() else -1]) + 1
+        self._starts_whole = True  # no start is missing between those that are here
         self._totals: dict[int, int] = {}
         self._taken: set[int] = set()
         self._ended: set[int] = set()  # old episodes whose last step is here
@@ -147,6 +150,8 @@ class _Planner:
         stops: dict[int, int] = {}  # where the ends say that the rows of a sub-environment end
         for _, end in self._told.ends.values():
             stops[end.env] = max(stops.get(end.env, 0), end.first_row + end.length)
+        starts = [] if channels.start is None else self._gathered.ranges(channels.start)
+        self._starts_whole = all(first == 0 for first, _ in starts)
         totals = [self._total(env, channels, stops.get(env, 0)) for env in range(len(channels.steps))]
         self._totals = dict(enumerate(totals))
         for segment in self._found:
@@ -213,8 +218,10 @@ class _Planner:
         unfinished = running and not ended and not self._gathered.tail.finished
         if segment.episode in self._told.finals and not unfinished:
             return self._told.finals[segment.episode]
+        if ended and not self._images and (segment.env, segment.row + segment.steps) in self._gathered.finals:
+            return IN_A_HOLE
         if running and segment.env in self._gathered.states and not (ended and self._gathered.final_lost):
-            return -1
+            return RUNNING
         self._plan.lost_finals.append(segment.episode)
         return None
 
@@ -225,8 +232,10 @@ class _Planner:
             time, start = self._told.starts[segment.episode]
             if start.env == segment.env:
                 return time, start
-        self._plan.lost_starts.append(segment.episode)
-        seed, time = "", segment.first_time
+        hole = self._gathered.finals.get((segment.env, segment.row))
+        if hole is None or not self._starts_whole:
+            self._plan.lost_starts.append(segment.episode)
+        seed, time = "", segment.first_time if hole is None else hole.time_ns
         index = self._gathered.tail.index
         if index is not None and number in self._told.index:
             row = index.episodes[self._told.index[number]]

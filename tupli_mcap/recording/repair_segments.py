@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.facts import StepFacts, step_facts
+from tupli_mcap.recording.facts import StepFacts, step_facts, sum_up
 from tupli_mcap.recording.headers import message_headers
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
 
@@ -92,7 +92,7 @@ def segments(
             open_: Segment | None = None
             row = first
             for facts in step_facts(store, layout, channel, store.packed(channel, first), stop - first):
-                for found in _cut(facts, env, row):
+                for found in _cut(facts, env, row, open_):
                     if open_ is not None and _continues(open_, found):
                         open_ = _joined(open_, found)
                         continue
@@ -104,8 +104,8 @@ def segments(
                 yield open_
 
 
-def _cut(facts: StepFacts, env: int, row: int) -> Iterator[Segment]:
-    """The segments of one batch of rows, which starts at `row`."""
+def _cut(facts: StepFacts, env: int, row: int, before: Segment | None) -> Iterator[Segment]:
+    """The segments of one batch of rows, which starts at `row`; the return of one that goes on is that of both."""
     episode, step = facts.episode.astype(np.int64), facts.step.astype(np.int64)
     flagged = (facts.terminal != 0) | (facts.timeout != 0)
     breaks = (episode[1:] != episode[:-1]) | (step[1:] != step[:-1] + 1) | flagged[:-1]
@@ -115,13 +115,13 @@ def _cut(facts: StepFacts, env: int, row: int) -> Iterator[Segment]:
     for begin, end in itertools.pairwise(order):
         if begin in facts.bad:
             continue
-        with np.errstate(invalid="ignore", over="ignore"):
-            total = float(np.cumsum(facts.reward[begin:end])[-1])
-        yield Segment(
-            env, row + begin, end - begin, int(episode[begin]), int(step[begin]), total,
+        found = Segment(
+            env, row + begin, end - begin, int(episode[begin]), int(step[begin]), 0.0,
             bool(facts.terminal[end - 1]), bool(facts.timeout[end - 1]),
             int(facts.time[begin]), int(facts.time[end - 1]), False,
         )  # fmt: skip
+        earlier = before.total if before is not None and _continues(before, found) else 0.0
+        yield found._replace(total=sum_up(facts.reward[begin:end], earlier))
 
 
 def _continues(a: Segment, b: Segment) -> bool:
@@ -131,7 +131,7 @@ def _continues(a: Segment, b: Segment) -> bool:
 
 def _joined(a: Segment, b: Segment) -> Segment:
     return a._replace(
-        steps=a.steps + b.steps, total=a.total + b.total,
+        steps=a.steps + b.steps, total=b.total,
         terminal=b.terminal, timeout=b.timeout, last_time=b.last_time,
     )  # fmt: skip
 

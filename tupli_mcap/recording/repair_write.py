@@ -26,7 +26,7 @@ from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilde
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_frames import OldCameras, kept_frames
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
-from tupli_mcap.recording.repair_plan import Plan, PlannedEpisode
+from tupli_mcap.recording.repair_plan import IN_A_HOLE, RUNNING, Plan, PlannedEpisode
 from tupli_mcap.recording.repair_segments import Channels, message_at, messages
 from tupli_mcap.recording.rows import even_rows
 
@@ -285,7 +285,9 @@ class RepairWriter:
 
     def _final(self, episode: PlannedEpisode, store: PackedStore, old: Channels) -> bytes:
         env = episode.segment.env
-        if episode.final is None or episode.final < 0 or old.final is None:
+        if episode.final == IN_A_HOLE:
+            rest = self._gathered.finals[env, episode.segment.row + episode.segment.steps].state
+        elif episode.final in (None, RUNNING) or old.final is None:
             rest = self._gathered.states[env]
         else:
             rest = message_at(store, old.final, episode.final)[8:]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,10 +19,20 @@ from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.rows import RowDeriver, even_rows
 from tupli_mcap.recording.vector_rows import HOLE
 
-__all__ = ["Salvage", "committed_rows", "image_rows", "log_records", "running_record", "to_rows"]
+__all__ = ["FinalHole", "Salvage", "committed_rows", "image_rows", "log_records", "running_record", "to_rows"]
 
 Array = np.ndarray[Any, Any]
 SEQUENCE_END = 15  # of `sequence` in a Message record
+EPISODE_END = BODY + 4  # of `episode` in a step's
+
+
+class FinalHole(NamedTuple):
+    """The place after an episode's last step: what it ended with, the time (ns) of the next reset, the row after."""
+
+    episode: int
+    state: bytes
+    time_ns: int
+    row: int
 
 
 class Salvage:
@@ -116,6 +126,30 @@ class Salvage:
                 return None
         return state
 
+    def finals(self, state_end: int) -> list[FinalHole]:
+        """What follows the last steps of episodes, of all committed rows here; nothing of a torn journal."""
+        rows = self.rows
+        flags = (rows[name][self._halves, self._places].view(np.uint8) for name in ("terminal", "timeout"))
+        ended = np.logical_or(*flags)
+        if self._torn or not ended.any():
+            return []
+        halves, places = self._halves[ended], self._places[ended]
+        last = rows[halves, places]
+        beyond = places + 1 == self._area.rows  # the spare row, which is the other half's first one
+        halves, places = np.where(beyond, 1 - halves, halves), np.where(beyond, 0, places + 1)
+        after = rows[halves, places]
+        valid = (after["#sequence"] == HOLE) & (after["episode"] == last["episode"])
+        valid &= after["#log_time"] >= last["#log_time"]
+        states = self._bytes[halves[valid], places[valid], STATE:state_end]
+        found = zip(
+            last["episode"][valid].tolist(),
+            states,
+            after["#log_time"][valid].tolist(),
+            (last["#sequence"][valid].astype(np.int64) + 1).tolist(),
+            strict=True,
+        )
+        return [FinalHole(episode, state.tobytes(), time_ns, row) for episode, state, time_ns, row in found]
+
     def _find(self, sequence: int) -> int | None:
         found = int(np.searchsorted(self._sequences, sequence))
         if found == len(self._sequences) or self._sequences[found] != sequence:
@@ -139,7 +173,15 @@ class Salvage:
         # which came later: where that is on the disk, so is the end of this row.
         follows = i + 1 < len(self._sequences) and self._sequences[i + 1] == self._sequences[i] + 1
         beside = follows and (int(self._halves[i + 1]), int(self._places[i + 1])) == (half, place + 1)
-        return beside and size <= SECTOR - SEQUENCE_END
+        if beside:
+            return size <= SECTOR - SEQUENCE_END
+        return size <= SECTOR - EPISODE_END and place + 1 < self._area.rows and self._has_hole(half, place)
+
+    def _has_hole(self, half: int, place: int) -> bool:
+        """Whether a final hole that is later than a row is the next one of its block."""
+        row, hole = self.rows[half, place], self.rows[half, place + 1]
+        later = hole["#sequence"] == HOLE and hole["#log_time"] > row["#log_time"]
+        return bool(later and hole["episode"] == row["episode"] and (row["terminal"] or row["timeout"]))
 
 
 def committed_rows(
