@@ -159,6 +159,7 @@ def test_a_watcher_in_another_thread_sees_what_is_recorded(
         env: Any = RecordVectorEpisodes(inner, path, chunk_size=4000)
     else:
         env = RecordEpisodes(Sampler(space, space), path, chunk_size=4000)
+    env._recorder.leaves_to_rows = False  # as where `live` is given
     watcher = Watcher(env._writer)
 
     def watch() -> None:

@@ -39,6 +39,7 @@ COLUMNS = ("states", "actions", "rewards", "terminals", "timeouts", "infos")
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 1_000_000
 BOOT = "00000000-0000-0000-0000-000000000000"  # none of any machine: what is not shown to be whole does not count
+BOOT_ID = "tupli_mcap.recording.writer.boot_id"
 
 Log = dict[str, Any]
 Observe = Callable[[int, int], Any]
@@ -56,7 +57,7 @@ def made_up_world(number: int) -> Iterator[None]:
         mock.patch("time.time_ns", side_effect=clock),
         mock.patch("uuid.uuid4", return_value=known),
         mock.patch("tupli_mcap.recording.writer.version", return_value="1"),
-        mock.patch("tupli_mcap.recording.writer.boot_id", return_value=BOOT),
+        mock.patch(BOOT_ID, return_value=BOOT),
         mock.patch("tupli_mcap.recording.rewrite.version", return_value="1"),
     ):
         yield
@@ -451,10 +452,40 @@ def unfinished(path: Path, env: Played, **more: Any) -> list[Log]:
         options: dict[str, Any] = {"compression": "none", "attachments": {}, "chunk_size": 400}
         with RecordEpisodes(env, live, durability="step", **options, **more) as recorder:
             roll(recorder, env, [3, 4, 2], action)
-            shutil.copy(live, path)
-            journal = journal_path(live).read_bytes()
+            keep(live, path)
+    return expected(env)
+
+
+def keep(live: Path, path: Path) -> None:
+    """Copies a recording as it is, and its journal."""
+    shutil.copy(live, path)
+    journal = journal_path(live).read_bytes()
     packed = zstandard.ZstdCompressor(level=19).compress(journal)  # most of it is zeros
     path.with_suffix(".mcap.journal.zst").write_bytes(packed)
+
+
+class Silent(Played):
+    """A reset tells nothing, so that rows tell of episodes."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        state, _ = super().reset(seed=seed, options=options)
+        self.log[-1]["reset_info"] = {}
+        return state, {}
+
+
+def unfinished_holes(path: Path) -> list[Log]:
+    """What a killed process leaves, with final states in holes, and the chunks of the first steps in the file."""
+    env = Silent(POLE, pole, ENDS)
+    with tempfile.TemporaryDirectory() as directory, mock.patch(BOOT_ID, return_value=""):
+        live = Path(directory, path.name)
+        with RecordEpisodes(env, live, compression="none", attachments={}, chunk_size=400) as recorder:
+            recorder.reset(seed=7)
+            for length in (3, 4, 9, 3, 4, 2):
+                for t in range(length):
+                    recorder.step(action(t))
+                if length > 2:
+                    recorder.reset()
+            keep(live, path)
     return expected(env)
 
 
@@ -493,6 +524,7 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "unfinished_frames": unfinished_frames,
     "stacked": stacked,
     "png_images": png_images,
+    "unfinished_holes": unfinished_holes,
 }
 
 

@@ -24,10 +24,11 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import DType, Leaf
 from tupli_mcap.messages.step import StepLayout
 
-__all__ = ["COMMIT", "SEQUENCE_OFFSET", "Cursor", "RowEncoder", "make_row_encoder"]
+__all__ = ["COMMIT", "HOLE", "SEQUENCE_OFFSET", "Cursor", "RowEncoder", "make_row_encoder"]
 
 SEQUENCE_OFFSET = 11  # of `sequence` in a Message record; log_time follows it
 COMMIT = Struct("<IQ")
+HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 PREFIX = BODY + 8  # record header, CDR header, episode, step: the same for a whole episode
 _LARGE = 2048  # bytes from which a leaf is copied as an array instead of through `bytes`
 _INT_FORMATS = {
@@ -66,10 +67,15 @@ class ImageSink(Protocol):
 
 @dataclass
 class RowEncoder:
-    """`put(action, state, reward, terminal, timeout)` writes and commits a step; `put_state(state)` starts a row."""
+    """`put(action, state, reward, terminal, timeout)` writes and commits a step; `put_state(state)` starts a row.
+
+    `put_next(prefix, state, time_ns)` leaves the running row as a hole of that time that keeps the final state, and
+    starts the one after it.
+    """
 
     put: Callable[[Any, Any, Any, Any, Any], None]
     put_state: Callable[[Any], None]
+    put_next: Callable[[bytes, Any, int], None]
     state_end: int  # bytes of a row up to the end of its state
     source: str
 
@@ -158,11 +164,18 @@ def make_row_encoder(
         *state_stores,
         *firsts,
     ]
+    next_lines = [
+        *state.lines,
+        f"pack_state(buffer, offset + {size}, {', '.join(['prefix', *head.args[1:]])})",
+        *next_state,
+    ]
     amount = "reward"
     if layout.reward_space is not None:
         put_lines.append(f"amount = {source.bind('total', layout.reward_total)}(reward)")
         amount = "amount"
-    text = _render(put_lines, first_lines, size, amount, "" if seal is None else "    seal(offset)\n")
+    text = _render(
+        put_lines, first_lines, next_lines, size, amount, "" if seal is None else "    seal(offset)\n"
+    )
     namespace = dict(
         source.names,
         buffer=buffer,
@@ -178,7 +191,8 @@ def make_row_encoder(
         view=np.frombuffer(buffer, np.uint8),
     )
     exec(compile(text, "<tupli_mcap row encoder>", "exec"), namespace)
-    return RowEncoder(namespace["put"], namespace["put_state"], layout.state_end, text)
+    put, put_state, put_next = (namespace[name] for name in ("put", "put_state", "put_next"))
+    return RowEncoder(put, put_state, put_next, layout.state_end, text)
 
 
 def _shift(head: _Packed, size: int, tail: _Packed) -> _Packed:
@@ -191,7 +205,12 @@ def _shift(head: _Packed, size: int, tail: _Packed) -> _Packed:
 
 
 def _render(
-    put_lines: Sequence[str], first_lines: Sequence[str], size: int, amount: str, committed: str
+    put_lines: Sequence[str],
+    first_lines: Sequence[str],
+    next_lines: Sequence[str],
+    size: int,
+    amount: str,
+    committed: str,
 ) -> str:
     def block(lines: Sequence[str]) -> str:
         return "".join(f"        {line}\n" for line in lines)
@@ -213,7 +232,17 @@ def _render(
         "def put_state(state):\n"
         "    offset = cursor.offset\n"
         "    try:\n" + block(first_lines) + "    except Exception as err:\n"
+        "        raise diagnose(None, state, None, err) from err\n\n"
+        "def put_next(prefix, state, now):\n"
+        "    offset = cursor.offset\n"
+        "    try:\n" + block(next_lines) + "    except Exception as err:\n"
         "        raise diagnose(None, state, None, err) from err\n"
+        f"    commit(buffer, offset + {SEQUENCE_OFFSET}, {HOLE}, now)\n"
+        "    cursor.prefix = prefix\n"
+        "    cursor.total = 0.0\n"
+        f"    cursor.offset = offset = offset + {size}\n"
+        "    if offset == cursor.end:\n"
+        "        switch()\n"
     )
 
 

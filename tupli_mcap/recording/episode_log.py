@@ -7,21 +7,41 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zlib import crc32
 
-from tupli_mcap.messages.layout import BODY, CDR_HEADER
-from tupli_mcap.recording.channels import Channels
-from tupli_mcap.recording.events import END_FIELDS, START_FIELDS, end_texts, start_texts
-from tupli_mcap.recording.index import IndexBuilder
+import numpy as np
+
+from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS
+from tupli_mcap.recording.episode_rows import StartedEpisode, Told
+from tupli_mcap.recording.events import (
+    END_FIELDS,
+    START_FIELDS,
+    EpisodeEnd,
+    EpisodeStart,
+    end_texts,
+    record,
+    start_texts,
+)
+from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder
 from tupli_mcap.recording.journal import LogArea
-from tupli_mcap.recording.logs import FRONT, EventLog, Sink
+from tupli_mcap.recording.logs import FRONT, EvenRecords, EventLog, Sink
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording.channels import Channels
 
 __all__ = ["EPISODE_AND_ENV", "EpisodeLog", "ResetFacts", "StartedEpisode"]
 
 _RECORD = BODY - len(CDR_HEADER)  # bytes of a record before its CDR header
 _LENGTH = _RECORD - 9  # of which its length counts
 EPISODE_AND_ENV = struct.Struct("<II")
+Array = np.ndarray[Any, Any]
+# the fields that differ between messages of plain episodes: name, format, offset in the CDR body
+_BOTH = [("episode", "<u4", 0), ("env", "<u4", 4)]
+_START = [*_BOTH, ("first_row", "<u8", 8)]
+_END = [*_START, ("length", "<u8", 16), ("return", "<f8", 24), ("end", "u1", 32)]
+_START_BODY = EpisodeStart(0, 0, 0, False, False, "", "", "{}").encode()
+_END_BODY = EpisodeEnd(0, 0, 0, 0, 0.0, 0, True, "{}").encode()
 
 
 class ResetFacts(NamedTuple):
@@ -38,17 +58,6 @@ class ResetFacts(NamedTuple):
     def goes_on(self) -> bool:
         """True if the reset had no seed, so that it went on with the random stream of what came before it."""
         return self.seed is None and self.drawn_seed is None and not self.continued
-
-
-class StartedEpisode(NamedTuple):
-    """An episode whose start is in the journal."""
-
-    number: int
-    env: int
-    first_row: int
-    start_time: int
-    seed: int | None
-    start_row: int
 
 
 # makes a StartedEpisode of its fields without a call of Python
@@ -70,6 +79,7 @@ class EpisodeLog(EventLog):
     ) -> None:
         self._start, self._final, self._end = ids = channels.start, channels.final_state, channels.end
         self._index = index
+        self._running: dict[int, StartedEpisode] = {}  # started, and to be ended by what rows tell
         super().__init__(area, buffer, sink, {channel: counts[channel] for channel in ids}, time_ns)
 
     def start(self, number: int, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
@@ -143,3 +153,94 @@ class EpisodeLog(EventLog):
             first_row, length, total, start_time, now, seed, start_row, end_row, final_row, number, env, end,
             metadata,
         )  # fmt: skip
+
+    def leave_to_rows(self, episode: StartedEpisode) -> None:
+        """The end of an episode will be told by its rows."""
+        self._running[episode.number] = episode
+
+    def take_back(self, number: int) -> StartedEpisode:
+        """An episode whose rows have told its start, but will not tell its end."""
+        return self._running.pop(number)
+
+    def extend(self, told: Told) -> None:
+        """Adds `/episode_start`, `/final_state` and `/episode_end` of what rows have told."""
+        starts, ends, states = told
+        if not len(starts) and not len(ends):
+            return
+        size = states.shape[1]
+        begun = self._table(self._start, _START_BODY, _START, starts)
+        final = self._table(self._final, bytes(8 + size), [*_BOTH, ("state", f"V{size}", 8)], ends)
+        final["state"] = np.ascontiguousarray(states).view(f"V{size}")[:, 0]
+        ended = self._table(self._end, _END_BODY, _END, ends)
+        self.latest_ns = max(self.latest_ns, *(int(t["#log_time"][-1]) for t in (begun, ended) if len(t)))
+        self._tell_index(begun, ended, final["#sequence"])
+        self._add({self._start: begun, self._final: final, self._end: ended})
+
+    def _table(self, channel: int, body: bytes, fields: list[tuple[str, str, int]], rows: Array) -> Array:
+        """Records of one channel: `body` with the fields that `rows` have, in their order and at their times."""
+        places = [*HEADER_FIELDS, *((name, kind, BODY + offset) for name, kind, offset in fields)]
+        names, formats, offsets = zip(*places, strict=True)
+        template = record(channel, 0, 0, body)
+        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": len(template)})
+        table: Array = np.frombuffer(bytearray(template * len(rows)), dtype)
+        for name, _, _ in fields:
+            if name != "state":
+                table[name] = rows[name]
+        table["#sequence"] = self.sequences[channel] + np.arange(len(rows))
+        times = np.maximum(rows["time"], np.uint64(self.latest_ns))
+        table["#log_time"] = np.maximum.accumulate(times)
+        return table
+
+    def _tell_index(self, begun: Array, ended: Array, final_rows: Array) -> None:
+        rows = np.zeros(len(ended), EPISODE_ROWS)
+        for name in ("first_row", "length", "return", "episode", "env", "end"):
+            rows[name] = ended[name]
+        rows["end_time"], rows["end_row"], rows["final_row"] = (
+            ended["#log_time"],
+            ended["#sequence"],
+            final_rows,
+        )
+        at = np.searchsorted(begun["episode"], ended["episode"])
+        here = np.append(begun["episode"], -1)[at] == ended["episode"]
+        rows["start_time"][here] = begun["#log_time"][at[here]]
+        rows["start_row"][here] = begun["#sequence"][at[here]]
+        for i in np.flatnonzero(~here).tolist():
+            _, _, _, time_ns, seed, start_row = self._running.pop(int(ended["episode"][i]))
+            rows["start_time"][i], rows["start_row"][i] = time_ns, start_row
+            if seed is not None and -(2**63) <= seed < 2**63:
+                rows["seed"][i], rows["has_seed"][i] = seed, 1
+        self._index.extend(rows)
+        goes_on = np.ones(len(begun), np.bool_)
+        goes_on[at[here]] = False
+        names = ["episode", "env", "first_row", "#log_time", "#sequence"]
+        for number, env, first_row, time_ns, start_row in begun[goes_on][names].tolist():
+            self._running[number] = _new(StartedEpisode, (number, env, first_row, time_ns, None, start_row))
+
+    def _add(self, tables: dict[int, Array]) -> None:
+        """Adds whole records by channel, all or none of them after a crash."""
+        size = sum(table.nbytes for table in tables.values())
+        if self._position + size > self._capacity:
+            self.flush()
+        for channel, table in tables.items():
+            if len(table):
+                self._whole[channel].append(EvenRecords.of(table))
+                self.sequences[channel] += len(table)
+        self._can_drop = False
+        if size > self._capacity:
+            self._write()
+            return
+        sealed = b"".join(_sealed(table) for table in tables.values())
+        end = self._position + size
+        self._records[self._position : end] = sealed
+        self._position = self._commit[0] = end
+
+
+def _sealed(table: Array) -> bytes:
+    """Records as they are in a journal, with a checksum in place of `publish_time`."""
+    size = table.dtype.itemsize - 8
+    bare = np.empty((len(table), size), np.uint8)
+    whole = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
+    bare[:, : FRONT.size], bare[:, FRONT.size :] = whole[:, : FRONT.size], whole[:, FRONT.size + 8 :]
+    data = bare.tobytes()
+    table["#publish_time"] = [crc32(data[i : i + size]) for i in range(0, len(data), size)]
+    return table.tobytes()

@@ -92,6 +92,11 @@ class IndexBuilder:
         self.metadata += text
         self.count += 1
 
+    def extend(self, episodes: np.ndarray[Any, Any]) -> None:
+        """Adds episodes (EPISODE_ROWS) without metadata."""
+        self.rows += episodes.tobytes()
+        self.count += len(episodes)
+
     def encode(self, chunk_rows: bytes | bytearray) -> bytes:
         """The attachment's bytes, episodes in the order of their numbers."""
         rows = np.frombuffer(bytes(self.rows), EPISODE_ROWS)

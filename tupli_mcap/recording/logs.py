@@ -27,6 +27,7 @@ from tupli_mcap.recording.journal import LogArea
 __all__ = [
     "FRONT",
     "Encoder",
+    "EvenRecords",
     "EventLog",
     "Sink",
     "StepLog",
@@ -70,9 +71,29 @@ def group_records(data: memoryview, *, sealed: bool = False) -> list[Rows]:
     return [_rows_of(channel, *group, sealed=sealed) for channel, group in groups.items()]
 
 
+class EvenRecords(bytes):
+    """Several records of one channel, each of `size` bytes."""
+
+    size: int
+
+    @classmethod
+    def of(cls, table: np.ndarray[Any, Any]) -> EvenRecords:
+        """The rows of a table."""
+        records = cls(table.tobytes())
+        records.size = table.dtype.itemsize
+        return records
+
+
+def _count(records: bytes) -> int:
+    return len(records) // records.size if isinstance(records, EvenRecords) else 1
+
+
 def _rows_of(channel: int, first: int, records: list[bytes], *, sealed: bool) -> Rows:
     """Whole records of one channel, of which the first has sequence `first`."""
-    sizes = [len(record) for record in records]
+    sizes = np.repeat(
+        [one.size if isinstance(one, EvenRecords) else len(one) for one in records],
+        [_count(one) for one in records],
+    )
     offsets = np.zeros(len(sizes), dtype=np.uint64)
     np.cumsum(sizes[:-1], out=offsets[1:])
     joined = bytearray().join(records)
@@ -173,7 +194,7 @@ class EventLog:
         whole, self._whole = self._whole, defaultdict(list)
         for channel, records in whole.items():
             if records:
-                before = len(records) + (kept if channel == self._last_channel else 0)
+                before = sum(map(_count, records)) + (kept if channel == self._last_channel else 0)
                 self._sink(_rows_of(channel, self.sequences[channel] - before, records, sealed=True))
 
 

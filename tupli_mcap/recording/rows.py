@@ -7,18 +7,21 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from tupli_mcap.messages.encoder import SEQUENCE_OFFSET, Cursor, ImageSink, make_row_encoder
+from tupli_mcap.messages.encoder import HOLE, SEQUENCE_OFFSET, Cursor, ImageSink, make_row_encoder
 from tupli_mcap.messages.exact import exact_array
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
+from tupli_mcap.recording.episode_log import EpisodeLog
+from tupli_mcap.recording.episode_rows import EpisodeRows, StartedEpisode
+from tupli_mcap.recording.events import EpisodeEnd
 from tupli_mcap.recording.journal import RowArea
 
 __all__ = ["HOLE", "ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
@@ -27,7 +30,7 @@ __all__ = ["HOLE", "ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
 # takes a fraction of the time that fields of a structured row do
 _IMAGE_HEAD = struct.Struct(f"<IQQ{len(CDR_HEADER)}siI")
 _EPISODE_AND_STEP = struct.Struct("<II")
-HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
+_TIME = struct.Struct("<Q")
 Array = np.ndarray[Any, Any]
 Sink = Callable[[Rows], None]
 StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]  # begins to make chunks; the result writes them
@@ -117,6 +120,12 @@ class SingleRows:
         )
         self.put = encoder.put
         self.put_state = encoder.put_state
+        self._put_next = encoder.put_next
+        self._events: EpisodeLog | None = (
+            None  # what rows tell of their episodes; None while they tell nothing
+        )
+        self._told = 0  # rows of the running half that have told it
+        self._episodes = EpisodeRows(1, encoder.state_end)
         self._state_end = encoder.state_end
         self.begin_episode(0)
 
@@ -137,6 +146,67 @@ class SingleRows:
         cursor.total = 0.0
         self._buffer[start : start + len(prefix)] = prefix
 
+    # ---- episodes told by rows
+
+    @property
+    def can_tell(self) -> bool:
+        """True if rows hold all that an episode is."""
+        layout = self._layout
+        return not self._sealed and layout.reward_space is None and self._state_end > STATE
+
+    @property
+    def tells(self) -> bool:
+        """True while rows tell of their episodes."""
+        return self._events is not None
+
+    def begin_next(self, episode: int, state: Any) -> None:
+        """The last row has ended its episode: `episode` begins at `state`, and rows will tell of both.
+
+        Raises:
+            StepError: the state cannot be stored exactly; nothing has changed.
+        """
+        area, offset, now = self._area, self.cursor.offset, time.time_ns()
+        start = self._half * area.half
+        last = (offset if offset > start else area.half - start + area.rows * area.row_size) - area.row_size
+        (before,) = _TIME.unpack_from(
+            self._buffer, last + SEQUENCE_OFFSET + 4
+        )  # no hole is older than its episode
+        prefix = self._header + _EPISODE_AND_STEP.pack(episode, 0)
+        self._put_next(prefix, state, now if now > before else before)
+
+    def tell(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
+        """The rows from here on will tell `events` of their episodes, and of the final state of the one that has
+        ended just now."""
+        self._events = events
+        self._told = (self.cursor.offset - self._half * self._area.half) // self._area.row_size
+        self._episodes.begin([None])
+        self._episodes.wait_for(ended, time.time_ns())
+        events.leave_to_rows(started)
+
+    def settle(self, *, over: bool) -> StartedEpisode | None:
+        """Rows tell what they have to tell, and from here on nothing; returns the running episode, if it has a row.
+
+        `over`: the last row has ended its episode, and the running one has its final state.
+        """
+        events = self._events
+        if events is None:
+            return None
+        half = self._half * self._area.half
+        row = (self.cursor.offset - half) // self._area.row_size
+        self._tell(half, row, {0: self.pending_state()} if over else None)
+        self._events = None
+        number = int(self._episodes.running[0])
+        return None if number < 0 else events.take_back(number)
+
+    def _tell(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
+        """What the rows of a half before `end` tell, and have not told yet."""
+        if self._events is None:
+            return
+        size, told = self._area.row_size, self._told
+        self._told = end
+        rows = np.frombuffer(self._buffer[half + told * size : half + end * size], self._dtype)
+        self._events.extend(self._episodes.take(rows[None], pending))
+
     def committed(self) -> tuple[int, int, Array]:
         """The running half, its committed rows, and the rows of both halves; for another thread to copy from."""
         half, offset = divmod(self.cursor.offset, self._area.half)
@@ -155,6 +225,9 @@ class SingleRows:
     def _switch(self) -> None:
         """The half is full: go on in the other one, then write this one as a chunk."""
         area, half = self._area, self._half
+        self._tell(
+            half * area.half, area.rows
+        )  # before the other half's last row goes, whose hole may be here
         spare = half * area.half + area.rows * area.row_size
         self._half = 1 - half
         # a power loss may leave a part of what is written over these rows, and not the chunk they are in
@@ -163,25 +236,31 @@ class SingleRows:
         self._buffer[start : start + self._state_end] = self._buffer[spare : spare + self._state_end]
         flushed, self._flushed = self._flushed, 0
         self.cursor.offset, self.cursor.end = start, start + area.rows * area.row_size
-        self._emit(half * area.half, flushed, area.rows, self.cursor.sequence - area.rows + flushed)
+        self._told = 0
+        self._emit(half * area.half, flushed, area.rows)
 
     def flush(self) -> None:
         """Writes the rows of the running half that are not in the file yet."""
         start = self._half * self._area.half
         rows = (self.cursor.offset - start) // self._area.row_size
         flushed, self._flushed = self._flushed, rows
-        self._emit(start, flushed, rows, self.cursor.sequence - rows + flushed)
+        self._tell(start, rows)
+        self._emit(start, flushed, rows)
 
-    def _emit(self, start: int, begin: int, end: int, first: int) -> None:
-        if begin == end:
-            return
+    def _emit(self, start: int, begin: int, end: int) -> None:
+        """Writes rows of a half, without holes."""
         size = self._area.row_size
         data: Any = self._buffer[start + begin * size : start + end * size]
-        if self._sealed:
+        kept = np.frombuffer(data, self._dtype)["#sequence"] != HOLE
+        if not kept.all():
+            data = memoryview(np.frombuffer(data, f"V{size}")[kept].view(np.uint8))  # padding stays zero
+        elif self._sealed:
             data = bytearray(data)  # until the chunk is on the disk, the rows in the journal stay as sealed
         rows = np.frombuffer(data, self._dtype)
+        if not len(rows):
+            return
         self._deriver.fill(rows)
-        self._sink(even_rows(self._channel, first, data, rows))
+        self._sink(even_rows(self._channel, int(rows["#sequence"][0]), data, rows))
 
 
 class ImageRows:

@@ -11,8 +11,9 @@ from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.messages.exact import check_structure, decide_dtype, exact_array, leaf_value
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.widening import variable_dtypes
-from tupli_mcap.recording.events import INTERRUPTED
+from tupli_mcap.recording.events import INTERRUPTED, EpisodeEnd
 from tupli_mcap.recording.infos import InfoRecorder
+from tupli_mcap.recording.rows import SingleRows
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
 
 __all__ = ["SingleRecorder", "decide_layout"]
@@ -55,13 +56,22 @@ class SingleRecorder:
         writer: RecordingWriter,
         spaces: StepLayout,
         infos: InfoRecorder | None = None,
+        *,
+        leaves_to_rows: bool = False,
     ) -> None:
+        self.leaves_to_rows = leaves_to_rows  # plain episodes
         self._writer = writer
         self._spaces = spaces
         self._infos = infos
         self._reset: tuple[Any, ResetFacts] | None = None
         self._earlier: list[ResetFacts] = []  # resets before it that no step followed
         self._episode: StartedEpisode | None = None
+        self._over: int | None = (
+            None  # how the last step has ended its episode, where that is not written yet
+        )
+        self._is_plain = False  # rows can tell of episodes
+        self._begin_next: Callable[[int, Any], None] = lambda *_: None
+        self._put: Put = self._unreset
         self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset
         writer.on_abandon = self._abandon
@@ -78,6 +88,7 @@ class SingleRecorder:
         """
         if self._writer.closed or self._writer.failed is not None:
             self._closed()
+        self._settle()
         if self._reset is not None or self._episode is not None:
             self._keep_start_for(facts)
             self.end(INTERRUPTED, metadata)
@@ -101,6 +112,65 @@ class SingleRecorder:
         if writer.syncs_steps:
             writer.sync_step()
 
+    def leave_end(self, end: int) -> None:
+        """As `end`, after a step with a flag set and without metadata; it is written later, with many others."""
+        if not self._is_plain:
+            self.end(end)
+            return
+        self._over = end
+        self.put = self._continue
+
+    def begin_next(self, state: Any) -> bool:
+        """As `reset` without facts, where `leave_end` was the last call; False if it was not, and nothing is done.
+
+        Raises:
+            StepError: the state cannot be stored exactly.
+        """
+        over, writer = self._over, self._writer
+        if over is None or writer.lost_streams:
+            return False
+        try:  # as `writer.whole`, which costs a call more
+            if self._episode is not None:
+                self._leave_to_rows(self._episode, over)
+            self._begin_next(writer.next_episode, state)
+            writer.next_episode += 1
+            self._over = None
+            self.put = self._put
+        except BaseException as err:
+            writer.stop(err)
+            raise
+        return True
+
+    def _leave_to_rows(self, episode: StartedEpisode, end: int) -> None:
+        rows, events = self._writer.rows, self._writer.events
+        if isinstance(rows, SingleRows) and events is not None:
+            number, env, first_row = episode[:3]
+            length = rows.count - first_row
+            rows.tell(
+                events, EpisodeEnd(number, env, first_row, length, rows.total, end, True, "{}"), episode
+            )
+            self._episode = None
+
+    def _settle(self) -> None:
+        """Writes what was left for later, so that everything is as if it had been written at once."""
+        over, self._over = self._over, None
+        writer = self._writer
+        if writer.failed is not None or not self._is_plain:
+            return
+        if self._episode is not None:
+            if over is not None:
+                self.end(over)
+            return
+        rows = writer.rows
+        with writer.whole:
+            if not isinstance(rows, SingleRows) or not rows.tells:
+                return
+            self._episode = rows.settle(over=over is not None)
+            if self._episode is None and over is None:  # begun, and no step yet
+                writer.next_episode -= 1
+                facts = ResetFacts(None, None, "", "{}", time.time_ns())
+                self._episode = writer.start_episode(0, rows.count, facts)
+
     def _keep_start_for(self, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""
         if self._reset is not None:
@@ -111,6 +181,8 @@ class SingleRecorder:
 
     def end(self, end: int, metadata: str = "{}", *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
+        if self._over is not None or self._episode is None:
+            self._settle()
         episode, writer = self._episode, self._writer
         rows = writer.rows
         if episode is None or rows is None or writer.failed is not None:
@@ -170,8 +242,12 @@ class SingleRecorder:
         first, facts = self._reset
         layout = decide_layout(self._spaces, [first, state], [action], [reward], self._writer.layout)
         schema = None if self._infos is None else self._infos.schema()
-        self._writer.begin(layout, 1, vector=False, info_schema=schema)
+        writer = self._writer
+        writer.begin(layout, 1, vector=False, info_schema=schema)
         self._reset = None
+        rows = writer.rows
+        if self.leaves_to_rows and isinstance(rows, SingleRows) and rows.can_tell and not writer.images:
+            self._is_plain, self._begin_next, self._put = True, rows.begin_next, rows.put
         self._start_earlier()
         self.reset(first, facts)
         self.put(action, state, reward, terminal, timeout)
@@ -188,6 +264,7 @@ class SingleRecorder:
 
     def _continue(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """A step after an end, without a reset: another episode, which starts at the last one's final state."""
+        self._settle()
         if self.resets_itself:
             self.reset(state, ResetFacts(None, None, "", "{}", time.time_ns()))
             return
@@ -205,6 +282,7 @@ class SingleRecorder:
 
         An episode that runs there goes on here, `continued`; close `before` afterwards.
         """
+        before._settle()
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = {0}
         self.resets_itself = before.resets_itself

@@ -31,6 +31,7 @@ from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpis
 __all__ = ["Autoreset", "VectorRecorder"]
 
 Array = np.ndarray[Any, Any]
+_BOOL = np.dtype(np.bool_)
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 
 
@@ -44,7 +45,11 @@ class VectorRecorder:
         num_envs: int,
         autoreset: Autoreset,
         infos: InfoRecorder | None,
+        *,
+        leaves_to_rows: bool = False,
     ) -> None:
+        self.leaves_to_rows = leaves_to_rows and autoreset == "NextStep"  # plain episodes
+        self._told = False  # rows tell of all episodes
         self._writer = writer
         self._spaces = spaces
         self._n = num_envs
@@ -66,7 +71,7 @@ class VectorRecorder:
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._any_ended = False
         self._everybody = np.ones(num_envs, dtype=np.bool_)
-        self._nobody = ~self._everybody
+        self._shape, self._none = (num_envs,), bytes(num_envs)
         self._texts = ["{}"] * num_envs
         self._was_reset = False
         self._refused = False
@@ -88,6 +93,7 @@ class VectorRecorder:
         self._writer.sync_step()
 
     def _reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None) -> None:
+        self._settle()
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
         ended = self._ended.copy()
         self._end([(int(i), INTERRUPTED) for i in chosen])
@@ -168,8 +174,8 @@ class VectorRecorder:
             rewards, terminals, timeouts = self._numbers_of(rewards, terminals, timeouts)
             if self._writer.vector is None:
                 self._begin(actions, states, rewards)
-            any_done = bool(np.count_nonzero(terminals) or np.count_nonzero(timeouts))
-            done = terminals | timeouts if any_done else self._nobody
+            done = terminals | timeouts
+            any_done = done.tobytes() != self._none
             holes = self._ended if self._any_ended and self._autoreset == "NextStep" else None
             active = None if holes is None else ~holes
             finals = self._finals(done, infos) if any_done and self._autoreset == "SameStep" else {}
@@ -177,26 +183,36 @@ class VectorRecorder:
         except StepError:
             self.refuse()
             raise
-        totals = rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1, dtype=np.float64)
+        if not self._told:
+            totals = (
+                rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1, dtype=np.float64)
+            )
+            self._totals += totals if active is None else totals * active
         if active is None:
             self._lengths += 1
-            self._totals += totals
             self._ended, self._any_ended = done, any_done
             return self._everybody
         self._lengths += active
-        self._totals += totals * active
-        self._note_resets(~active, infos)
         self._ended = done & active if any_done else done
         self._any_ended = any_done and bool(np.count_nonzero(self._ended))
+        if self._told:
+            self._begin_told(~active, infos)
+        else:
+            self._note_resets(~active, infos)
         return active
 
     def _numbers_of(self, rewards: Any, terminals: Any, timeouts: Any) -> tuple[Array, Array, Array]:
         """Rewards and flags as arrays; the rewards' shape is checked when they are stored."""
-        flags = np.asarray(terminals, dtype=np.bool_), np.asarray(timeouts, dtype=np.bool_)
-        for name, flag in zip(("terminal", "timeout"), flags, strict=True):
-            if flag.shape != (self._n,):
-                raise StepError(f"{name}: expected shape {(self._n,)}, found shape {flag.shape}")
-        return np.asarray(rewards), *flags
+        return np.asarray(rewards), self._flag("terminal", terminals), self._flag("timeout", timeouts)
+
+    def _flag(self, name: str, values: Any) -> Array:
+        if values.__class__ is np.ndarray and values.dtype is _BOOL and values.shape == self._shape:
+            flag: Array = values
+            return flag
+        flag = np.asarray(values, dtype=np.bool_)
+        if flag.shape != self._shape:
+            raise StepError(f"{name}: expected shape {self._shape}, found shape {flag.shape}")
+        return flag
 
     def running(self, i: int) -> tuple[int, int]:
         """The number of the running episode of a sub-environment and its steps so far; (-1, 0) if there is none."""
@@ -209,7 +225,7 @@ class VectorRecorder:
 
     def finish(self, terminals: Any, infos: Mapping[str, Any]) -> None:
         """Ends the episodes that ended in the batch just put; `infos` are that batch's."""
-        if not self._any_ended or self._writer.failed is not None:
+        if not self._any_ended or self._told or self._writer.failed is not None:
             return
         with self._writer.whole:
             ended = self._ended.nonzero()[0].tolist()
@@ -304,6 +320,49 @@ class VectorRecorder:
         self._totals[waiting] = 0.0
         self._waiting.difference_update(waiting)
         self._fresh = bool(self._waiting)
+        self._leave_to_rows()
+
+    # ---- episodes told by rows
+
+    def _leave_to_rows(self) -> None:
+        """From here on rows tell of all episodes, if they can; where none is running, the next row is a hole."""
+        store, events = self._writer.vector, self._writer.events
+        if not self.leaves_to_rows or events is None or self._writer.images or self._told:
+            return
+        if not isinstance(store, VectorRows) or not store.can_tell or self._lengths.any():
+            return
+        store.tell(events, self._episodes)
+        self._episodes = [None] * self._n
+        self._waiting.clear()
+        self._told, self._fresh = True, False
+
+    def _begin_told(self, holes: Array, infos: Mapping[str, Any]) -> None:
+        """The episodes that begin with the batch just put, which was a reset to these sub-environments."""
+        begun, writer = holes.nonzero()[0], self._writer
+        first, writer.next_episode = writer.next_episode, writer.next_episode + len(begun)
+        self._episode_numbers[begun] = np.arange(first, writer.next_episode)
+        self._lengths[begun] = 0
+        if infos and any(info_of(infos, i, self._n) for i in begun.tolist()):
+            self.leaves_to_rows = False
+            self._settle()
+            self._note_resets(holes, infos)
+
+    def _settle(self) -> None:
+        """Writes what was left to the rows, so that everything is as if it had been written at once."""
+        store, events = self._writer.vector, self._writer.events
+        if not self._told or not isinstance(store, VectorRows) or events is None:
+            return
+        self._told = False
+        now = time.time_ns()
+        for i, (number, total) in enumerate(zip(*store.settle(self._ended), strict=True)):
+            if number >= 0:
+                self._episodes[i], self._totals[i] = events.take_back(number), total
+                continue
+            self._waiting.add(i)
+            self._fresh = True
+            if not self._ended[i]:  # begun, and no step yet
+                self._writer.next_episode -= 1
+                self._facts[i] = ResetFacts(None, None, "", "{}", now)
 
     def _counts(self) -> list[int]:
         """The rows of each sub-environment so far."""
@@ -415,6 +474,8 @@ class VectorRecorder:
     @property
     def is_running(self) -> bool:
         """True if a sub-environment is within an episode."""
+        if self._told:
+            return bool((self._lengths > 0).any() and not self._ended.all())
         return any(episode is not None for episode in self._episodes)
 
     def go_on_from(self, before: VectorRecorder, states: Any) -> None:
@@ -422,6 +483,8 @@ class VectorRecorder:
 
         Episodes that run there go on here, `continued`; close `before` afterwards.
         """
+        with before._writer.whole:
+            before._settle()
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = set(range(self._n))
         cut = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
@@ -441,6 +504,7 @@ class VectorRecorder:
         if self._writer.failed is not None or self._writer.closed:
             return
         with self._writer.whole:
+            self._settle()
             self._end([(i, INTERRUPTED) for i in range(self._n) if self._lengths[i]])
 
     def close(self) -> None:
@@ -450,6 +514,7 @@ class VectorRecorder:
         try:
             if self._writer.failed is None:
                 with self._writer.whole:
+                    self._settle()
                     self._end([(i, INTERRUPTED) for i in range(self._n)])
         finally:
             self._refused = True

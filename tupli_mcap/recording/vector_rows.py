@@ -8,7 +8,7 @@ other half fills, and written before it is needed again.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
+from tupli_mcap.recording.episode_log import EpisodeLog
+from tupli_mcap.recording.episode_rows import EpisodeRows, StartedEpisode
 from tupli_mcap.recording.journal import RowArea
 from tupli_mcap.recording.rows import HOLE, Array, StartChunks
 
@@ -64,6 +66,11 @@ class VectorRows:
         self._times = np.zeros((2, area.rows), np.uint64)  # of the rows in the journal, the same for a batch
         self._offsets = np.arange(area.rows, dtype=np.uint64) * np.uint64(area.row_size)
         self._write_chunks: Callable[[], None] | None = None  # of the half that is not running
+        self._events: EpisodeLog | None = (
+            None  # what rows tell of their episodes; None while they tell nothing
+        )
+        self._told = 0  # rows of the running half that have told it
+        self._episodes = EpisodeRows(n, layout.state_end)
         self._state = [self._writer(leaf) for leaf in layout.state if not leaf.apart]
         self._action = [self._writer(leaf) for leaf in layout.action]
         self._reward = [self._writer(leaf) for leaf in layout.reward]
@@ -148,6 +155,38 @@ class VectorRows:
         if self._row == self._area.rows:
             self._switch()
 
+    # ---- episodes told by rows
+
+    @property
+    def can_tell(self) -> bool:
+        """True if rows hold all that an episode is."""
+        return not self._sealed and self._layout.reward_space is None and self._state_end > STATE
+
+    def tell(self, events: EpisodeLog, running: Sequence[StartedEpisode | None]) -> None:
+        """The rows from here on will tell `events` of their episodes. `running` are those that have been started, by
+        sub-environment, and have no row yet."""
+        self._events, self._told = events, self._row
+        self._episodes.begin(running)
+        for started in running:
+            if started is not None:
+                events.leave_to_rows(started)
+
+    def settle(self, over: Array) -> tuple[list[int], list[float]]:
+        """Rows tell what they have to tell, and from here on nothing; returns the numbers of the running episodes (-1:
+        none), and their returns so far.
+
+        `over`: where the last row has ended its episode, and the running one has its final state.
+        """
+        self._tell(self._half, self._row, {i: self.pending_state(i) for i in np.flatnonzero(over).tolist()})
+        self._events = None
+        return self._episodes.running.tolist(), self._episodes.totals.tolist()
+
+    def _tell(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
+        """What the rows of a half before `end` tell, and have not told yet."""
+        if self._events is not None:
+            told, self._told = self._told, end
+            self._events.extend(self._episodes.take(self._rows[half, :, told:end], pending))
+
     def committed(self, i: int) -> tuple[int, int, Array]:
         """As `SingleRows.committed`, of one sub-environment."""
         return self._half, self._row, self._rows[:, i]
@@ -168,11 +207,12 @@ class VectorRows:
     def _switch(self) -> None:
         self._finish_chunks()  # a half is used again only when its chunks are in the file
         half, rows, flushed = self._half, self._area.rows, self._flushed
+        self._tell(half, rows)  # see SingleRows
         self._half = 1 - half
         self._sequence[self._half] = HOLE  # see SingleRows
         end = self._state_end
         self._state_bytes[self._half, :, 0, BODY:end] = self._state_bytes[half, :, rows, BODY:end]
-        self._row = self._flushed = 0
+        self._row = self._flushed = self._told = 0
         self._write_chunks = self._start_chunks(self._chunks(half, flushed, rows))
         if self._durable:
             self._finish_chunks()
@@ -181,6 +221,7 @@ class VectorRows:
         """Writes the rows that are not in the file yet."""
         self._finish_chunks()
         flushed, self._flushed = self._flushed, self._row
+        self._tell(self._half, self._row)
         self._write_chunks = self._start_chunks(self._chunks(self._half, flushed, self._row))
         self._finish_chunks()
 

@@ -81,7 +81,10 @@ class NewInfo(NamedTuple):
 
 
 class Watcher:
-    """Reads what `writer` has committed since the last look. For one thread, any but the writer's."""
+    """Reads what `writer` has committed since the last look. For one thread, any but the writer's.
+
+    The recorder must not leave starts and ends to rows: it is from their records that they are known.
+    """
 
     def __init__(self, writer: RecordingWriter) -> None:
         self._writer = writer

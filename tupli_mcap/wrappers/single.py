@@ -149,16 +149,17 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         except SpaceError:
             self._writer.close()
             raise
-        self._recorder = SingleRecorder(self._writer, spaces, self._infos)
-        self._recorder.resets_itself = _resets_itself(env)
-        self._newest = [self._recorder]
-        self._frames = FrameRecorder(self._writer, 1, every, frame_format) if every else None
         self._watches = metadata_callback is not None or wanted or bool(every)
-        # shared with the finalizer, which must not hold the wrapper
-        self._episode_metadata: list[str] = ["{}"]
         self._plain = (
             not self._watches and flush_seconds is None and durability != "step" and not self.rotation.limited
         )
+        leaves_to_rows = self._plain and live is None  # who looks on wants to see every end
+        self._recorder = SingleRecorder(self._writer, spaces, self._infos, leaves_to_rows=leaves_to_rows)
+        self._recorder.resets_itself = _resets_itself(env)
+        self._newest = [self._recorder]
+        self._frames = FrameRecorder(self._writer, 1, every, frame_format) if every else None
+        # shared with the finalizer, which must not hold the wrapper
+        self._episode_metadata: list[str] = ["{}"]
         self._stepped = False
         self._state: Any = None
         self._live = live_session(self._writer, live, env)
@@ -206,6 +207,10 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         except BaseException as err:  # a full disk, Ctrl-C
             self._writer.stop(err)
             raise
+        if self._plain:
+            if terminal or timeout:
+                self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
+            return result
         try:
             if self._watches:
                 if self._recorder.step_index == 0:  # a step that was a reset
@@ -225,12 +230,11 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
                     self._recorder.end(end)
                 if self.rotation.is_due(self._writer):
                     self._rotate(state)
-        if not self._plain:
-            self._writer.flush_if_due()
-            self._writer.sync_step()
-            if self.rotation.is_overdue(self._writer):
-                self._rotate(state)
-                self._start_frames()
+        self._writer.flush_if_due()
+        self._writer.sync_step()
+        if self.rotation.is_overdue(self._writer):
+            self._rotate(state)
+            self._start_frames()
         return result
 
     def _rotate(self, state: Any) -> None:
@@ -238,7 +242,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         before = self._recorder
         writer = self.rotation.open_next(self._options)
         try:
-            recorder = SingleRecorder(writer, self._spaces, self._infos)
+            recorder = SingleRecorder(writer, self._spaces, self._infos, leaves_to_rows=before.leaves_to_rows)
             recorder.go_on_from(before, state)
         except BaseException:
             writer.close()
@@ -259,6 +263,10 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         try:
             result = self.env.reset(seed=seed, options=options)
             state, info = result
+            has_facts = seed is not None or options is not None or info or unseeded
+            is_plain = self._plain and not has_facts and not self.rotation.is_due(self._writer)
+            if is_plain and self._recorder.begin_next(state):
+                return result
             facts = ResetFacts(
                 seed,
                 drawn_seed(self.env) if unseeded else None,

@@ -121,7 +121,12 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         except SpaceError:
             self._writer.close()
             raise
-        self._recorder = VectorRecorder(self._writer, spaces, n, self._autoreset, self._infos)
+        watches = wanted or metadata_callback is not None or bool(every)
+        plain = not watches and flush_seconds is None and durability != "step" and live is None
+        self._recorder = VectorRecorder(
+            self._writer, spaces, n, self._autoreset, self._infos,
+            leaves_to_rows=plain and not self.rotation.limited,
+        )  # fmt: skip
         self._newest = [self._recorder]
         self._frames = VectorFrames(self._writer, n, every, frame_format) if every else None
         self._texts = ["{}"] * n
@@ -177,7 +182,10 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         before = self._recorder
         writer = self.rotation.open_next(self._options)
         try:
-            recorder = VectorRecorder(writer, self._spaces, self.num_envs, self._autoreset, self._infos)
+            recorder = VectorRecorder(
+                writer, self._spaces, self.num_envs, self._autoreset, self._infos,
+                leaves_to_rows=before.leaves_to_rows,
+            )  # fmt: skip
             recorder.go_on_from(before, states)
         except BaseException:
             writer.close()

@@ -1,0 +1,182 @@
+"""Episodes that rows tell of: their starts and ends, made for many at a time when the rows go to the file.
+
+A plain episode (a reset without seed, options and info; an end by a flag) writes nothing of its own while it is
+recorded: its rows carry its number and its flags, and the hole after its last row the final state and the time of the
+next reset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tupli_mcap.messages.encoder import HOLE
+from tupli_mcap.recording.durability import STATE
+from tupli_mcap.recording.events import TERMINAL, TIMEOUT, EpisodeEnd
+
+__all__ = ["EpisodeRows", "StartedEpisode", "Told"]
+
+Array = np.ndarray[Any, Any]
+_START = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("time", "<u8")])
+_END = np.dtype(
+    [
+        ("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("length", "<u8"), ("return", "<f8"),
+        ("end", "u1"), ("time", "<u8"),
+    ]
+)  # fmt: skip
+
+
+class StartedEpisode(NamedTuple):
+    """An episode whose start is written."""
+
+    number: int
+    env: int
+    first_row: int
+    start_time: int
+    seed: int | None
+    start_row: int
+
+
+class Told(NamedTuple):
+    """What rows have told: `starts` (episode, env, first_row, time), `ends` (those, length, return, end) and their
+    final states, as they follow `episode` and `env` in `/final_state` (uint8, a row an end); each in the order of time.
+    """
+
+    starts: Array
+    ends: Array
+    states: Array
+
+
+class EpisodeRows:
+    """Follows the rows of `num_envs` sub-environments, batch after batch.
+
+    `running` are the numbers of the running episodes, -1 where there is none; `totals` their returns so far.
+    """
+
+    def __init__(self, num_envs: int, state_end: int) -> None:
+        self._n = num_envs
+        self._state = slice(STATE, state_end)
+        self._began = np.zeros(num_envs, np.uint64)  # time of the last reset
+        self.begin([None] * num_envs)
+
+    def begin(self, started: Sequence[StartedEpisode | None]) -> None:
+        """The next rows are the first ones of these episodes, whose start is written, or of some to be started."""
+        self.running = np.array([-1 if one is None else one.number for one in started])
+        self._first_rows = np.array([0 if one is None else one.first_row for one in started])
+        self._lengths = np.zeros(self._n, np.int64)
+        self.totals = np.zeros(self._n)
+        # ends whose final state comes with the next batch, by sub-environment
+        self._waiting: Array = np.zeros(self._n, _END)
+        self._waits = np.zeros(self._n, np.bool_)
+
+    def wait_for(self, end: EpisodeEnd, time_ns: int) -> None:
+        """The next row is a hole that keeps the final state of an episode that has ended otherwise."""
+        facts = end.episode, end.env, end.first_row, end.length, end.episode_return, end.end, time_ns
+        self._waiting[end.env], self._waits[end.env] = facts, True
+
+    def take(self, rows: Array, pending: Mapping[int, bytes] | None = None) -> Told:
+        """What new rows tell (a line a sub-environment, with holes, in their order).
+
+        `pending`: final states of episodes that the last rows have ended, by sub-environment.
+        """
+        flags = rows["terminal"] | rows["timeout"]
+        found = _Segments(rows["#sequence"], flags)
+        going_on = found.is_first & (self.running[found.env] >= 0)
+        rewards = rows["reward"].reshape(-1)[found.places]
+        lengths, first_rows = found.lengths, rows["#sequence"].reshape(-1)[found.first].astype(np.int64)
+        env = found.env[going_on]
+        rewards[found.at[going_on]] += self.totals[env]
+        lengths[going_on] += self._lengths[env]
+        first_rows[going_on] = self._first_rows[env]
+        totals = _sums(rewards, found.at)
+        episodes = rows["episode"].reshape(-1)
+        starts = np.zeros(len(found.env), _START)
+        starts["episode"], starts["env"], starts["first_row"] = episodes[found.first], found.env, first_rows
+        starts["time"] = self._reset_times(rows, found)
+        ends = np.zeros(len(found.env), _END)
+        for name in ("episode", "env", "first_row"):
+            ends[name] = starts[name]
+        ends["length"], ends["return"] = lengths, totals
+        ends["end"] = np.where(rows["terminal"].reshape(-1)[found.last], TERMINAL, TIMEOUT)
+        ends["time"] = rows["#log_time"].reshape(-1)[found.last]
+        final = found.is_final
+        numbers = starts["episode"].astype(np.int64)
+        self.running[found.env[final]] = np.where(found.ended, -1, numbers)[final]
+        self._first_rows[found.env[final]] = first_rows[final]
+        self._lengths[found.env[final]] = lengths[final]
+        self.totals[found.env[final]] = totals[final]
+        return self._told(rows, starts[~going_on], ends[found.ended], found.last[found.ended], pending or {})
+
+    def _reset_times(self, rows: Array, found: _Segments) -> Array:
+        """The times of the holes before each segment."""
+        times, width = rows["#log_time"], rows.shape[1]
+        before = times.reshape(-1)[found.first - 1]
+        before[found.first % max(1, width) == 0] = self._began[found.env[found.first % max(1, width) == 0]]
+        if width:
+            is_hole = rows["#sequence"][:, -1] == HOLE
+            self._began[is_hole] = times[is_hole, -1]
+        return before
+
+    def _told(
+        self, rows: Array, starts: Array, ends: Array, last: Array, pending: Mapping[int, bytes]
+    ) -> Told:
+        width, size = rows.shape[1], self._state.stop - self._state.start
+        data = rows[..., None].view(np.uint8)[..., self._state]
+        before = np.flatnonzero(self._waits)
+        if not width:
+            before = before[np.isin(before, list(pending))]
+        column = last % max(1, width) + 1
+        ends = np.concatenate([self._waiting[before], ends])
+        column = np.concatenate([np.zeros(len(before), np.int64), column])
+        self._waits[before] = False
+        inside = column < width
+        states = np.zeros((len(ends), size), np.uint8)
+        states[inside] = data[ends["env"][inside], column[inside]]
+        for i in np.flatnonzero(~inside).tolist():
+            env = int(ends["env"][i])
+            if env in pending:
+                states[i] = np.frombuffer(pending[env], np.uint8)
+                inside[i] = True
+            else:
+                self._waiting[env], self._waits[env] = ends[i], True
+        ends, states = ends[inside], states[inside]
+        order = np.argsort(ends["time"], kind="stable")
+        return Told(starts[np.argsort(starts["episode"], kind="stable")], ends[order], states[order])
+
+
+class _Segments:
+    """The parts of rows (a line a sub-environment) between holes, flags, and the ends of the lines.
+
+    Attributes:
+        places: of all rows that are no holes, in the flattened rows.
+        at: of each part's first row, in `places`.
+        env, first, last, lengths: each part's sub-environment, the places of its first and last row, and its rows.
+        ended: its last row has a flag set.
+        is_first, is_final: it is the first, the last one of its sub-environment.
+    """
+
+    def __init__(self, sequences: Array, flags: Array) -> None:
+        width = max(1, sequences.shape[1])
+        self.places = np.flatnonzero(sequences.reshape(-1) != HOLE)
+        done = flags.reshape(-1)[self.places]
+        line = self.places // width
+        begins = np.ones(len(self.places), np.bool_)
+        begins[1:] = (line[1:] != line[:-1]) | done[:-1]
+        self.at = np.flatnonzero(begins)
+        stops = np.append(self.at[1:], len(self.places))[: len(self.at)]
+        self.lengths = stops - self.at
+        self.env, self.first = line[self.at], self.places[self.at]
+        self.last, self.ended = self.places[stops - 1], done[stops - 1]
+        self.is_first = np.diff(self.env, prepend=-1) != 0
+        self.is_final = np.diff(self.env, append=-1) != 0
+
+
+def _sums(values: Array, firsts: Array) -> Array:
+    """The sum of each part of `values`, added up one after the other, as a loop would."""
+    if not len(firsts):
+        return np.zeros(0)
+    if (values == np.rint(values)).all() and np.abs(values).sum() < 2**53:
+        return np.add.reduceat(values, firsts) + 0.0  # exact in any order
+    return np.array([np.add.accumulate(part)[-1] for part in np.split(values, firsts[1:])]) + 0.0
