@@ -37,6 +37,7 @@ class Kind:
     reward: gym.Space[Any] | None = None
     plain: bool = False  # states of one value each, for they are large
     rotates: bool = False  # goes on in other files
+    silent: bool = False  # a reset tells nothing, so that rows tell of episodes
     window: bool = False  # states are the newest frames, the oldest first
     large: int = 0  # every episode's texts are longer than the last one's, up to here
 
@@ -63,6 +64,10 @@ KINDS = {
     "box": Kind(_BOX, reuse=True),
     "discrete": Kind(spaces.Discrete(500), reward=spaces.Box(-9, 9, (2,), np.float32)),
     "nested": Kind(_NESTED),
+    "silent": Kind(_BOX, reuse=True, silent=True),
+    "silent nested": Kind(_NESTED, silent=True),
+    "silent chunks": Kind(_WIDE, options={"durability": "chunk"}, silent=True),
+    "silent vector": Kind(_WIDE, vector=_NEXT, silent=True),
     "large": Kind(spaces.Dict({"x": spaces.Discrete(5), "y": spaces.Box(-1, 1, (600,))}), reuse=True),
     "text": Kind(_TEXT, _SMALL),
     "sequence": Kind(
@@ -155,7 +160,7 @@ class Teller(gym.Env[Any, Any]):
         super().reset(seed=seed)
         self._episodes += 1
         self._steps, self._length = 0, int(self._random.integers(1, 12))
-        state, info = self._state(), {"r": self._episodes}
+        state, info = self._state(), {} if self._kind.silent else {"r": self._episodes}
         self._tell("reset", (self._number, state, seed, options, info))
         return state, info
 

@@ -59,7 +59,11 @@ MOMENTS = {
         Moment("any line"),
         Moment("step", ("RecordEpisodes.step",), times=40),
         Moment("stores", ("put", "StepLog.commit", "VectorRows.put", "ImageRows.put"), times=60),
-        Moment("reset", ("SingleRecorder.reset", "VectorRecorder.reset"), times=6),
+        Moment(
+            "reset", ("SingleRecorder.reset", "SingleRecorder.begin_next", "VectorRecorder.reset"), times=6
+        ),
+        Moment("told", ("SingleRows._tell", "VectorRows._tell", "EpisodeLog.extend"), times=3, flushes=True),
+        Moment("settled", ("SingleRecorder._settle", "VectorRecorder._settle"), times=4),
         Moment(
             "episode log",
             ("EventLog.append", "EpisodeLog.start", "EpisodeLog.end", "EventLog.drop_last"),
