@@ -56,9 +56,9 @@ def made_up_world(number: int) -> Iterator[None]:
     with (
         mock.patch("time.time_ns", side_effect=clock),
         mock.patch("uuid.uuid4", return_value=known),
-        mock.patch("tupli_mcap.recording.writer.version", return_value="1"),
+        mock.patch("tupli_mcap.recording.writer.library", return_value="tupli-mcap 1"),
         mock.patch(BOOT_ID, return_value=BOOT),
-        mock.patch("tupli_mcap.recording.rewrite.version", return_value="1"),
+        mock.patch("tupli_mcap.recording.rewrite.library", return_value="tupli-mcap 1"),
     ):
         yield
 

@@ -79,7 +79,7 @@ class Worker:
     def _affordable(self, workload: Workload, where: Path, data: Data, seconds: float) -> int:
         """How many episodes may be recorded and read in about `seconds`, at least two."""
         trial = where.with_name(f"{where.name}-trial")
-        per_step = 0.0
+        before, per_step = (0, 0.0), 0.0  # of the trial before: steps, seconds
         for steps in (1, 100, 1000):  # the first one imports, and is not counted
             _remove(trial)
             episodes = max(2, data.episodes_for(steps))
@@ -89,6 +89,9 @@ class Worker:
                 self._contender.read(trial)
             took = time.perf_counter() - began
             per_step = took / count
+            if steps == 1000 and count > before[0]:  # what is paid once a recording does not grow with it
+                per_step = max((took - before[1]) / (count - before[0]), per_step / 4)
+            before = count, took
             if took > seconds / 4 and steps > 1:
                 break
         _remove(trial)
@@ -114,7 +117,7 @@ class Worker:
     # ---- operations: each gives one figure
 
     def do_record(self, work: str, path: str, seconds: float, steps: int) -> float:
-        """Microseconds a step over the same rollout without a recorder, which runs before and after."""
+        """Microseconds a step over the same rollout without a recorder, in turns with it."""
         workload, where = WORKLOADS[work], Path(path)
         data = reference(work, steps)
         key = work, "record"
@@ -122,13 +125,13 @@ class Worker:
             self._built[key] = data.head(self._affordable(workload, where, data, seconds))
         data = self._built[key]
         episodes = len(data.lengths)
-        before = _bare(workload, episodes)
-        took, count = self._contender.record(workload, where, episodes)
-        after = _bare(workload, episodes)
+        gc.collect()
+        with workload.beside() as bare:
+            took, count = self._contender.record(workload, where, episodes)
         check(count == data.steps, f"{count} steps, not {data.steps}")
         self._check(where, data)
         _remove(where)
-        return (took / count - (before + after) / 2) * 1e6
+        return (took - 2 * bare.seconds) / count * 1e6  # once while it was recorded, and once for itself
 
     def do_finishing(self) -> float:
         """Microseconds a step of what came after the rollout of the last recording."""

@@ -6,9 +6,12 @@ nothing, so that what is left is the recorder. What a recording must hold is kno
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import os
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -176,6 +179,36 @@ def play(path: Path, frames: int) -> str:
     return title
 
 
+def _roll(env: Any, next_action: Callable[[], Any], episodes: range) -> int:
+    steps = 0
+    for episode in episodes:
+        env.reset(seed=SEED if episode == 0 else None)
+        done = False
+        while not done:
+            _, _, terminal, timeout, _ = env.step(next_action())
+            steps += 1
+            done = terminal or timeout
+    return steps
+
+
+class Bare:
+    """The environment in a wrapper that does nothing. `seconds` it took so far."""
+
+    def __init__(self, env: gym.Env[Any, Any], actions: list[Any]) -> None:
+        self._env, self._next_action = gym.Wrapper(env), itertools.cycle(actions).__next__
+        self.seconds = 0.0
+
+    def roll(self, episodes: range) -> None:
+        """Goes on with these episodes."""
+        began = time.perf_counter()
+        _roll(self._env, self._next_action, episodes)
+        self.seconds += time.perf_counter() - began
+
+
+_TURN = 350  # steps, about: a machine that changes its speed changes it for both
+_beside: list[Bare] = []
+
+
 @dataclass(frozen=True)
 class Workload:
     """An environment and the actions taken in it, repeated without end."""
@@ -202,17 +235,27 @@ class Workload:
         return rng.integers(0, space.n, ROWS)  # type: ignore[attr-defined]
 
     def rollout(self, env: Any, episodes: int) -> int:
-        """The ordinary loop: seed the first reset, leave the others alone. Returns the number of steps."""
+        """The ordinary loop: seed the first reset, leave the others alone. Returns the number of steps.
+
+        Within `beside`, some episodes of it and as many of the bare environment take turns.
+        """
         next_action = itertools.cycle(list(self.actions)).__next__
-        steps = 0
-        for episode in range(episodes):
-            env.reset(seed=SEED if episode == 0 else None)
-            done = False
-            while not done:
-                _, _, terminal, timeout, _ = env.step(next_action())
-                steps += 1
-                done = terminal or timeout
+        steps, turn = 0, max(1, _TURN // self.length)
+        for first in range(0, episodes, turn):
+            part = range(first, min(first + turn, episodes))
+            steps += _roll(env, next_action, part)
+            if _beside:
+                _beside[-1].roll(part)
         return steps
+
+    @contextlib.contextmanager
+    def beside(self) -> Iterator[Bare]:
+        """A bare environment that takes turns with the one that is rolled out meanwhile."""
+        _beside.append(Bare(self.make(), list(self.actions)))
+        try:
+            yield _beside[-1]
+        finally:
+            _beside.pop()
 
     def data(self, steps: int) -> Data:
         """What a recording of at least `steps` steps of whole episodes must hold."""

@@ -8,7 +8,6 @@ import time
 import uuid
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +18,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.imagecodecs import image_format
+from tupli_mcap.recording.library import library
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.rewrite import camera_channels, define, write
@@ -115,7 +115,7 @@ def _merge(
 ) -> Target:
     now, first = time.time_ns(), sources[0]
     shifts = np.cumsum([0, *(recording._contents.next_episode for recording in sources)])
-    container.start(f"tupli-mcap {version('tupli-mcap')}")
+    container.start(library())
     container.add_metadata(RECORDING_METADATA, _metadata(first, next_episode=int(shifts[-1])))
     for name, (media_type, data) in attachments.items():
         container.add_attachment(name, media_type, data, now)
@@ -140,7 +140,7 @@ def _metadata(source: Recording, *, next_episode: int) -> dict[str, str]:
     return {
         "uuid": uuid.uuid4().hex,
         "format_version": source.metadata["format_version"],
-        "library": f"tupli-mcap {version('tupli-mcap')}",
+        "library": library(),
         "created_ns": str(time.time_ns()),
         "benchmark_id": source.benchmark_id,
         "next_episode": str(next_episode),

@@ -10,7 +10,6 @@ import time
 import uuid
 from collections.abc import Iterable, Iterator
 from functools import partial
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import record
 from tupli_mcap.recording.imagecodecs import image_codecs, image_format, uses_codecs
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
+from tupli_mcap.recording.library import library
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_frames import OldCameras, kept_frames
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
@@ -59,7 +59,7 @@ class RepairWriter:
     def begin(self, next_episode: int | None) -> None:
         """Magic, header, metadata and the attachments that are good. No later episode gets a number that was lost."""
         container, found = self._container, self._gathered
-        container.start(f"tupli-mcap {version('tupli-mcap')}")
+        container.start(library())
         metadata = self._metadata_of_recording()
         if next_episode is not None:
             metadata["next_episode"] = str(next_episode)
@@ -77,7 +77,7 @@ class RepairWriter:
         made = {
             "uuid": uuid.uuid4().hex,
             "format_version": "2" if uses_codecs(self._gathered.channels) else "1",
-            "library": f"tupli-mcap {version('tupli-mcap')}",
+            "library": library(),
             "created_ns": str(self._now),
             "benchmark_id": "",
         }

@@ -6,7 +6,6 @@ import os
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.imagecodecs import image_codecs, image_format
+from tupli_mcap.recording.library import library
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.signed import SIGNATURE_NAME, stays_signed
@@ -79,7 +79,7 @@ def write(
 ) -> int:
     """Writes a recording of some of a source's episodes, other than the attachments `left_out`; returns how many chunks
     were copied. A signature is kept if the contents are still what was `signed`."""
-    container.start(f"tupli-mcap {version('tupli-mcap')}")
+    container.start(library())
     container.add_metadata(RECORDING_METADATA, metadata)
     now = time.time_ns()
     kept = {name: info for name, info in source.attachments.items() if name not in attachments}

@@ -13,7 +13,6 @@ import uuid
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -28,6 +27,7 @@ from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
 from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_info, journal_path
+from tupli_mcap.recording.library import library
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog, StepLog
 from tupli_mcap.recording.options import WriterOptions, check_options
@@ -129,7 +129,7 @@ class RecordingWriter:
         values = {
             "uuid": self.uuid,
             "format_version": self.options.format_version,
-            "library": f"tupli-mcap {version('tupli-mcap')}",
+            "library": library(),
             "created_ns": str(now),
             "benchmark_id": self.options.benchmark_id,
         }

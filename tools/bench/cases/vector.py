@@ -120,12 +120,10 @@ def _compare(run: Run, work: Workload, limit: float) -> Target:
 
     def single() -> float:
         path = run.fresh("single.mcap")
-        env: Any = gym.Wrapper(work.make())
-        before = seconds_of(lambda: work.rollout(env, episodes))
-        seconds, count = Ours().record(work, path, episodes)
-        after = seconds_of(lambda: work.rollout(env, episodes))
+        with work.beside() as bare:
+            seconds, count = Ours().record(work, path, episodes)
         path.unlink()
-        return (seconds - (before + after) / 2) / count * 1e6
+        return (seconds - 2 * bare.seconds) / count * 1e6
 
     alternate({"vector": vector, "single": single}, 1)
     values = alternate({"vector": vector, "single": single}, max(run.rounds, 3))
