@@ -36,7 +36,7 @@ def _forget_the_pending_state() -> None:
         start = self._half * area.half
         flushed, self._flushed = self._flushed, 0
         self.cursor.offset, self.cursor.end = start, start + area.rows * area.row_size
-        self._emit(half * area.half, flushed, area.rows, self.cursor.sequence - area.rows + flushed)
+        self._emit(half * area.half, flushed, area.rows)
 
     rows.SingleRows._switch = switch  # type: ignore[method-assign]
 

@@ -21,7 +21,7 @@ from tupli_mcap.recording.events import END_NAME, END_SCHEMA, START_NAME, START_
 from tupli_mcap.recording.imagecodecs import CODEC, image_codecs
 from tupli_mcap.recording.journal import Area, LogArea, RowArea
 from tupli_mcap.recording.pictures import ImageFormat
-from tupli_mcap.recording.rows import rows_per_half
+from tupli_mcap.recording.rows import CHUNKS_PER_HALF, rows_per_half
 
 __all__ = ["FRAMES_AREA", "Channels", "plan_areas", "register_channels"]
 
@@ -123,9 +123,16 @@ def _image_schema(leaf: Leaf, images_as: ImageFormat) -> tuple[str, str]:
 
 
 def plan_areas(
-    layout: StepLayout, n: int, size: int, step_capacity: int, *, infos: bool, frames: bool = False
+    layout: StepLayout,
+    n: int,
+    size: int,
+    step_capacity: int,
+    *,
+    vector: bool,
+    infos: bool,
+    frames: bool = False,
 ) -> list[Area]:
-    """The areas of a journal for `n` sub-environments and chunks of `size` bytes.
+    """The areas of a journal for `n` sub-environments (of a `vector` environment) and chunks of `size` bytes.
 
     `step_capacity` is the least room (bytes) for steps of variable size.
     """
@@ -136,7 +143,8 @@ def plan_areas(
         areas += [LogArea(f"steps/{i}", max(size, step_capacity), 2) for i in range(n)]
     else:
         row = layout.step_message.record_size
-        areas.append(RowArea("steps", row, rows_per_half(row, size), n))
+        chunks = 1 if vector else CHUNKS_PER_HALF
+        areas.append(RowArea("steps", row, chunks * rows_per_half(row, size), n))
     for leaf in layout.images:
         row = layout.image_messages[leaf.name].dtype.itemsize
         # of a stack, most rows store one frame

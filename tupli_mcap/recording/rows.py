@@ -24,13 +24,15 @@ from tupli_mcap.recording.episode_rows import EpisodeRows, StartedEpisode
 from tupli_mcap.recording.events import EpisodeEnd
 from tupli_mcap.recording.journal import RowArea
 
-__all__ = ["HOLE", "ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
+__all__ = ["CHUNKS_PER_HALF", "HOLE", "ImageRows", "RowDeriver", "SingleRows", "rows_per_half"]
 
 # sequence, log_time, publish_time, the CDR header, and the stamp of an image: they follow each other, and one call
 # takes a fraction of the time that fields of a structured row do
 _IMAGE_HEAD = struct.Struct(f"<IQQ{len(CDR_HEADER)}siI")
 _EPISODE_AND_STEP = struct.Struct("<II")
 _TIME = struct.Struct("<Q")
+# of a single environment: what is done once a half finds cold caches, and takes as long for few rows as for many
+CHUNKS_PER_HALF = 2
 Array = np.ndarray[Any, Any]
 Sink = Callable[[Rows], None]
 StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]  # begins to make chunks; the result writes them
@@ -109,6 +111,7 @@ class SingleRows:
         self._channel = channel
         self._sink = sink
         self._half = 0
+        self._chunk = -(-area.rows // CHUNKS_PER_HALF)  # rows
         self._flushed = 0  # rows of the running half that are in the file
         self._deriver = deriver or RowDeriver()
         self.cursor = Cursor()
@@ -257,10 +260,11 @@ class SingleRows:
         elif self._sealed:
             data = bytearray(data)  # until the chunk is on the disk, the rows in the journal stay as sealed
         rows = np.frombuffer(data, self._dtype)
-        if not len(rows):
-            return
         self._deriver.fill(rows)
-        self._sink(even_rows(self._channel, int(rows["#sequence"][0]), data, rows))
+        for first in range(0, len(rows), self._chunk):
+            chunk = rows[first : first + self._chunk]
+            part = data[first * size : first * size + chunk.nbytes]
+            self._sink(even_rows(self._channel, int(chunk["#sequence"][0]), part, chunk))
 
 
 class ImageRows:

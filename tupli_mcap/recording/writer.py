@@ -191,7 +191,7 @@ class RecordingWriter:
         has_infos = self.channels.info is not None
         return plan_areas(
             self._laid(), self.num_envs, self.options.chunk_size, step_capacity,
-            infos=has_infos, frames=bool(self.channels.cameras),
+            vector=self.is_vector, infos=has_infos, frames=bool(self.channels.cameras),
         )  # fmt: skip
 
     def _laid(self) -> StepLayout:
