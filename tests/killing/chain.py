@@ -44,6 +44,8 @@ def moments_of(kind: str, *, appends: bool) -> list[str]:
     for moment in MOMENTS.values():
         if moment.appends and (not appends or about.storage):
             continue
+        if moment.told and not about.silent:
+            continue
         if moment.threaded and not about.threaded:
             continue
         if moment.syncs and "durability" not in about.options:

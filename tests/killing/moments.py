@@ -45,6 +45,7 @@ class Moment:
     closes: bool = False  # the process closes its recording, to get there
     appends: bool = False  # only where a recording goes on
     grows: bool = False  # only where steps become larger than the journal
+    told: bool = False  # only where rows tell of episodes
     threaded: bool = False  # only where a thread writes the chunks
     syncs: bool = False  # only where file and journal are synced
     rotates: bool = False  # only where a recording goes on in other files
@@ -62,7 +63,13 @@ MOMENTS = {
         Moment(
             "reset", ("SingleRecorder.reset", "SingleRecorder.begin_next", "VectorRecorder.reset"), times=6
         ),
-        Moment("told", ("SingleRows._tell", "VectorRows._tell", "EpisodeLog.extend"), times=3, flushes=True),
+        Moment(
+            "told",
+            ("SingleRows._tell", "VectorRows._tell", "EpisodeLog.extend"),
+            times=3,
+            told=True,
+            flushes=True,
+        ),
         Moment("settled", ("SingleRecorder._settle", "VectorRecorder._settle"), times=4),
         Moment(
             "episode log",

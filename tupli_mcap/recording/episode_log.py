@@ -5,6 +5,7 @@ Little of this is in the processor's caches when an episode ends, so that every 
 
 from __future__ import annotations
 
+import functools
 import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,10 +37,11 @@ _RECORD = BODY - len(CDR_HEADER)  # bytes of a record before its CDR header
 _LENGTH = _RECORD - 9  # of which its length counts
 EPISODE_AND_ENV = struct.Struct("<II")
 Array = np.ndarray[Any, Any]
+_Fields = tuple[tuple[str, str, int], ...]
 # the fields that differ between messages of plain episodes: name, format, offset in the CDR body
-_BOTH = [("episode", "<u4", 0), ("env", "<u4", 4)]
-_START = [*_BOTH, ("first_row", "<u8", 8)]
-_END = [*_START, ("length", "<u8", 16), ("return", "<f8", 24), ("end", "u1", 32)]
+_BOTH: _Fields = (("episode", "<u4", 0), ("env", "<u4", 4))
+_START: _Fields = (*_BOTH, ("first_row", "<u8", 8))
+_END: _Fields = (*_START, ("length", "<u8", 16), ("return", "<f8", 24), ("end", "u1", 32))
 _START_BODY = EpisodeStart(0, 0, 0, False, False, "", "", "{}").encode()
 _END_BODY = EpisodeEnd(0, 0, 0, 0, 0.0, 0, True, "{}").encode()
 
@@ -169,26 +171,23 @@ class EpisodeLog(EventLog):
             return
         size = states.shape[1]
         begun = self._table(self._start, _START_BODY, _START, starts)
-        final = self._table(self._final, bytes(8 + size), [*_BOTH, ("state", f"V{size}", 8)], ends)
+        final = self._table(self._final, bytes(8 + size), (*_BOTH, ("state", f"V{size}", 8)), ends)
         final["state"] = np.ascontiguousarray(states).view(f"V{size}")[:, 0]
         ended = self._table(self._end, _END_BODY, _END, ends)
         self.latest_ns = max(self.latest_ns, *(int(t["#log_time"][-1]) for t in (begun, ended) if len(t)))
         self._tell_index(begun, ended, final["#sequence"])
         self._add({self._start: begun, self._final: final, self._end: ended})
 
-    def _table(self, channel: int, body: bytes, fields: list[tuple[str, str, int]], rows: Array) -> Array:
+    def _table(self, channel: int, body: bytes, fields: _Fields, rows: Array) -> Array:
         """Records of one channel: `body` with the fields that `rows` have, in their order and at their times."""
-        places = [*HEADER_FIELDS, *((name, kind, BODY + offset) for name, kind, offset in fields)]
-        names, formats, offsets = zip(*places, strict=True)
-        template = record(channel, 0, 0, body)
-        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": len(template)})
+        template, dtype = _record_of(channel, body, fields)
         table: Array = np.frombuffer(bytearray(template * len(rows)), dtype)
         for name, _, _ in fields:
             if name != "state":
                 table[name] = rows[name]
-        table["#sequence"] = self.sequences[channel] + np.arange(len(rows))
-        times = np.maximum(rows["time"], np.uint64(self.latest_ns))
-        table["#log_time"] = np.maximum.accumulate(times)
+        first = self.sequences[channel]
+        table["#sequence"] = np.arange(first, first + len(rows))
+        table["#log_time"] = np.maximum.accumulate(np.maximum(rows["time"], np.uint64(self.latest_ns)))
         return table
 
     def _tell_index(self, begun: Array, ended: Array, final_rows: Array) -> None:
@@ -233,6 +232,17 @@ class EpisodeLog(EventLog):
         end = self._position + size
         self._records[self._position : end] = sealed
         self._position = self._commit[0] = end
+
+
+@functools.lru_cache(maxsize=64)
+def _record_of(channel: int, body: bytes, fields: _Fields) -> tuple[bytes, np.dtype[Any]]:
+    """A record of a channel, and its dtype: that of its header, and of some fields of its body."""
+    places = [*HEADER_FIELDS, *((name, kind, BODY + offset) for name, kind, offset in fields)]
+    names, formats, offsets = zip(*places, strict=True)
+    template = record(channel, 0, 0, body)
+    return template, np.dtype(
+        {"names": names, "formats": formats, "offsets": offsets, "itemsize": len(template)}
+    )
 
 
 def _sealed(table: Array) -> bytes:

@@ -87,10 +87,11 @@ class EpisodeRows:
         rewards = rows["reward"].reshape(-1)[found.places]
         lengths, first_rows = found.lengths, rows["#sequence"].reshape(-1)[found.first].astype(np.int64)
         env = found.env[going_on]
-        rewards[found.at[going_on]] += self.totals[env]
+        with np.errstate(over="ignore", invalid="ignore"):  # of infinite rewards
+            rewards[found.at[going_on]] += self.totals[env]
+            totals = _sums(rewards, found.at)
         lengths[going_on] += self._lengths[env]
         first_rows[going_on] = self._first_rows[env]
-        totals = _sums(rewards, found.at)
         episodes = rows["episode"].reshape(-1)
         starts = np.zeros(len(found.env), _START)
         starts["episode"], starts["env"], starts["first_row"] = episodes[found.first], found.env, first_rows

@@ -66,9 +66,7 @@ class SingleRecorder:
         self._reset: tuple[Any, ResetFacts] | None = None
         self._earlier: list[ResetFacts] = []  # resets before it that no step followed
         self._episode: StartedEpisode | None = None
-        self._over: int | None = (
-            None  # how the last step has ended its episode, where that is not written yet
-        )
+        self._over: int | None = None  # how the last step has ended its episode, if that is not written yet
         self._is_plain = False  # rows can tell of episodes
         self._begin_next: Callable[[int, Any], None] = lambda *_: None
         self._put: Put = self._unreset
