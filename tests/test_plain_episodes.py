@@ -18,10 +18,11 @@ import pytest
 from environments import same
 from gymnasium.vector import SyncVectorEnv
 
-from tupli_mcap import RecordEpisodes, Recording
-from tupli_mcap.errors import StepError
+from tupli_mcap import RecordEpisodes, Recording, verify_recording
+from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.recording.episode_rows import EpisodeRows
 from tupli_mcap.recording.rows import SingleRows
+from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
 EXACT = ("first_row", "length", "return", "seed", "final_row", "episode", "env", "end", "has_seed")
@@ -49,7 +50,8 @@ class Uneven(gym.Env[Any, Any]):
         return self._state(), float(self.np_random.random()), done and not timeout, done and timeout, {}
 
     def _state(self) -> Any:
-        return self.np_random.uniform(-1, 1, 3)
+        self.newest = self.np_random.uniform(-1, 1, 3)
+        return self.newest
 
 
 def at_once(env: Any) -> Any:
@@ -261,3 +263,39 @@ def test_a_clock_that_is_set_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
                 with Recording(copied) as recording:
                     assert same([e.final_state for e in recording.episodes], finals)
         assert len(finals) > 10
+
+
+@pytest.mark.parametrize("begun", ["seeded", "plain"])
+def test_broken_off_as_an_episode_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun: str) -> None:
+    """Ctrl-C after the last step is in the journal: nothing more is accepted, and the episode is whole."""
+    path = tmp_path / "r.mcap"
+    env = RecordEpisodes(Uneven(), path)
+    env.reset(seed=1)
+    ends = 1 if begun == "seeded" else 5
+
+    def broken(self: SingleRecorder, end: int, leave: Any = SingleRecorder.leave_end) -> None:
+        nonlocal ends
+        ends -= 1
+        if not ends:
+            raise KeyboardInterrupt
+        leave(self, end)
+
+    monkeypatch.setattr(SingleRecorder, "leave_end", broken)
+    steps = 0
+    with pytest.raises(KeyboardInterrupt):
+        while True:
+            steps += 1
+            _, _, terminal, timeout, _ = env.step(0)
+            if terminal or timeout:
+                env.reset()
+    state = env.unwrapped.newest
+    for go_on in (env.reset, lambda: env.step(0)):
+        with pytest.raises(RecordingError, match="broke off"):
+            go_on()
+    env.close()
+    with Recording(path) as recording:
+        assert recording.num_steps == steps
+        assert len(recording.episodes) == (1 if begun == "seeded" else 5)
+        assert recording.episodes[-1].end in ("terminal", "timeout")
+        assert same(recording.episodes[-1].final_state, state)
+    assert verify_recording(path).ok

@@ -14,7 +14,7 @@ from zlib import crc32
 import numpy as np
 
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS
-from tupli_mcap.recording.episode_rows import StartedEpisode, Told
+from tupli_mcap.recording.episode_rows import EpisodeBatch, StartedEpisode
 from tupli_mcap.recording.events import (
     END_FIELDS,
     START_FIELDS,
@@ -164,7 +164,7 @@ class EpisodeLog(EventLog):
         """An episode whose rows have told its start, but will not tell its end."""
         return self._running.pop(number)
 
-    def extend(self, told: Told) -> None:
+    def extend(self, told: EpisodeBatch) -> None:
         """Adds `/episode_start`, `/final_state` and `/episode_end` of what rows have told."""
         starts, ends, states = told
         if not len(starts) and not len(ends):

@@ -16,7 +16,7 @@ from tupli_mcap.messages.encoder import HOLE
 from tupli_mcap.recording.durability import STATE
 from tupli_mcap.recording.events import TERMINAL, TIMEOUT, EpisodeEnd
 
-__all__ = ["EpisodeRows", "StartedEpisode", "Told"]
+__all__ = ["EpisodeBatch", "EpisodeRows", "StartedEpisode"]
 
 Array = np.ndarray[Any, Any]
 _START = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("time", "<u8")])
@@ -39,7 +39,7 @@ class StartedEpisode(NamedTuple):
     start_row: int
 
 
-class Told(NamedTuple):
+class EpisodeBatch(NamedTuple):
     """What rows have told: `starts` (episode, env, first_row, time), `ends` (those, length, return, end) and their
     final states, as they follow `episode` and `env` in `/final_state` (uint8, a row an end); each in the order of time.
     """
@@ -76,7 +76,7 @@ class EpisodeRows:
         facts = end.episode, end.env, end.first_row, end.length, end.episode_return, end.end, time_ns
         self._waiting[end.env], self._waits[end.env] = facts, True
 
-    def take(self, rows: Array, pending: Mapping[int, bytes] | None = None) -> Told:
+    def take(self, rows: Array, pending: Mapping[int, bytes] | None = None) -> EpisodeBatch:
         """What new rows tell (a line a sub-environment, with holes, in their order).
 
         `pending`: final states of episodes that the last rows have ended, by sub-environment.
@@ -122,7 +122,7 @@ class EpisodeRows:
 
     def _told(
         self, rows: Array, starts: Array, ends: Array, last: Array, pending: Mapping[int, bytes]
-    ) -> Told:
+    ) -> EpisodeBatch:
         width, size = rows.shape[1], self._state.stop - self._state.start
         data = rows[..., None].view(np.uint8)[..., self._state]
         before = np.flatnonzero(self._waits)
@@ -143,8 +143,10 @@ class EpisodeRows:
             else:
                 self._waiting[env], self._waits[env] = ends[i], True
         ends, states = ends[inside], states[inside]
+        if self._n == 1:  # in their order, also where the clock was set back
+            return EpisodeBatch(starts, ends, states)
         order = np.argsort(ends["time"], kind="stable")
-        return Told(starts[np.argsort(starts["episode"], kind="stable")], ends[order], states[order])
+        return EpisodeBatch(starts[np.argsort(starts["episode"], kind="stable")], ends[order], states[order])
 
 
 class _Segments:

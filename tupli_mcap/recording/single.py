@@ -151,23 +151,21 @@ class SingleRecorder:
 
     def _settle(self) -> None:
         """Writes what was left for later, so that everything is as if it had been written at once."""
-        over, self._over = self._over, None
         writer = self._writer
-        if writer.failed is not None or not self._is_plain:
+        if not self._is_plain or writer.failed is not None:
             return
-        if self._episode is not None:
-            if over is not None:
-                self.end(over)
-            return
-        rows = writer.rows
         with writer.whole:
-            if not isinstance(rows, SingleRows) or not rows.tells:
-                return
-            self._episode = rows.settle(over=over is not None)
-            if self._episode is None and over is None:  # begun, and no step yet
-                writer.next_episode -= 1
-                facts = ResetFacts(None, None, "", "{}", time.time_ns())
-                self._episode = writer.start_episode(0, rows.count, facts)
+            over, self._over = self._over, None
+            rows = writer.rows
+            if self._episode is not None:
+                if over is not None:
+                    self.end(over)
+            elif isinstance(rows, SingleRows) and rows.tells:
+                self._episode = rows.settle(over=over is not None)
+                if self._episode is None and over is None:  # begun, and no step yet
+                    writer.next_episode -= 1
+                    facts = ResetFacts(None, None, "", "{}", time.time_ns())
+                    self._episode = writer.start_episode(0, rows.count, facts)
 
     def _keep_start_for(self, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""

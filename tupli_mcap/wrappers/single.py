@@ -201,16 +201,16 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
                 self._recorder.put
             )  # looked up as an attribute, which it is, and not as a method: that is quicker
             put(action, state, reward, terminal, timeout)
+            if self._plain:
+                if terminal or timeout:
+                    self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
+                return result
         except StepError:
             self._recorder.refuse(self._taken_metadata())
             raise
         except BaseException as err:  # a full disk, Ctrl-C
             self._writer.stop(err)
             raise
-        if self._plain:
-            if terminal or timeout:
-                self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
-            return result
         try:
             if self._watches:
                 if self._recorder.step_index == 0:  # a step that was a reset
