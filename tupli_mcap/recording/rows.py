@@ -124,9 +124,8 @@ class SingleRows:
         self.put = encoder.put
         self.put_state = encoder.put_state
         self._put_next = encoder.put_next
-        self._events: EpisodeLog | None = (
-            None  # what rows tell of their episodes; None while they tell nothing
-        )
+        # what rows tell of their episodes goes there; None while they tell nothing
+        self._events: EpisodeLog | None = None
         self._told = 0  # rows of the running half that have told it
         self._episodes = EpisodeRows(1, encoder.state_end)
         self._state_end = encoder.state_end
@@ -171,9 +170,8 @@ class SingleRows:
         area, offset, now = self._area, self.cursor.offset, time.time_ns()
         start = self._half * area.half
         last = (offset if offset > start else area.half - start + area.rows * area.row_size) - area.row_size
-        (before,) = _TIME.unpack_from(
-            self._buffer, last + SEQUENCE_OFFSET + 4
-        )  # no hole is older than its episode
+        # no hole is older than its episode
+        (before,) = _TIME.unpack_from(self._buffer, last + SEQUENCE_OFFSET + 4)
         prefix = self._header + _EPISODE_AND_STEP.pack(episode, 0)
         self._put_next(prefix, state, now if now > before else before)
 
@@ -228,9 +226,8 @@ class SingleRows:
     def _switch(self) -> None:
         """The half is full: go on in the other one, then write this one as a chunk."""
         area, half = self._area, self._half
-        self._tell(
-            half * area.half, area.rows
-        )  # before the other half's last row goes, whose hole may be here
+        # before the other half's last row goes, whose hole may be here
+        self._tell(half * area.half, area.rows)
         spare = half * area.half + area.rows * area.row_size
         self._half = 1 - half
         # a power loss may leave a part of what is written over these rows, and not the chunk they are in

@@ -66,9 +66,8 @@ class VectorRows:
         self._times = np.zeros((2, area.rows), np.uint64)  # of the rows in the journal, the same for a batch
         self._offsets = np.arange(area.rows, dtype=np.uint64) * np.uint64(area.row_size)
         self._write_chunks: Callable[[], None] | None = None  # of the half that is not running
-        self._events: EpisodeLog | None = (
-            None  # what rows tell of their episodes; None while they tell nothing
-        )
+        # what rows tell of their episodes goes there; None while they tell nothing
+        self._events: EpisodeLog | None = None
         self._told = 0  # rows of the running half that have told it
         self._episodes = EpisodeRows(n, layout.state_end)
         self._state = [self._writer(leaf) for leaf in layout.state if not leaf.apart]
