@@ -150,44 +150,59 @@ def last_card(path: Path) -> str:
     "space", [MIXED, spaces.Text(8), spaces.Box(-1, 1, (3,))], ids=["mixed", "text", "box"]
 )
 @pytest.mark.parametrize("num_envs", [0, 3], ids=["single", "vector"])
+@pytest.mark.parametrize(
+    ("told", "chunk_size"), [(False, 4000), (True, 4000), (True, 2**18)], ids=["at-once", "told", "asked"]
+)
 def test_a_watcher_in_another_thread_sees_what_is_recorded(
-    space: gym.Space[Any], num_envs: int, tmp_path: Path
+    space: gym.Space[Any], num_envs: int, told: bool, chunk_size: int, tmp_path: Path
 ) -> None:
     path, seen, done = tmp_path / "r.mcap", [], threading.Event()
+    ended: list[Any] = []
     if num_envs:
         inner = gym.vector.SyncVectorEnv([lambda: Sampler(space, space)] * num_envs)
-        env: Any = RecordVectorEpisodes(inner, path, chunk_size=4000)
+        env: Any = RecordVectorEpisodes(inner, path, chunk_size=chunk_size)
     else:
-        env = RecordEpisodes(Sampler(space, space), path, chunk_size=4000)
-    env._recorder.leaves_to_rows = False  # as where `live` is given
+        env = RecordEpisodes(Sampler(space, space), path, chunk_size=chunk_size)
+    env._recorder.leaves_to_rows = told
     watcher = Watcher(env._writer)
 
     def watch() -> None:
         while True:
             last = done.is_set()
             if watcher.layout is not None:
-                for new in watcher.look(2)[0]:
+                found, ends = watcher.look(2)
+                ended.append(ends)
+                for new in found:
                     images = {}
                     if watcher.layout.images:
                         images = watcher.images(0, new.env, range(new.first, new.first + len(new)))
                     seen.append((new, images))
             if last:
                 return
+            time.sleep(0.0005)  # else it keeps the interpreter for 5 ms after each look
 
     thread = threading.Thread(target=watch)
     thread.start()
     env.reset(seed=1)
-    for _ in range(600):
-        *_, terminal, timeout, _ = env.step(env.action_space.sample())
-        if not num_envs and (terminal or timeout):
-            env.reset()
-    done.set()
-    thread.join()
-    env.close()
+    try:
+        for i in range(1000):
+            if i % 20 == 0:
+                time.sleep(0.001)  # or the other thread may see little of it
+            *_, terminal, timeout, _ = env.step(env.action_space.sample())
+            if not num_envs and (terminal or timeout):
+                env.reset()
+        until_closing = sum(map(len, ended))
+    finally:
+        env.close()
+        done.set()
+        thread.join()
     with Recording(path) as recording:
         layout = recording.layout
         firsts = recording.index["first_row"].tolist()
         episodes = list(zip(recording.episodes, firsts, strict=True))
+        names = ["episode", "env", "first_row", "length", "return", "end"]
+        assert sorted(np.concatenate(ended)[names].tolist()) == recording.index[names].tolist()
+        assert until_closing > 10
         rows = {(e.env, first + i): (e, i) for e, first in episodes for i in range(len(e))}
         assert {new.env for new, _ in seen} == set(range(min(num_envs, 2) or 1))
         assert sum(len(new) for new, _ in seen if new.env == 0) > 100

@@ -160,6 +160,10 @@ class EpisodeLog(EventLog):
         """The end of an episode will be told by its rows."""
         self._running[episode.number] = episode
 
+    def running(self, number: int) -> StartedEpisode | None:
+        """An episode whose end its rows will tell, and have not told yet. For any thread."""
+        return self._running.get(number)
+
     def take_back(self, number: int) -> StartedEpisode:
         """An episode whose rows have told its start, but will not tell its end."""
         return self._running.pop(number)

@@ -127,6 +127,7 @@ class SingleRows:
         # what rows tell of their episodes goes there; None while they tell nothing
         self._events: EpisodeLog | None = None
         self._told = 0  # rows of the running half that have told it
+        self._asked = False  # for what is told at the next reset
         self._episodes = EpisodeRows(1, encoder.state_end)
         self._state_end = encoder.state_end
         self.begin_episode(0)
@@ -174,6 +175,14 @@ class SingleRows:
         (before,) = _TIME.unpack_from(self._buffer, last + SEQUENCE_OFFSET + 4)
         prefix = self._header + _EPISODE_AND_STEP.pack(episode, 0)
         self._put_next(prefix, state, now if now > before else before)
+        if self._asked:
+            self._asked = False
+            start = self._half * area.half
+            self._tell(start, (self.cursor.offset - start) // area.row_size)
+
+    def ask(self) -> None:
+        """Rows tell what they have to tell at the next reset, and not only when they go to the file. For any thread."""
+        self._asked = True
 
     def tell(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
         """The rows from here on will tell `events` of their episodes, and of the final state of the one that has

@@ -69,6 +69,7 @@ class VectorRows:
         # what rows tell of their episodes goes there; None while they tell nothing
         self._events: EpisodeLog | None = None
         self._told = 0  # rows of the running half that have told it
+        self._asked = False  # for what is told at the next reset
         self._episodes = EpisodeRows(n, layout.state_end)
         self._state = [self._writer(leaf) for leaf in layout.state if not leaf.apart]
         self._action = [self._writer(leaf) for leaf in layout.action]
@@ -153,6 +154,9 @@ class VectorRows:
         self._row = row + 1
         if self._row == self._area.rows:
             self._switch()
+        if self._asked and active is not None:
+            self._asked = False
+            self._tell(self._half, self._row)
 
     # ---- episodes told by rows
 
@@ -169,6 +173,15 @@ class VectorRows:
         for started in running:
             if started is not None:
                 events.leave_to_rows(started)
+
+    @property
+    def tells(self) -> bool:
+        """True while rows tell of their episodes."""
+        return self._events is not None
+
+    def ask(self) -> None:
+        """As `SingleRows.ask`."""
+        self._asked = True
 
     def settle(self, over: Array) -> tuple[list[int], list[float]]:
         """Rows tell what they have to tell, and from here on nothing; returns the numbers of the running episodes (-1:

@@ -22,6 +22,7 @@ from tupli_mcap.recording.index import EPISODE_ROWS
 from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.logs import EventLog, StepLog, iter_records
 from tupli_mcap.recording.rows import HOLE, SingleRows
+from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter
 
 __all__ = ["NewInfo", "NewSteps", "Watcher"]
@@ -83,13 +84,14 @@ class NewInfo(NamedTuple):
 class Watcher:
     """Reads what `writer` has committed since the last look. For one thread, any but the writer's.
 
-    The recorder must not leave starts and ends to rows: it is from their records that they are known.
+    Where starts and ends of episodes are left to rows, each look asks for those that the next one shows.
     """
 
     def __init__(self, writer: RecordingWriter) -> None:
         self._writer = writer
         self._seen: dict[int, int] = {}  # rows of each sub-environment
-        self._starts: dict[int, tuple[int, int]] = {}  # its last row's episode, and where that began
+        # its last row's episode, where that began, and the row after the last one
+        self._starts: dict[int, tuple[int, int, int]] = {}
         self._ends: dict[int, int] = {}  # where its last ended episode ended
         self._note_ends(np.frombuffer(bytes(writer.index.rows), EPISODE_ROWS))
         self._recent: Array = np.zeros(0, EPISODE_ROWS)
@@ -135,9 +137,15 @@ class Watcher:
     def look(self, envs: int) -> tuple[list[NewSteps], Array]:
         """The new steps of the first `envs` sub-environments, and the episodes that have ended (EPISODE_ROWS)."""
         found = [self._new_records(env) for env in range(min(envs, self.num_envs))]
-        # after the rows: an episode that is not there by now has begun where the last one ended
+        # after the rows: unless they tell of their episodes, one that is not there by now has begun where the last one
+        # ended
+        store = self._writer.rows if self._writer.rows is not None else self._writer.vector
+        tells = isinstance(store, SingleRows | VectorRows) and store.tells
         ended = self._ended()
-        return [self._placed(*new) for new in found if new is not None], ended
+        if isinstance(store, SingleRows | VectorRows) and tells:
+            store.ask()
+        placed = [self._placed(*new, tells=tells) for new in found if new is not None]
+        return [new for new in placed if len(new)], ended
 
     def images(self, leaf: int, env: int, rows: range) -> dict[int, Array]:
         """Whole records of those of the image rows that are in the journal still."""
@@ -267,29 +275,48 @@ class Watcher:
             self._ends[env] = int(last["first_row"] + last["length"])
 
     def _placed(
-        self, env: int, first: int, rows: Array | None, messages: list[tuple[int, bytes]]
+        self, env: int, first: int, rows: Array | None, messages: list[tuple[int, bytes]], *, tells: bool
     ) -> NewSteps:
-        """Numbers the steps in their episodes; `step` in the journal is filled in at a flush only."""
+        """Numbers the steps in their episodes; `step` in the journal is filled in at a flush only.
+
+        Steps of an episode whose beginning is not known are left out.
+        """
         if rows is None:
             pairs = np.array([np.frombuffer(m, "<u4", 2, BODY - _HEADER) for _, m in messages], np.int64)
             times = np.array([time_ns for time_ns, _ in messages], np.int64)
-            self._starts[env] = int(pairs[-1, 0]), first + len(messages) - 1 - int(pairs[-1, 1])
+            end = first + len(messages)
+            self._starts[env] = int(pairs[-1, 0]), end - 1 - int(pairs[-1, 1]), end
             return NewSteps(env, first, None, messages, pairs[:, 0], pairs[:, 1], times)
         episodes = rows["episode"].astype(np.int64)
         index = np.arange(first, first + len(rows))
-        begins = np.zeros(len(rows), np.int64)
-        begins[1:] = np.where(episodes[1:] != episodes[:-1], index[1:], 0)
-        begins[0] = self._begin_of(env, int(episodes[0]), min(self._ends.get(env, 0), first))
+        begins = np.full(len(rows), -1, np.int64)
+        begins[1:] = np.where(episodes[1:] != episodes[:-1], index[1:], -1)
+        begins[0] = self._first_row(env, first, int(episodes[0]), tells=tells)
         np.maximum.accumulate(begins, out=begins)
-        self._starts[env] = int(episodes[-1]), int(begins[-1])
-        steps = index - begins
+        if begins[-1] >= 0:
+            self._starts[env] = int(episodes[-1]), int(begins[-1]), first + len(rows)
+        unknown = int(np.count_nonzero(begins < 0))
+        first, rows, episodes = first + unknown, rows[unknown:], episodes[unknown:]
+        steps = (index - begins)[unknown:]
         rows["step"] = steps
         times = np.maximum.accumulate(rows["#log_time"].astype(np.int64))
         return NewSteps(env, first, rows, [], episodes, steps, times)
 
+    def _first_row(self, env: int, first: int, episode: int, *, tells: bool) -> int:
+        """Where the episode of row `first` has begun; -1 if that is not known."""
+        begin = self._begin_of(env, episode, -1)
+        if begin >= 0:
+            return begin
+        if not tells:
+            return min(self._ends.get(env, 0), first)
+        running = self._writer.events.running(episode) if self._writer.events is not None else None
+        if running is not None:
+            return running.first_row
+        return first if self._starts.get(env, (0, 0, -1))[2] == first else -1
+
     def _begin_of(self, env: int, episode: int, unknown: int) -> int:
         """The first row of an episode; `unknown` if it is neither the last one looked at nor one that has ended."""
-        known, begin = self._starts.get(env, (-1, 0))
+        known, begin, _ = self._starts.get(env, (-1, 0, 0))
         if known == episode:
             return begin
         ended = self._recent[(self._recent["episode"] == episode) & (self._recent["env"] == env)]

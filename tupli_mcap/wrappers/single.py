@@ -153,8 +153,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         self._plain = (
             not self._watches and flush_seconds is None and durability != "step" and not self.rotation.limited
         )
-        leaves_to_rows = self._plain and live is None  # who looks on wants to see every end
-        self._recorder = SingleRecorder(self._writer, spaces, self._infos, leaves_to_rows=leaves_to_rows)
+        self._recorder = SingleRecorder(self._writer, spaces, self._infos, leaves_to_rows=self._plain)
         self._recorder.resets_itself = _resets_itself(env)
         self._newest = [self._recorder]
         self._frames = FrameRecorder(self._writer, 1, every, frame_format) if every else None

@@ -122,7 +122,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             self._writer.close()
             raise
         watches = wanted or metadata_callback is not None or bool(every)
-        plain = not watches and flush_seconds is None and durability != "step" and live is None
+        plain = not watches and flush_seconds is None and durability != "step"
         self._recorder = VectorRecorder(
             self._writer, spaces, n, self._autoreset, self._infos,
             leaves_to_rows=plain and not self.rotation.limited,
