@@ -1,11 +1,10 @@
-"""What a live view costs the rollout, in wall time: steps while it works over steps while it is held still.
+"""What a live view costs the rollout, in wall time: steps that it shows over steps of a recorder without one.
 
-The viewers run in processes of their own, on the same machine. Virtual machines change their speed by a tenth from one
-moment to the next, so a recorder takes steps in slices of some 20 ms, with its view at work in every other one: a step
-with the view is compared with one of the slices before and after. Meanwhile no other recorder is open. In between the
-view is held in its rest, which then goes on where it stopped: put together, the slices with the view are a rollout with
-a view, look by look, and what viewers do in the 10 ms after a look counts. A figure is the median of several recorders;
-beside it is that of recorders without a view that are measured in the same way, which is 1 but for chance.
+The viewers run in processes of their own, on the same machine. Virtual machines change their speed by a tenth from
+one moment to the next, so two recorders take turns, in slices of some 20 ms: one with a view, and one without. In the
+slices of the one without, the view is held in its rest, which then goes on where it stopped: put together, the slices
+with the view are a rollout with a view, look by look, and what viewers do in the 10 ms after a look counts. A figure
+is the median of several pairs of recorders; beside it is that of pairs without a view, which is 1 but for chance.
 
 Left out are making the recorder, which imports what the viewer needs; the view's beginning (the panels are made and
 sent, which costs about 0.2 s of a core, once); and closing, which waits until the viewer has the rest.
@@ -115,14 +114,17 @@ class _Rollout:
                 self._env.reset()
         self.steps += self._at_once
 
-    def slice(self, hold: _Hold, free: bool) -> _Slice:
-        """The next one, with or without the view."""
-        hold.let(free)
+    def slice(self, hold: _Hold | None = None) -> _Slice:
+        """The next one, with the view that is held."""
+        if hold is not None:
+            hold.let(True)
         first, began = self.steps, time.perf_counter()
         seconds = 0.0
-        while seconds < _SLICE or not hold.rested(_AFTER):
+        while seconds < _SLICE or not (hold is None or hold.rested(_AFTER)):
             self.go_on()
             seconds = time.perf_counter() - began
+        if hold is not None:
+            hold.let(False)
         return _Slice(seconds, self.steps - first)
 
 
@@ -157,21 +159,32 @@ def compare(run: Run, workload: Workload) -> Iterator[Target]:
 
 
 def _slices(run: Run, workload: Workload, place: _Place | None) -> tuple[float, float]:
-    """Seconds per step of a recorder with its view held, as in the first and the last slice, and with it at work."""
-    from tupli_mcap import RecordEpisodes, Recording
+    """Seconds per step of a recorder without a view, and of another with its view at work."""
+    from tupli_mcap import RecordEpisodes
 
-    path, hold = run.fresh("live.mcap"), _Hold()
+    bare_path, path, hold = run.fresh("bare.mcap"), run.fresh("live.mcap"), _Hold()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # no viewer answers: that is one of the sides
+        bare_env = RecordEpisodes(workload.make(), bare_path)
         env = RecordEpisodes(workload.make(), path, live=place and place.url)
-        rollout = _Rollout(env, workload)
-        _begin(rollout, env._live, hold, place)
-        taken = [rollout.slice(hold, free=bool(number % 2)) for number in range(2 * run.part(_SLICES) + 1)]
+        bare, watched = _Rollout(bare_env, workload), _Rollout(env, workload)
+        _begin(bare, None, hold, None)
+        _begin(watched, env._live, hold, place)
+        hold.let(False)
+        taken = [(bare.slice(), watched.slice(hold)) for _ in range(run.part(_SLICES))]
+        bare_env.close()
         env.close()
+    _check_steps(bare_path, bare.steps)
+    _check_steps(path, watched.steps)
+    return _per_step([one for one, _ in taken]), _per_step([other for _, other in taken])
+
+
+def _check_steps(path: Path, steps: int) -> None:
+    from tupli_mcap import Recording
+
     with Recording(path) as recording:
-        check(recording.num_steps == rollout.steps, f"{recording.num_steps} steps instead of {rollout.steps}")
+        check(recording.num_steps == steps, f"{recording.num_steps} steps instead of {steps}")
     path.unlink()
-    return _per_step(taken[::2]), _per_step(taken[1::2])
 
 
 def _per_step(slices: list[_Slice]) -> float:
