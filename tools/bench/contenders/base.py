@@ -170,6 +170,15 @@ class Blocks(gym.Wrapper[Any, Any, Any, Any]):
         super().close()
 
 
+class ByHand(Contender):
+    """Who writes blocks of whole columns: `sink(path)` gets them."""
+
+    sink: type[Any]
+
+    def wrap(self, env: gym.Env[Any, Any], work: Workload, path: Path) -> gym.Env[Any, Any]:
+        return Blocks(env, self.sink(path))
+
+
 def _column(space: Any, rows: int) -> Array:
     if isinstance(space, gym.spaces.Text):
         return np.empty(rows, f"U{space.max_length}")

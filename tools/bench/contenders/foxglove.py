@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
-from tools.bench.contenders.mcap import SCHEMA, Mcap, Writing
+from tools.bench.contenders.mcap import SCHEMA, Mcap
 
 
 class Foxglove(Mcap):
@@ -15,7 +13,7 @@ class Foxglove(Mcap):
 
     note = "writes as a raw channel does, its bytes prepared before the clock runs; its files are read with `mcap`"
 
-    def _recorder(self, env: gym.Env[Any, Any], path: Path, prepared: list[bytes]) -> Writing:
+    def _writer(self, path: Path) -> tuple[Any, Any]:
         import foxglove
         from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
@@ -34,4 +32,4 @@ class Foxglove(Mcap):
             writer.close()
             return context  # channels close when nobody holds it any more
 
-        return Writing(env, prepared, add, finish)
+        return add, finish

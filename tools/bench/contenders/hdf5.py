@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tools.bench.contenders.base import Blocks, Contender, Session, joined
+from tools.bench.contenders.base import Blocks, ByHand, Session, joined
 from tools.bench.data import Array
 from tools.bench.measure import Stopwatch
 from tools.bench.workloads import Workload
@@ -77,11 +77,10 @@ def _strings(dataset: Any) -> Any:
     return dataset.asstr() if dataset.dtype.kind == "O" else dataset
 
 
-class Hdf5(Contender):
+class Hdf5(ByHand):
     """h5py."""
 
-    def wrap(self, env: Any, work: Workload, path: Path) -> Any:
-        return Blocks(env, _Sink(path))
+    sink = _Sink
 
     def append(self, work: Workload, path: Path, episodes: int) -> tuple[float, int]:
         env, watch = work.make(), Stopwatch()

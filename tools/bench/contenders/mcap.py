@@ -32,8 +32,12 @@ def messages(work: Workload, episodes: int) -> tuple[list[bytes], np.dtype[Any]]
     """The bytes of each step, made before the clock runs."""
     steps = 2 * episodes * work.length + 1000
     rows = packed(reference(work.name, steps).head(episodes))
+    return _each(rows), rows.dtype
+
+
+def _each(rows: Array) -> list[bytes]:
     size, everything = rows.dtype.itemsize, rows.tobytes()
-    return [everything[i : i + size] for i in range(0, len(everything), size)], rows.dtype
+    return [everything[i : i + size] for i in range(0, len(everything), size)]
 
 
 class Writing(gym.Wrapper[Any, Any, Any, Any]):
@@ -68,12 +72,13 @@ class Mcap(Contender):
         prepared, self._dtype = messages(work, episodes)
         env, watch = work.make(), Stopwatch()
         with watch:
-            recorder = self._recorder(env, path, prepared)
+            recorder = Writing(env, prepared, *self._writer(path))
             steps = work.rollout(recorder, episodes)
             recorder.close()
         return watch.seconds, steps
 
-    def _recorder(self, env: gym.Env[Any, Any], path: Path, prepared: list[bytes]) -> Writing:
+    def _writer(self, path: Path) -> tuple[Any, Any]:
+        """What adds a message, and what finishes the file."""
         from mcap.writer import CompressionType, Writer
 
         writer = Writer(str(path), compression=CompressionType.ZSTD)
@@ -84,7 +89,7 @@ class Mcap(Contender):
         def add(data: bytes, number: int) -> None:
             writer.add_message(channel, number, data, number, number)
 
-        return Writing(env, prepared, add, writer.finish)
+        return add, writer.finish
 
     def read(self, path: Path) -> tuple[dict[str, Any], Array | None]:
         return self._columns(path, log_time_order=False), None

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from tools.bench.contenders.base import LOADED, Blocks, Contender, Session
+from tools.bench.contenders.base import LOADED, ByHand, Session
 from tools.bench.data import Array, Data
-from tools.bench.workloads import Workload
 
 FACTS = ("lengths", "returns")
 
@@ -71,14 +70,12 @@ def chosen(leaves: dict[str, Array], lengths: Array, returns: Array, least: floa
     return Data(leaves, lengths).take(np.flatnonzero(returns >= least)).leaves
 
 
-class Npz(Contender):
+class Npz(ByHand):
     """One compressed file."""
 
+    sink = _ToNpz
     batches = True
     note = "everything is in memory until it is written, and again before a window or an episode is read"
-
-    def wrap(self, env: Any, work: Workload, path: Path) -> Any:
-        return Blocks(env, _ToNpz(path))
 
     def listing(self, path: Path) -> Array:
         with np.load(path) as file:
@@ -107,14 +104,12 @@ class Npz(Contender):
         return chosen(*self._leaves(path), least)
 
 
-class Npy(Contender):
+class Npy(ByHand):
     """One file a column, uncompressed, mapped into memory."""
 
+    sink = _ToNpy
     batches = True
     note = "the floor: nothing is compressed or checked; everything is in memory until it is written"
-
-    def wrap(self, env: Any, work: Workload, path: Path) -> Any:
-        return Blocks(env, _ToNpy(path))
 
     def _leaves(self, path: Path) -> tuple[dict[str, Array], Array, Array]:
         names = [file.stem for file in path.glob("*.npy") if not file.name.startswith("final.")]

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from tools.bench.contenders.base import Blocks, Contender, Session, joined
+from tools.bench.contenders.base import ByHand, Session, joined
 from tools.bench.data import Array
-from tools.bench.workloads import Workload
 
 
 class _Sink:
@@ -89,11 +88,10 @@ class _Session(Session):
         self.file.close()
 
 
-class Parquet(Contender):
+class Parquet(ByHand):
     """pyarrow."""
 
-    def wrap(self, env: Any, work: Workload, path: Path) -> Any:
-        return Blocks(env, _Sink(path))
+    sink = _Sink
 
     def listing(self, path: Path) -> Array:
         import pyarrow.parquet as pq
