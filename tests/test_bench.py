@@ -20,6 +20,7 @@ from tools.bench import report, workloads  # noqa: E402
 from tools.bench.contenders import OURS, make  # noqa: E402
 from tools.bench.data import check_same  # noqa: E402
 from tools.bench.fleet import NoAnswerError, Process  # noqa: E402
+from tools.bench.matrix import VECTORS  # noqa: E402
 from tools.bench.measure import WrongResultError  # noqa: E402
 from tools.bench.worker import Worker  # noqa: E402
 
@@ -35,7 +36,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [sys.executable, "-m", "tools.bench", "--quick", "--output", str(output)]
     command += ["--readme", str(output / "front.md")]
     command += [part for side in SIDES for part in ("--with", side)]
-    command += [part for name in ("floats", "growth", "noise") for part in ("--only", name)]
+    command += [part for name in ("floats", "growth", "noise", "vector") for part in ("--only", name)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
     assert done.returncode == 0, done.stderr
     return output
@@ -52,6 +53,15 @@ class TestQuickRun:
                 for side, cell in row.items():
                     assert bool(cell["values"]) != bool(cell["cannot"]), (work, operation, side)
             assert all(cell["values"] for cell in (row[OURS] for row in found["cells"].values()))
+
+    def test_vector_environments_are_compared(self, quick: Path) -> None:
+        cells = json.loads((quick / "results.json").read_text())["vectors"]["cells"]
+        assert {operation: set(row) for operation, row in cells.items()} == {
+            "record": set(SIDES),
+            "size": set(SIDES),
+        }
+        assert all(cell["values"] for row in cells.values() for cell in row.values())
+        assert "## Recording 64 sub-environments" in (quick / "README.md").read_text()
 
     def test_growth_has_all_sizes(self, quick: Path) -> None:
         growth = json.loads((quick / "results.json").read_text())["growth"]
@@ -129,6 +139,33 @@ class TestChecks:
         assert lengths.tolist() == data.lengths.tolist()
 
 
+class TestVectors:
+    @pytest.mark.parametrize("name", VECTORS)
+    def test_what_was_recorded_is_compared(
+        self, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Resets are no steps; wherever one value differs, there is no time."""
+        worker, path = Worker(name), str(tmp_path / "run")
+        ask = {"do": "build", "work": workloads.VECTOR, "steps": 6400}
+        answer = worker.answer({**ask, "path": path})
+        if "NotFoundError" in answer.get("failed", ""):
+            pytest.skip(answer["failed"])
+        assert answer["value"]["steps"] == 6400 - 6  # of 100 vector steps
+        assert answer["value"]["bytes"] > 0
+        read = worker._contender.read_vector
+        for leaf in worker._contender.read_vector(Path(path)):
+
+            def changed(path: Path, leaf: str = leaf) -> dict[str, Any]:
+                found = read(path)
+                found[leaf] = np.array(found[leaf])
+                found[leaf].flat[77] = not found[leaf].flat[77]
+                return found
+
+            monkeypatch.setattr(worker._contender, "read_vector", changed)
+            answer = worker.answer({**ask, "path": str(tmp_path / leaf)})
+            assert answer["failed"].startswith("WrongResultError: other ")
+
+
 class TestFleet:
     def test_a_contender_that_dies_is_said_to(self, tmp_path: Path) -> None:
         process = Process(".npy, mapped", tmp_path)
@@ -161,9 +198,7 @@ class TestFleet:
                     "failed": "" if values else "WrongResultError: other actions",
                 },
             }
-        table = report.table(
-            "floats", {"built": {OURS: {"steps": 100}, "mcap": {"steps": 50}}, "cells": cells}
-        )
+        table = report.table({"built": {OURS: {"steps": 100}, "mcap": {"steps": 50}}, "cells": cells})
         row = next(line for line in table.splitlines() if line.startswith("| mcap"))
         assert "failed<sup>1</sup>" in row
         assert "<sup>1</sup> mcap: WrongResultError: other actions." in table

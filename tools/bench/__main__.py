@@ -24,7 +24,7 @@ from tools.bench.contenders import ENTRIES
 from tools.bench.fleet import ROOT
 from tools.bench.matrix import STEPS, Workbench, grow, start
 from tools.bench.measure import Run
-from tools.bench.workloads import DATA, play
+from tools.bench.workloads import DATA, VECTOR, play
 
 GROWING = [
     "tupli-mcap",
@@ -108,6 +108,9 @@ def _measure(options: argparse.Namespace, log: _Log) -> dict[str, Any]:
             if "growth" in wanted:
                 sizes = [1000, 10_000] if options.quick else [10_000, 100_000, 1_000_000, 10_000_000]
                 results["growth"] = grow(bench, GROWING, sizes, 3.0 if options.quick else 60.0)
+            if VECTOR in wanted:
+                log.say("vector: side by side ...")
+                results["vectors"] = bench.vectors()
         finally:
             for process in processes.values():
                 process.stop()
@@ -151,6 +154,8 @@ def main() -> int:
     for target in results["targets"]:
         mark = {None: "?", True: "reached", False: "NOT REACHED"}[target["reached"]]
         print(f"{mark:12} {target['what']}: {report.measured(target)} ({target['words']}) {target['note']}")
+    for line in report.vectors(results["vectors"]) if "vectors" in results else ():
+        print(f"{'':12} {line}")
     log.say(f"wrote {options.output}; {len(results['failures'])} failed")
     return 1 if results["failures"] else 0
 

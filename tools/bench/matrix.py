@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from tools.bench.contenders import ENTRIES, OURS
 from tools.bench.fleet import NoAnswerError, Process
 from tools.bench.measure import Run
+from tools.bench.workloads import VECTOR
 
 
 class Operation(NamedTuple):
@@ -37,6 +38,7 @@ OPERATIONS = {
     "append": Operation("append", "ms"),
 }
 SLOW = 8.0  # seconds; who takes longer is asked once
+VECTORS = (OURS, "HDF5 by hand", "Parquet by hand", ".npz", ".npy, mapped", "mcap", "foxglove-sdk")
 STEPS = {"cartpole": 100_000, "floats": 100_000, "images": 1000, "dict": 10_000}
 APPENDED = {"cartpole": 45, "floats": 1, "images": 1, "dict": 10}  # episodes, about 1,000 steps (images: 200)
 
@@ -72,12 +74,20 @@ class Workbench:
 
     def measure(self, work: str) -> dict[str, Any]:
         """One workload: {"built": {contender: facts}, "cells": {operation: {contender: cell}}}."""
+        return self._measure(work, STEPS[work], list(self.processes), list(OPERATIONS))
+
+    def vectors(self) -> dict[str, Any]:
+        """The same of recording a vector environment, by those who can."""
+        names = [name for name in VECTORS if name in self.processes]
+        return self._measure(VECTOR, 400_000, names, ["record", "size"])
+
+    def _measure(self, work: str, steps: int, names: list[str], operations: list[str]) -> dict[str, Any]:
         started = time.perf_counter()
         built: dict[str, Any] = {}
-        cells: dict[str, dict[str, Cell]] = {name: {} for name in OPERATIONS}
-        paths = {name: self.run.fresh(f"{work}-{number}") for number, name in enumerate(self.processes)}
-        steps = self.run.part(STEPS[work], 250)
-        for name, process in self.processes.items():
+        cells: dict[str, dict[str, Cell]] = {operation: {} for operation in operations}
+        paths = {name: self.run.fresh(f"{work}-{number}") for number, name in enumerate(names)}
+        steps = self.run.part(steps, 250)
+        for name in names:
             try:
                 arguments = {
                     "work": work,
@@ -85,15 +95,15 @@ class Workbench:
                     "steps": steps,
                     "seconds": self.build_seconds,
                 }
-                built[name] = process.ask("build", 90, **arguments)
+                built[name] = self.processes[name].ask("build", 90, **arguments)
                 cells["size"][name] = Cell([built[name]["bytes"]])
             except NoAnswerError as err:
-                for operation in OPERATIONS:
+                for operation in operations:
                     cells[operation][name] = Cell(**{err.why: str(err)})
                 if err.why == "failed":
                     self.fail(f"{work}: {name} failed: {err}")
         self.say(f"{work}: building took {time.perf_counter() - started:.0f} s")
-        for operation in OPERATIONS:
+        for operation in operations:
             if operation != "size":
                 began = time.perf_counter()
                 rounds = self.rounds if began - started < self.workload_seconds else 1

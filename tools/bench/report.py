@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import statistics
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from tools.bench.contenders import OURS
 from tools.bench.matrix import OPERATIONS
 from tools.bench.measure import ratio
-from tools.bench.workloads import WORKLOADS
+from tools.bench.workloads import NUM_ENVS, WORKLOADS
 
 BEGIN, END = "<!-- benchmark: begin -->", "<!-- benchmark: end -->"
 MINE = (OURS, f"{OURS}, materialized")
@@ -24,16 +25,17 @@ def figure(value: float) -> str:
     return f"{value:,.0f}" if value < 9.95e5 else f"{value / 1e6:.1f}M"
 
 
-def table(work: str, found: dict[str, Any]) -> str:
+def table(found: dict[str, Any]) -> str:
     """One workload: a row a contender, a column an operation, footnotes below."""
     cells, notes = found["cells"], _Notes()
     names = list(next(iter(cells.values())))
-    heads = " | ".join(f"{op.title}<br>{op.unit} {'▲' if op.higher else '▼'}" for op in OPERATIONS.values())
-    lines = [f"| | {heads} |", "|---|" + "---:|" * len(OPERATIONS)]
+    operations = [OPERATIONS[operation] for operation in cells]
+    heads = " | ".join(f"{op.title}<br>{op.unit} {'▲' if op.higher else '▼'}" for op in operations)
+    lines = [f"| | {heads} |", "|---|" + "---:|" * len(operations)]
     for name in names:
         if all(row.get(name, {}).get("cannot", "").startswith("not installed") for row in cells.values()):
             continue
-        row = [_cell(operation, name, cells[operation], notes) for operation in OPERATIONS]
+        row = [_cell(operation, name, cells[operation], notes) for operation in cells]
         lines.append(
             f"| {'**' if name == OURS else ''}{name}{'**' if name == OURS else ''} | {' | '.join(row)} |"
         )
@@ -153,12 +155,35 @@ LEGEND = (
 )
 
 
+VECTORS = (
+    "A vector environment (next-step autoreset) of four random floats and two actions, episodes of 1,000 steps: what "
+    "an env-step costs over the same rollout without a recorder, and its bytes. By hand, in `.npz` and in `.npy` a row "
+    "is a vector step with a mask of who took it; nothing else tells episodes apart. `mcap` and foxglove-sdk write a "
+    "message an env-step. Minari's and PyTupli's recorders refuse a vector environment; LeRobot and d3rlpy are given "
+    "the steps of one episode at a time."
+)
+
+
+def vectors(found: dict[str, Any]) -> list[str]:
+    """A line a contender of what recording a vector environment costs."""
+    cells, lines = found["cells"], []
+    for name in cells["record"]:
+        row = {operation: _cell(operation, name, cells[operation], _Notes()) for operation in cells}
+        told = ", ".join(f"{cell} {OPERATIONS[operation].unit}" for operation, cell in row.items())
+        lines.append(
+            f"record {NUM_ENVS} sub-environments, {name}: {re.sub('<sup>.*?</sup>|<.*?>', '', told)}"
+        )
+    return lines
+
+
 def page(results: dict[str, Any]) -> str:
     """Everything."""
     parts = ["# Benchmark", f"`python -m tools.bench` writes this page. {LEGEND}"]
     parts += ["![By number of steps](growth.svg)", f"## Machine\n\n{machine(results)}"]
     for work, found in results["matrix"].items():
-        parts.append(f"## {WORKLOADS[work].title}\n\n![{work}]({work}.svg)\n\n{table(work, found)}")
+        parts.append(f"## {WORKLOADS[work].title}\n\n![{work}]({work}.svg)\n\n{table(found)}")
+    if "vectors" in results:
+        parts.append(f"## Recording {NUM_ENVS} sub-environments\n\n{VECTORS}\n\n{table(results['vectors'])}")
     notes = [f"- {name}: {e['note']}" for name, e in results["contenders"].items() if e["note"]]
     parts.append("## Contenders\n\n" + "\n".join(notes))
     parts.append("## Promises\n\n" + targets(results["targets"]))
@@ -175,7 +200,7 @@ def block(results: dict[str, Any]) -> str:
         parts.append(
             f"![{WORKLOADS[shown].title}](docs/bench/{shown}.svg)\n![By number of steps](docs/bench/growth.svg)"
         )
-        parts.append(f"{WORKLOADS[shown].title}:\n\n{table(shown, results['matrix'][shown])}")
+        parts.append(f"{WORKLOADS[shown].title}:\n\n{table(results['matrix'][shown])}")
     about = results["machine"]
     parts.append(
         f"▼ less is better, ▲ more is better; ⚡ faster than tupli-mcap. {about['cpu']}, {about['cores']} cores, "

@@ -10,6 +10,7 @@ import contextlib
 import gc
 import importlib.metadata
 import json
+import math
 import os
 import resource
 import shutil
@@ -27,9 +28,10 @@ from tools.bench import epochs
 from tools.bench.contenders import ENTRIES, CannotError, make
 from tools.bench.data import Data, check_same
 from tools.bench.measure import check, seconds_of
-from tools.bench.workloads import WORKLOADS, Workload, reference
+from tools.bench.workloads import NUM_ENVS, VECTOR, WORKLOADS, Workload, reference
 
 PLACES = 100
+TRIAL = 40_000  # env-steps
 
 
 class Worker:
@@ -40,6 +42,7 @@ class Worker:
         self._contender = make(name)
         self._built: dict[tuple[str, str], Data] = {}
         self._sessions: dict[str, Any] = {}
+        self._trials: list[float] = []
         self._random = np.random.default_rng()
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -60,6 +63,8 @@ class Worker:
 
     def do_build(self, work: str, path: str, steps: int, seconds: float | None = None) -> dict[str, Any]:
         """Records about `steps` steps for the other operations, or what takes about `seconds`; checks it all."""
+        if work == VECTOR:
+            return self._build_vector(Path(path), steps, seconds)
         workload, where = WORKLOADS[work], Path(path)
         data = reference(work, steps)
         if seconds is not None:
@@ -75,6 +80,24 @@ class Worker:
             "bytes": lengths / data.steps,
             "allocated": allocated / data.steps,
         }
+
+    def _build_vector(self, where: Path, steps: int, seconds: float | None) -> dict[str, Any]:
+        _, count = self._record_vector(where, steps, math.inf if seconds is None else seconds)
+        lengths, allocated = _sizes(where)
+        return {"steps": count, "bytes": lengths / count, "allocated": allocated / count}
+
+    def _record_vector(self, where: Path, steps: int, seconds: float) -> tuple[float, int]:
+        """Microseconds an env-step, and how many: `steps`, or what takes about `seconds`."""
+        from tools.bench.vectors import LENGTH, record  # not in every Gymnasium
+
+        def batches(count: float) -> tuple[float, int]:
+            return record(self._contender, where, LENGTH, max(1, int(count / NUM_ENVS)))
+
+        trial = min(steps, TRIAL)
+        while len(self._trials) < 2:  # the first one imports, and is not counted
+            self._trials.append(seconds_of(lambda: batches(trial)) / trial)
+            _remove(where)
+        return batches(min(steps, seconds / self._trials[-1]))
 
     def _affordable(self, workload: Workload, where: Path, data: Data, seconds: float) -> int:
         """How many episodes may be recorded and read in about `seconds`, at least two."""
@@ -118,7 +141,12 @@ class Worker:
 
     def do_record(self, work: str, path: str, seconds: float, steps: int) -> float:
         """Microseconds a step over the same rollout without a recorder, in turns with it."""
-        workload, where = WORKLOADS[work], Path(path)
+        where = Path(path)
+        if work == VECTOR:
+            value, _ = self._record_vector(where, steps, seconds)
+            _remove(where)
+            return value
+        workload = WORKLOADS[work]
         data = reference(work, steps)
         key = work, "record"
         if key not in self._built:

@@ -26,6 +26,8 @@ from tools.bench.data import Array, Data, flat
 SEED = 7
 ROWS = 4096
 DATA = "TUPLI_MCAP_BENCH_DATA"  # the directory of what the processes of one run share
+VECTOR = "vector"  # the workload of a vector environment, see vectors.py
+NUM_ENVS = 64
 STEPS = ("actions", "rewards", "terminals", "timeouts")
 
 

@@ -63,6 +63,17 @@ class Contender:
         """The environment, recorded to `path` (a file or a directory that is not there yet)."""
         raise CannotError("records nothing")
 
+    def prepare_vector(self, leaves: dict[str, Array]) -> None:
+        """Before the clock runs: all leaves of the vector steps to come, and `is_step`."""
+
+    def wrap_vector(self, env: gym.vector.VectorEnv[Any, Any, Any], path: Path) -> Any:
+        """The vector environment, recorded to `path`."""
+        raise CannotError("records no vector environment")
+
+    def read_vector(self, path: Path) -> dict[str, Any]:
+        """All leaves: a row a vector step, with `is_step`, or a row a step, with its sub-environment in `env`."""
+        return self.read(path)[0]
+
     def append(self, work: Workload, path: Path, episodes: int) -> tuple[float, int]:
         """The same to what is there already."""
         raise CannotError("a file is written once")
@@ -170,6 +181,57 @@ class Blocks(gym.Wrapper[Any, Any, Any, Any]):
         super().close()
 
 
+class VectorBlocks(gym.vector.VectorWrapper):
+    """The same of a vector environment whose states are arrays: a row a vector step.
+
+    `is_step` is False where a sub-environment was reset instead: its state there is the last one of its episode.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], sink: Any) -> None:
+        super().__init__(env)
+        self._sink = sink
+        shape, actions = (BLOCK, env.num_envs), env.action_space
+        self._empty = {"states": _column(env.observation_space, BLOCK), "actions": _column(actions, BLOCK)}
+        self._empty["rewards"] = np.empty(shape)
+        self._empty |= {name: np.empty(shape, np.bool_) for name in ("terminals", "timeouts", "is_step")}
+        self._lengths, self._returns = np.zeros(env.num_envs, np.int64), np.zeros(env.num_envs)
+        self._fresh()
+
+    def _fresh(self) -> None:
+        self._leaves = {name: np.empty_like(leaf) for name, leaf in self._empty.items()}
+        self._columns = list(self._leaves.values())
+        self._at = 0
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        self._state, info = self.env.reset(**kwargs)
+        self._running = np.ones(self.num_envs, np.bool_)
+        return self._state, info
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        result = after, rewards, terminals, timeouts, _ = self.env.step(actions)
+        row = self._state, actions, rewards, terminals, timeouts, self._running
+        for column, values in zip(self._columns, row, strict=True):
+            column[self._at] = values
+        self._state, self._running = after, ~(terminals | timeouts)
+        self._at += 1
+        if self._at == BLOCK:
+            self._write()
+        return result
+
+    def _write(self) -> None:
+        self._sink.write({name: leaf[: self._at] for name, leaf in self._leaves.items()})
+        self._lengths += self._at
+        self._returns += self._leaves["rewards"][: self._at].sum(0)
+        self._fresh()
+
+    def close(self, **kwargs: Any) -> None:
+        if self._at:
+            self._write()
+        # Of each sub-environment: rows, the sum of its rewards, the state it is left in.
+        self._sink.finish(self._lengths, self._returns, {"states": self._state})
+        super().close(**kwargs)
+
+
 class ByHand(Contender):
     """Who writes blocks of whole columns: `sink(path)` gets them."""
 
@@ -177,6 +239,9 @@ class ByHand(Contender):
 
     def wrap(self, env: gym.Env[Any, Any], work: Workload, path: Path) -> gym.Env[Any, Any]:
         return Blocks(env, self.sink(path))
+
+    def wrap_vector(self, env: gym.vector.VectorEnv[Any, Any, Any], path: Path) -> Any:
+        return VectorBlocks(env, self.sink(path))
 
 
 def _column(space: Any, rows: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,25 @@ class Writing(gym.Wrapper[Any, Any, Any, Any]):
         super().close()
 
 
+class WritingVector(gym.vector.VectorWrapper):
+    """The same of a vector environment: one call of `add` for each sub-environment that was not reset."""
+
+    def __init__(self, env: Any, prepared: list[list[bytes]], add: Any, finish: Any) -> None:
+        super().__init__(env)
+        self._prepared, self._add, self._finish, self._count = iter(prepared), add, finish, 0
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        result = self.env.step(actions)
+        for data in next(self._prepared):
+            self._add(data, self._count)
+        self._count += 1
+        return result
+
+    def close(self, **kwargs: Any) -> None:
+        self._finish()
+        super().close(**kwargs)
+
+
 class Mcap(Contender):
     """`Writer.add_message` and `iter_messages`."""
 
@@ -76,6 +96,17 @@ class Mcap(Contender):
             steps = work.rollout(recorder, episodes)
             recorder.close()
         return watch.seconds, steps
+
+    def prepare_vector(self, leaves: dict[str, Array]) -> None:
+        there = leaves["is_step"]
+        steps = {name: leaf[there] for name, leaf in leaves.items() if name != "is_step"}
+        steps["env"] = np.nonzero(there)[1].astype(np.uint16)
+        rows = packed(Data(steps, there.sum(1)))
+        self._dtype, every = rows.dtype, iter(_each(rows))
+        self._batches = [list(itertools.islice(every, count)) for count in there.sum(1).tolist()]
+
+    def wrap_vector(self, env: Any, path: Path) -> WritingVector:
+        return WritingVector(env, self._batches, *self._writer(path))
 
     def _writer(self, path: Path) -> tuple[Any, Any]:
         """What adds a message, and what finishes the file."""

@@ -43,6 +43,18 @@ class Ours(Contender):
 
         return RecordEpisodes(env, path)
 
+    def wrap_vector(self, env: Any, path: Path) -> Any:
+        from tupli_mcap.vector import RecordEpisodes
+
+        return RecordEpisodes(env, path)
+
+    def read_vector(self, path: Path) -> dict[str, Any]:
+        from tupli_mcap import Recording
+
+        with Recording(path) as recording:
+            lengths = recording.index["length"].astype(np.int64)
+            return leaves(recording.read()) | {"env": np.repeat(recording.index["env"], lengths)}
+
     def append(self, work: Workload, path: Path, episodes: int) -> tuple[float, int]:
         from tupli_mcap import RecordEpisodes
 
