@@ -18,8 +18,9 @@ from killing.check import Found, problems_of
 from killing.kinds import KINDS
 from killing.moments import MOMENTS, die
 
-from tupli_mcap import RecordEpisodes, Recording, recover_recording
+from tupli_mcap import RecordEpisodes, Recording, journal_path, recover_recording
 from tupli_mcap.recording.journal import Journal
+from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter
@@ -210,3 +211,76 @@ def test_nothing_of_a_killed_writer_stays_behind(tmp_path: Path) -> None:
     make("a").close()
     assert [file.name for file in tmp_path.iterdir()] == ["r.mcap"]
     assert Recording(path).num_steps == 1
+
+
+def _count(path: Path, mode: Any) -> RecordEpisodes:
+    env = Scripted(lambda i: np.array([i], np.float32), spaces.Box(0, 99, (1,), np.float32), length=50)
+    return RecordEpisodes(env, path, mode=mode)
+
+
+def _take(env: RecordEpisodes, steps: int) -> None:
+    env.reset(seed=1)
+    for _ in range(steps):
+        env.step(0)
+
+
+def _with_journal_only(path: Path) -> None:
+    RecordingWriter.cut = lambda _: die()  # type: ignore[method-assign]
+    _take(_count(path, "x"), 1)
+
+
+def _with_steps(path: Path) -> None:
+    env = _count(path, "x")  # closed if nobody held it
+    _take(env, 7)
+    die()
+
+
+def _as_soon_as_it_is_there(path: Path) -> None:
+    publish = FileLock.publish
+
+    def publish_and_die(self: FileLock) -> None:
+        publish(self)
+        die()
+
+    FileLock.publish = publish_and_die  # type: ignore[method-assign]
+    _count(path, "w")
+
+
+@pytest.mark.parametrize("first", [_with_journal_only, _with_steps])
+@pytest.mark.parametrize("replacements", [1, 2])
+@pytest.mark.parametrize("mode", ["w", "a"])
+def test_the_journal_of_what_was_replaced_goes_though_the_replacing_was_killed(
+    tmp_path: Path, first: Callable[[Path], None], replacements: int, mode: str
+) -> None:
+    path = tmp_path / "r.mcap"
+    in_a_process_that_dies(lambda: first(path))
+    uuid = Recording(path).uuid
+    for _ in range(replacements):
+        in_a_process_that_dies(lambda: _as_soon_as_it_is_there(path))
+        assert journal_path(path).exists()
+        with Recording(path) as recording:
+            assert (recording.metadata["replaced"], recording.num_steps) == (uuid, 0)
+    recover_recording(path, tmp_path / "recovered.mcap")
+    with Recording(tmp_path / "recovered.mcap") as recovered:
+        assert "replaced" not in recovered.metadata
+    (tmp_path / "recovered.mcap").unlink()
+    with _count(path, mode) as env:
+        assert not journal_path(path).exists()
+        _take(env, 3)
+    assert Recording(path).num_steps == 3
+    assert [file.name for file in tmp_path.iterdir()] == ["r.mcap"]
+
+
+@pytest.mark.parametrize("mode", ["w", "a"])
+def test_the_journal_of_what_was_renamed_stays_though_its_successor_was_killed(
+    tmp_path: Path, mode: str
+) -> None:
+    path, kept = tmp_path / "r.mcap", tmp_path / "kept.mcap"
+    in_a_process_that_dies(lambda: _with_steps(path))
+    path.rename(kept)
+    in_a_process_that_dies(lambda: _as_soon_as_it_is_there(path))
+    with pytest.warns(UserWarning, match="is kept as"), _count(path, mode) as env:
+        _take(env, 3)
+    (journal,) = tmp_path.glob("*.journal")
+    journal.rename(journal_path(kept))
+    assert (Recording(kept).num_steps, Recording(path).num_steps) == (7, 3)

@@ -29,7 +29,8 @@ __all__ = ["Contents", "read_contents"]
 
 RECORDING_METADATA = "tupli_mcap.recording"
 RECORDING_KEYS = (
-    "uuid", "format_version", "library", "created_ns", "benchmark_id", "journal", "rewritten", "next_episode",
+    "uuid", "format_version", "library", "created_ns", "benchmark_id", "journal", "replaced", "rewritten",
+    "next_episode",
 )  # fmt: skip
 CHANNEL_KEYS = (
     "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields", "camera",

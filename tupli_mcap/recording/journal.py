@@ -39,6 +39,7 @@ __all__ = [
     "journal_info",
     "journal_name",
     "journal_path",
+    "owner_among",
     "read_journal",
     "recorded_journal",
 ]
@@ -337,6 +338,15 @@ def journal_info(path: Path) -> dict[str, Any]:
     """What a journal says of itself; nothing else of it is read. Raises as `read_journal` does."""
     with _open(path) as file:
         return _read_header(path, file)[0]
+
+
+def owner_among(path: Path, uuids: Collection[str]) -> str:
+    """Which of these recordings the journal at a path belongs to; empty if to none, or if it cannot be read."""
+    try:
+        found = str(journal_info(path).get("uuid"))
+    except (OSError, FormatError):
+        return ""
+    return found if found in uuids and _UUID.fullmatch(found) else ""
 
 
 def _open(path: Path) -> BinaryIO:

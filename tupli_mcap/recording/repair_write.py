@@ -73,7 +73,8 @@ class RepairWriter:
 
     def _metadata_of_recording(self) -> dict[str, str]:
         """The recording's metadata; what is lost or damaged of it is made anew."""
-        found = {k: v for k, v in (self._gathered.metadata or {}).items() if k != "journal"}
+        known = self._gathered.metadata or {}
+        found = {key: value for key, value in known.items() if key not in ("journal", "replaced")}
         made = {
             "uuid": uuid.uuid4().hex,
             "format_version": "2" if uses_codecs(self._gathered.channels) else "1",

@@ -54,7 +54,7 @@ def rewrite_recording(
         FormatError: the source is damaged.
     """
     target = Path(target)
-    metadata = {key: value for key, value in source.metadata.items() if key != "journal"}
+    metadata = {key: value for key, value in source.metadata.items() if key not in ("journal", "replaced")}
     if benchmark_id is not None:
         metadata["benchmark_id"] = benchmark_id
     metadata["next_episode"] = str(source._contents.next_episode)

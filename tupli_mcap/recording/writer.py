@@ -26,7 +26,7 @@ from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
 from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_info, journal_path
+from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_path, owner_among
 from tupli_mcap.recording.library import library
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog, StepLog
@@ -94,6 +94,9 @@ class RecordingWriter:
         self.recorded_vector = False
         self.uuid = uuid.uuid4().hex
         self.rewritten = ""
+        self.replaced = (
+            ""  # the recording whose journal a writer that was killed has left in this one's place
+        )
         self.journal_place = self._choose_journal_place()
         self._is_cut = True  # False on append, while the file still is as it was found
         self._flush_seconds = options.flush_seconds
@@ -117,8 +120,12 @@ class RecordingWriter:
             self._is_cut = False
             resume(self)
             self._old_journal = self.journal_place
+            self._remove_replaced()
             return
-        replaced = _uuid_of(self._place) if self.options.mode == "w" else ""
+        there = _metadata_of(self._place) if self.options.mode == "w" else {}
+        self.replaced = owner_among(
+            journal_path(self._place), [there[key] for key in ("uuid", "replaced") if key in there]
+        )
         try:
             os.ftruncate(self.lock.fd, 0)
         except OSError as err:
@@ -135,13 +142,18 @@ class RecordingWriter:
         }
         if self.options.journal_dir is not None:
             values["journal"] = str(self.journal_place)
+        if (
+            self.replaced
+        ):  # whoever comes next shall know, if this process dies before it removes that journal
+            values["replaced"] = self.replaced
         self.container.start(values["library"])
         self.container.add_metadata(RECORDING_METADATA, values)
         for name, (media_type, data) in (self.options.attachments or {}).items():
             self.container.add_attachment(name, media_type, data, now)
         self.lock.publish()
-        if replaced:
-            self._remove_old_journal(journal_path(self._place), replaced)
+        self._remove_replaced()
+        if there:
+            self._remove_unnamed(journal_path(self._place))
 
     # ---- the first step
 
@@ -463,11 +475,20 @@ class RecordingWriter:
 
     def _remove_old_journal(self, place: Path, uuid: str) -> None:
         """What a killed writer left of its journal, and of one that was not in its place yet."""
-        unnamed = place.with_name(f"{place.name}.tmp")
-        with contextlib.suppress(OSError, FormatError):
-            if journal_info(place).get("uuid") == uuid:
+        with contextlib.suppress(OSError):
+            if owner_among(place, [uuid]):
                 place.unlink()
-        unnamed.unlink(missing_ok=True)
+        self._remove_unnamed(place)
+
+    def _remove_unnamed(self, place: Path) -> None:
+        place.with_name(f"{place.name}.tmp").unlink(missing_ok=True)
+
+    def _remove_replaced(self) -> None:
+        """The journal of the recording that this one took the place of."""
+        place = journal_path(self._place)
+        with contextlib.suppress(OSError):
+            if owner_among(place, [self.replaced]):
+                place.unlink()
 
     def _is_new_and_empty(self) -> bool:
         return self.options.mode != "a" and not self.options.keep_empty
@@ -487,8 +508,7 @@ class RecordingWriter:
         if self.journal is not None:
             self.journal.close(unlink=False)
         self.lock.release()
-        place = self.journal_place
-        place.with_name(f"{place.name}.tmp").unlink(missing_ok=True)
+        self._remove_unnamed(self.journal_place)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
             options = WriterOptions(self.options.compression, "a", durability=self.options.durability)
@@ -522,13 +542,13 @@ class _Whole:
             self._writer.stop(err)
 
 
-def _uuid_of(path: Path) -> str:
-    """The UUID of a recording that is there; empty if there is none."""
+def _metadata_of(path: Path) -> dict[str, str]:
+    """The metadata of a recording that is there; empty if there is none."""
     if not path.is_file():
-        return ""
+        return {}
     with contextlib.suppress(RecordingError, FormatError), contextlib.closing(PathSource(path)) as source:
-        return head(source).get("uuid", "")
-    return ""
+        return head(source)
+    return {}
 
 
 def _abandon_all() -> None:
