@@ -260,7 +260,8 @@ def test_the_journal_of_what_was_replaced_goes_though_the_replacing_was_killed(
         assert journal_path(path).exists()
         with Recording(path) as recording:
             assert (recording.metadata["replaced"], recording.num_steps) == (uuid, 0)
-    recover_recording(path, tmp_path / "recovered.mcap")
+    report = recover_recording(path, tmp_path / "recovered.mcap")
+    assert (report.journal, report.notes) == ("none", [])
     with Recording(tmp_path / "recovered.mcap") as recovered:
         assert "replaced" not in recovered.metadata
     (tmp_path / "recovered.mcap").unlink()

@@ -29,12 +29,14 @@ def add_journal(gathered: Gathered) -> None:
     if gathered.tail.finished or gathered.source.path is None:
         return
     path = gathered.source.path
+    # a journal is made before the channels
+    no_step = not gathered.channels and not gathered.damages
     try:
         path = recorded_journal(path, gathered.metadata or {})
         journal = read_journal(path)
     except FileNotFoundError:
-        if not gathered.channels and not gathered.damages:
-            return  # a journal is made before the channels: there was no step
+        if no_step:
+            return
         gathered.journal = "missing"
         elsewhere = misplaced_journal(gathered.source.path, gathered.metadata or {})
         if elsewhere is not None:
@@ -45,6 +47,8 @@ def add_journal(gathered: Gathered) -> None:
         gathered.notes.append(f"the journal cannot be read ({err})")
         return
     if not _belongs(gathered, journal):
+        if no_step:
+            return
         gathered.journal = "stale"
         gathered.notes.append(f"the journal {path.name} belongs to another recording")
         return
