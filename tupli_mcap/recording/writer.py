@@ -94,9 +94,8 @@ class RecordingWriter:
         self.recorded_vector = False
         self.uuid = uuid.uuid4().hex
         self.rewritten = ""
-        self.replaced = (
-            ""  # the recording whose journal a writer that was killed has left in this one's place
-        )
+        # the recording whose journal a writer that was killed has left in this one's place
+        self.replaced = ""
         self.journal_place = self._choose_journal_place()
         self._is_cut = True  # False on append, while the file still is as it was found
         self._flush_seconds = options.flush_seconds
@@ -142,9 +141,8 @@ class RecordingWriter:
         }
         if self.options.journal_dir is not None:
             values["journal"] = str(self.journal_place)
-        if (
-            self.replaced
-        ):  # whoever comes next shall know, if this process dies before it removes that journal
+        if self.replaced:
+            # whoever comes next shall know, if this process dies before it removes that journal
             values["replaced"] = self.replaced
         self.container.start(values["library"])
         self.container.add_metadata(RECORDING_METADATA, values)
