@@ -271,6 +271,22 @@ def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:
             assert np.array(value[0], np.uint8).tobytes() == cams[row].tobytes()
 
 
+@pytest.mark.parametrize("shape", [(8, 6), (8, 6, 3), (1, 2)])
+def test_stacks_of_frames_come_to_rerun(shape: tuple[int, ...], tmp_path: Path) -> None:
+    path, port = tmp_path / "r.mcap", free_port()
+    screen = Sampler(spaces.Box(0, 255, shape, np.uint8), spaces.Discrete(3))
+    inner = gym.wrappers.FrameStackObservation(screen, 4)
+    with receiver(port, tmp_path / "r.rrd"), RecordEpisodes(inner, path, live=url(port)) as env:
+        roll(env, 100, 0.01)
+    rows, tensors = shown(tmp_path / "r.rrd", "/state", "Tensor:data")
+    with Recording(path) as recording:
+        assert recording.layout.stacks  # type: ignore[union-attr]
+        states = recording.read().states
+    assert len(rows) > 5
+    for row, (tensor,) in zip(rows, tensors, strict=True):
+        assert np.array_equal(np.array(tensor["buffer"]).reshape(tensor["shape"]), states[row])
+
+
 class Told(gym.Wrapper[Any, Any, Any, Any]):
     """Says something of each step; a sub-environment's episodes are over after `length` steps."""
 

@@ -16,7 +16,8 @@ from tupli_mcap.viewer.sending import Times, blob_array, column_of, send_blobs, 
 __all__ = ["Camera", "Grid", "HeatMap", "Picture"]
 
 _MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
-_AXES = {3: ("row", "column"), 4: ("[0]", "[1]", "[2]")}  # by dimensions of a column of steps
+# by dimensions of a column of steps
+_AXES = {3: ("row", "column"), 4: ("[0]", "[1]", "[2]"), 5: ("[0]", "[1]", "[2]", "[3]")}
 _FRAMES_AT_ONCE = 64
 
 
@@ -51,7 +52,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Grid:
-    """A leaf of two or three dimensions: a tensor a step."""
+    """A leaf of two or three dimensions, or a stack of frames: a tensor a step."""
 
     leaf: Leaf
     column: str

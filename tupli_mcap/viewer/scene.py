@@ -123,6 +123,8 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
         scene.unseen.append(f"{title_of(leaf)} has no values")
     elif leaf.kind == "image":
         scene.beside.append(Picture(leaf, column, entity, title))
+    elif leaf.apart:
+        panels.append(Grid(leaf, column, entity, title))
     elif type(leaf.space) is spaces.Discrete:
         panels.append(_discrete(leaf, column, material))
     elif leaf.size <= MOST_LINES:
