@@ -271,11 +271,14 @@ def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:
             assert np.array(value[0], np.uint8).tobytes() == cams[row].tobytes()
 
 
+@pytest.mark.parametrize("axis", [0, -1])
 @pytest.mark.parametrize("shape", [(8, 6), (8, 6, 3), (1, 2)])
-def test_stacks_of_frames_come_to_rerun(shape: tuple[int, ...], tmp_path: Path) -> None:
+def test_stacks_of_frames_come_to_rerun(shape: tuple[int, ...], axis: int, tmp_path: Path) -> None:
     path, port = tmp_path / "r.mcap", free_port()
     screen = Sampler(spaces.Box(0, 255, shape, np.uint8), spaces.Discrete(3))
-    inner = gym.wrappers.FrameStackObservation(screen, 4)
+    stack = gym.wrappers.FrameStackObservation(screen, 4)
+    space = spaces.Box(0, 255, (*shape, 4) if axis else (4, *shape), np.uint8)
+    inner = gym.wrappers.TransformObservation(stack, lambda frames: np.moveaxis(frames, 0, axis), space)
     with receiver(port, tmp_path / "r.rrd"), RecordEpisodes(inner, path, live=url(port)) as env:
         roll(env, 100, 0.01)
     rows, tensors = shown(tmp_path / "r.rrd", "/state", "Tensor:data")

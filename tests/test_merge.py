@@ -36,6 +36,7 @@ SPACES = {
     "box": spaces.Box(-9, 9, (40,), np.float64),
     "text": spaces.Dict({"note": spaces.Text(300), "x": spaces.Discrete(5)}),
     "stack": spaces.Box(0, 255, (20, 20), np.uint8),
+    "last stack": spaces.Box(0, 255, (20, 18), np.uint8),
     "image": spaces.Dict({"see": spaces.Box(0, 255, (20, 20, 3), np.uint8), "x": spaces.Box(-1, 1, (2,))}),
 }
 
@@ -96,8 +97,11 @@ def record(
         **options,
     }
     inner: gym.Env[Any, Any] = Sampled(kind, "rgb_array")
-    if kind == "stack":  # each frame is stored once
+    if "stack" in kind:  # each frame is stored once
         inner = gym.wrappers.FrameStackObservation(inner, 3)
+    if kind == "last stack":
+        moved = spaces.Box(0, 255, (20, 18, 3), np.uint8)
+        inner = gym.wrappers.TransformObservation(inner, lambda frames: np.moveaxis(frames, 0, -1), moved)
     env = RecordEpisodes(inner, path, frames=frames, **options)
     with env:
         env.action_space.seed(seed)

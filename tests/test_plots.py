@@ -292,6 +292,23 @@ def test_pictures_of_an_episode(tmp_path: Path) -> None:
     assert pictures.averaged == 10
 
 
+@pytest.mark.parametrize("axis", [0, -1])
+@pytest.mark.parametrize("shape", [(6, 5), (6, 3), (6, 5, 3)])
+def test_the_newest_frame_of_a_stack_is_shown(tmp_path: Path, shape: tuple[int, ...], axis: int) -> None:
+    def frame(n: int) -> Any:
+        return np.full(shape, 5 * n, np.uint8)
+
+    screen = Scripted(frame, spaces.Box(0, 255, shape, np.uint8), length=10)
+    stack = gym.wrappers.FrameStackObservation(screen, 4)
+    space = spaces.Box(0, 255, (*shape, 4) if axis else (4, *shape), np.uint8)
+    moved = gym.wrappers.TransformObservation(stack, lambda frames: np.moveaxis(frames, 0, axis), space)
+    ((_, trace),) = report(record(tmp_path / "r.mcap", moved, 10)).traces
+    (pictures,) = trace.pictures
+    assert [(one.shape, int(one.flat[0])) for one in pictures.frames] == [
+        (shape, n) for n in (0, 5, 15, 25, 35, 45)
+    ]
+
+
 # --- pictures of every kind of environment ---
 
 NESTED = spaces.Dict(

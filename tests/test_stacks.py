@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
-from gymnasium.wrappers import FrameStackObservation
+from gymnasium.wrappers import FrameStackObservation, TransformObservation
 from mcap.reader import make_reader
 
-from tupli_mcap import FormatError, RecordEpisodes, Recording
+from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset
+from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.imagecodecs import StackCodec
@@ -58,6 +59,39 @@ class Screen(gym.Env[Any, Any]):
         return self._observe(), 1.0, self._t == 23, False, {}
 
 
+def frames_last(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    """As TensorFlow wants frames: along the last axis."""
+
+    def move(value: Any) -> Any:
+        return {**value, "see": move(value["see"])} if isinstance(value, dict) else np.moveaxis(value, 0, -1)
+
+    space: Any = env.observation_space
+    if isinstance(space, spaces.Dict):
+        moved: Any = spaces.Dict(
+            {**space.spaces, "see": spaces.Box(0, 255, shape_of(space["see"]), np.uint8)}
+        )
+    else:
+        moved = spaces.Box(0, 255, shape_of(space), np.uint8)
+    return TransformObservation(env, move, moved)
+
+
+def shape_of(space: Any) -> tuple[int, ...]:
+    """That of a stack of frames, with the frames last."""
+    return (*space.shape[1:], space.shape[0])
+
+
+def frames_first(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    return env
+
+
+BOTH = pytest.mark.parametrize("placed", [frames_first, frames_last])
+
+
+def named(name: str, placed: Any) -> list[Any]:
+    """What the layout says of one stack."""
+    return [[name, "last"]] if placed is frames_last else [name]
+
+
 class Odd(gym.Wrapper[Any, Any, Any, Any]):
     """Stacks that are none: now and then of other frames, skipped, repeated, or changed after they were seen."""
 
@@ -92,47 +126,57 @@ def record(env: gym.Env[Any, Any], path: Path, steps: int, **options: Any) -> tu
 
 def stored(path: Path) -> list[int]:
     """Bytes of the images, as any reader of MCAP sees them."""
+    return [len(data) for data in messages(path)]
+
+
+def messages(path: Path) -> list[bytes]:
+    """The images themselves."""
     with path.open("rb") as file:
-        return [
-            len(message.data) for _, _, message in make_reader(file).iter_messages(topics=["/image/state"])
-        ]
+        return [message.data for _, _, message in make_reader(file).iter_messages(topics=["/image/state"])]
 
 
 @pytest.mark.parametrize("shape", [(H, W), (H, W, 1), (H, W, 3)])
 @pytest.mark.parametrize("padding", ["reset", "zero"])
-def test_each_frame_is_stored_once(tmp_path: Path, shape: tuple[int, ...], padding: str) -> None:
+@BOTH
+def test_each_frame_is_stored_once(tmp_path: Path, shape: tuple[int, ...], padding: str, placed: Any) -> None:
     path = tmp_path / "r.mcap"
-    states, finals = record(FrameStackObservation(Screen(shape), 4, padding_type=padding), path, 300)
+    env = placed(FrameStackObservation(Screen(shape), 4, padding_type=padding))
+    states, finals = record(env, path, 300)
     with Recording(path) as recording:
         assert recording.metadata["format_version"] == "2"
         assert np.array_equal(recording.read().states, np.array(states))
         assert np.array_equal(recording.episodes[3].final_state, finals[3])
         assert np.array_equal(recording.episodes[3][5:9].states, np.array(states[74:78]))
-        assert recording.observation_space == spaces.Box(0, 255, (4, *shape), np.uint8)
+        assert recording.observation_space == env.observation_space
         layout = recording.layout
-        assert layout is not None and layout.stacks == ["state"]
+        assert layout is not None and layout.stacks == named("state", placed)
         chunks = len(recording._store.chunks(recording._topics["/image/state"]))
     assert verify_recording(path).ok
     frames = [size // int(np.prod(shape)) for size in stored(path)]
     episodes = 300 // 23 + 1
     assert sum(frames) <= 300 + 3 * (chunks + episodes) < 2 * 300
     assert min(frames) == 1 and max(frames) == 4
+    for data, state in zip(messages(path), states, strict=True):  # the newest frame is the lowest one
+        newest = state[..., -1] if placed is frames_last else state[-1]
+        assert data.endswith(newest.tobytes())
 
 
-def test_stacks_that_are_none_come_back_too(tmp_path: Path) -> None:
+@BOTH
+def test_stacks_that_are_none_come_back_too(tmp_path: Path, placed: Any) -> None:
     path = tmp_path / "r.mcap"
-    states, _ = record(Odd(FrameStackObservation(Screen(), 5)), path, 400)
+    states, _ = record(placed(Odd(FrameStackObservation(Screen(), 5))), path, 400)
     with Recording(path) as recording:
         assert np.array_equal(recording.read().states, np.array(states))
     assert verify_recording(path).ok
 
 
-def test_leaves_of_a_dict(tmp_path: Path) -> None:
+@BOTH
+def test_leaves_of_a_dict(tmp_path: Path, placed: Any) -> None:
     path = tmp_path / "r.mcap"
-    states, _ = record(FrameStackObservation(Screen(as_dict=True), 3), path, 60)
+    states, _ = record(placed(FrameStackObservation(Screen(as_dict=True), 3)), path, 60)
     with Recording(path) as recording:
         found = recording.read().states
-        assert recording.layout.stacks == ["state_see"]  # type: ignore[union-attr]
+        assert recording.layout.stacks == named("state_see", placed)  # type: ignore[union-attr]
     assert np.array_equal(found["see"], np.array([state["see"] for state in states]))
     assert np.array_equal(found["x"], np.array([state["x"] for state in states]))
 
@@ -171,9 +215,10 @@ def test_sub_environments_are_asked_before(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
 @pytest.mark.parametrize("stacked", [FrameStackObservation, Older])
-def test_sub_environments(tmp_path: Path, kind: Any, stacked: Any) -> None:
+@BOTH
+def test_sub_environments(tmp_path: Path, kind: Any, stacked: Any, placed: Any) -> None:
     path = tmp_path / "r.mcap"
-    env = RecordVector(kind([lambda: stacked(Screen(), 4)] * 3), path)
+    env = RecordVector(kind([lambda: placed(stacked(Screen(), 4))] * 3), path)
     taken: list[list[Array]] = [[], [], []]
     states, _ = env.reset(seed=1)
     for t in range(200):
@@ -183,7 +228,7 @@ def test_sub_environments(tmp_path: Path, kind: Any, stacked: Any) -> None:
         states = env.step(env.action_space.sample())[0]
     env.close()
     with Recording(path) as recording:
-        assert recording.layout is not None and recording.layout.stacks == ["state"]
+        assert recording.layout is not None and recording.layout.stacks == named("state", placed)
         for i in range(3):
             mine = np.concatenate([e.states for e in recording.episodes if e.env == i])
             assert np.array_equal(mine, np.array(taken[i]))
@@ -203,9 +248,10 @@ def test_frames_that_ale_stacks(tmp_path: Path) -> None:
         assert recording.episodes[1].env == 1
 
 
-def test_killed_appended_rewritten_and_repaired(tmp_path: Path) -> None:
+@BOTH
+def test_killed_appended_rewritten_and_repaired(tmp_path: Path, placed: Any) -> None:
     path, killed = tmp_path / "r.mcap", tmp_path / "killed.mcap"
-    env = RecordEpisodes(FrameStackObservation(Screen(), 4), path, chunk_size=4000)
+    env = RecordEpisodes(placed(FrameStackObservation(Screen(), 4)), path, chunk_size=4000)
     states = []
     state, _ = env.reset(seed=1)
     for t in range(100):
@@ -217,9 +263,18 @@ def test_killed_appended_rewritten_and_repaired(tmp_path: Path) -> None:
             shutil.copy(path, killed)
             shutil.copy(f"{path}.journal", f"{killed}.journal")
     env.close()
-    with Recording(killed) as recording:
-        assert np.array_equal(recording.read().states, np.array(states[:61]))
-    more, _ = record(FrameStackObservation(Screen(), 4), killed, 50, mode="a")
+    torn, mended = tmp_path / "torn.mcap", tmp_path / "mended.mcap"
+    shutil.copy(f"{killed}.journal", f"{torn}.journal")
+    torn.write_bytes(killed.read_bytes()[:-100])
+    recover_recording(torn, mended)
+    for one in (killed, mended):
+        with Recording(one) as recording:
+            assert recording.layout.stacks == named("state", placed)  # type: ignore[union-attr]
+            count = recording.num_steps
+            assert count == 61 or (one is mended and count > 40)
+            assert np.array_equal(recording.read().states, np.array(states[:61])[-count:])
+            assert np.array_equal(recording.episodes[-1].final_state, states[61])
+    more, _ = record(placed(FrameStackObservation(Screen(), 4)), killed, 50, mode="a")
     assert not Path(f"{killed}.journal").exists()
     expected = np.array(states[:61] + more)
     rewritten, repaired = tmp_path / "rewritten.mcap", tmp_path / "repaired.mcap"
@@ -277,3 +332,153 @@ def test_a_chunk_that_holds_no_stacks_is_a_format_error() -> None:
         except FormatError:
             continue
         assert len(found) == 6
+
+
+def test_the_frames_of_a_last_axis_take_no_more_room(tmp_path: Path) -> None:
+    sizes, chunks = {}, {}
+    for placed in (frames_first, frames_last):
+        path = tmp_path / f"{placed.__name__}.mcap"
+        record(placed(FrameStackObservation(Screen(), 4)), path, 500, chunk_size=20_000)
+        sizes[placed] = path.stat().st_size
+        with Recording(path) as recording:
+            chunks[placed] = len(recording._store.chunks(recording._topics["/image/state"]))
+    record(Plain(frames_last(FrameStackObservation(Screen(), 4))), tmp_path / "whole.mcap", 500)
+    assert chunks[frames_last] == chunks[frames_first] > 5
+    assert sizes[frames_last] < 1.05 * sizes[frames_first]
+    assert sizes[frames_last] < 0.5 * (tmp_path / "whole.mcap").stat().st_size
+
+
+class Plain(gym.Env[Any, Any]):
+    """Another environment, behind which no wrapper is found."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self._env = env
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self._env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        return self._env.step(action)
+
+
+@pytest.mark.parametrize("shape", [(H, W), (H, W, 3)])
+@pytest.mark.parametrize("frames", [3, 4, 7])
+@BOTH
+def test_everything_reads_as_if_it_was_stored_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, ...], frames: int, placed: Any
+) -> None:
+    stacked, whole = tmp_path / "stacked.mcap", tmp_path / "whole.mcap"
+    chunk_size = 20_000 if frames == 4 else 1 << 20
+    monkeypatch.setattr("tupli_mcap.recording.columns._MANY_ROWS", 60)
+    record(placed(FrameStackObservation(Screen(shape), frames)), stacked, 110, chunk_size=chunk_size)
+    record(Plain(placed(FrameStackObservation(Screen(shape), frames))), whole, 110, chunk_size=chunk_size)
+    with Recording(stacked) as one, Recording(whole) as other:
+        assert one.layout.stacks == named("state", placed) and not other.layout.stacks
+        assert same(one.read(threads=2).states, other.read().states)
+        assert same(
+            one.read([3, 1], fields=["next_states"]).next_states,
+            other.read([3, 1], fields=["next_states"]).next_states,
+        )
+        shuffled = [4, 2, 0, 3, 1]
+        assert same(one.read(shuffled).states, other.read(shuffled).states)
+        assert same(one.final_states([2, 0]), other.final_states([2, 0]))
+        for mine, theirs in zip(one.episodes, other.episodes, strict=True):
+            assert same(mine.states, theirs.states)
+            assert same(mine.final_state, theirs.final_state)
+            assert same(mine[1:3].states, theirs[1:3].states)
+            assert all(same(a.state, b.state) for a, b in zip(mine, theirs, strict=True))
+    datasets = [TupliDataset.from_files(path) for path in (stacked, whole)]
+    for cache_bytes in (0, 1 << 30):
+        kept, other_kept = (dataset.with_cache(cache_bytes) for dataset in datasets)
+        assert same(kept.windows(5)[:].states, other_kept.windows(5)[:].states)
+        assert same(kept.transitions()[[50, 3]].next_states, other_kept.transitions()[[50, 3]].next_states)
+    both = TupliDataset.from_files([stacked, whole])  # of two layouts
+    assert same(both.observations, np.concatenate([dataset.observations for dataset in datasets]))
+    assert same(both.steps.read(["states"], np.array([9, 119]))["states"], datasets[1].observations[[9, 9]])
+    for number, dataset in enumerate([*datasets, both]):
+        expected = dataset.observations
+        dataset.materialize(tmp_path / f"columns {number}")
+        assert same(dataset.observations, expected)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Equal in dtype, shape, order and every byte."""
+    return (one.dtype, one.shape) == (other.dtype, other.shape) and (
+        one.flags.c_contiguous,
+        one.tobytes(),
+    ) == (other.flags.c_contiguous, other.tobytes())
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "stacks"),
+    [
+        ((4, H, W), 4, ["state"]),
+        ((H, W, 4), 4, [["state", "last"]]),
+        ((H, W, 1, 4), 4, [["state", "last"]]),
+        ((4, H, 4), 4, ["state"]),
+        ((4, H, W, 4), 4, ["state"]),
+        ((5, H, 3, 5), 5, []),  # the first axis is as long, and holds no pictures
+        ((H, W, 2, 4), 4, []),
+        ((H, W, 3), 4, []),
+        ((H, W, 1), 1, []),
+        ((H, 4), 4, []),
+        ((4, 4, 257), 257, []),
+    ],
+)
+def test_what_is_a_stack(tmp_path: Path, shape: tuple[int, ...], size: int, stacks: list[Any]) -> None:
+    class Says(gym.Wrapper[Any, Any, Any, Any]):
+        def __init__(self, env: gym.Env[Any, Any]) -> None:
+            super().__init__(env)
+            self.stack_size = size
+
+    states, _ = record(Says(Screen(shape)), tmp_path / "r.mcap", 30)
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert recording.layout.stacks == stacks  # type: ignore[union-attr]
+        assert np.array_equal(recording.read().states, np.array(states))
+
+
+@pytest.mark.parametrize(
+    "stacks",
+    [
+        "state",
+        [5],
+        [["state"]],
+        [["state", "first"]],
+        [["state", "last", "last"]],
+        [["other", "last"]],
+        [["state", "last"], "state"],
+        [["state", "last"], ["state", "last"]],
+        ["state"],
+        [[np.zeros(2), "last"]],
+    ],
+)
+def test_metadata_of_no_such_stack_are_a_format_error(stacks: Any) -> None:
+    space = spaces.Box(0, 255, (300, 2, 3), np.uint8)
+    metadata = StepLayout(space, spaces.Discrete(2), stacks=[["state", "last"]]).to_metadata()
+    assert StepLayout.from_metadata(metadata).stacks == [["state", "last"]]
+    with pytest.raises(FormatError):
+        StepLayout.from_metadata({**metadata, "stacks": jsonvalue.dumps(stacks)})
+
+
+@pytest.mark.parametrize("mode", gym.vector.AutoresetMode)
+def test_final_states_of_sub_environments(tmp_path: Path, mode: Any) -> None:
+    path = tmp_path / "r.mcap"
+    finals: list[list[Array]] = [[], []]
+    with RecordVector(
+        SyncVectorEnv([lambda: frames_last(FrameStackObservation(Screen(), 4))] * 2, autoreset_mode=mode),
+        path,
+    ) as env:
+        env.reset(seed=1)
+        for _ in range(100):
+            states, _, terminals, _, infos = env.step(env.action_space.sample())
+            seen = infos.get("final_obs", states)
+            for i in np.flatnonzero(terminals):
+                finals[i].append(seen[i].copy())
+            if mode is gym.vector.AutoresetMode.DISABLED and terminals.any():
+                env.reset(options={"reset_mask": terminals})
+    with Recording(path) as recording:
+        for i in range(2):
+            mine = [e.final_state for e in recording.episodes if e.env == i and e.end == "terminal"]
+            assert len(mine) == len(finals[i]) > 3
+            assert all(map(same, mine, map(np.ascontiguousarray, finals[i])))

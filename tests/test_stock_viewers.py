@@ -193,6 +193,7 @@ class Told:
                 assert np.array_equal(np.asarray(picture).reshape(image.shape), image)
             return
         if leaf.kind == "stack":  # the newest frames, one below the other
+            image = np.moveaxis(image, -1 if leaf.frames_last else 0, 0)
             frames = fields["height"] // image.shape[1]
             image = image[-frames:].reshape(fields["height"], *image.shape[2:], 1)
         assert (fields["height"], fields["width"]) == image.shape[:2]

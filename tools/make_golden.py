@@ -25,7 +25,7 @@ import gymnasium as gym
 import numpy as np
 import zstandard
 from gymnasium import spaces
-from gymnasium.wrappers import FrameStackObservation
+from gymnasium.wrappers import FrameStackObservation, TransformObservation
 
 from tupli_mcap import RecordEpisodes
 from tupli_mcap import vector as recorded_vector
@@ -202,18 +202,22 @@ def constant(path: Path, compression: str) -> list[Log]:
     return episodes
 
 
-def stacked(path: Path) -> list[Log]:
+def stacked(path: Path, axis: int = 0) -> list[Log]:
     def observe(episode: int, t: int) -> Any:
         return np.arange(6, dtype=np.uint8).reshape(2, 3) + np.uint8(40 * episode + 7 * t)
 
     env = Played(spaces.Box(0, 255, (2, 3), np.uint8), observe, ENDS)
-    window = FrameStackObservation(env, 3)
+    window: gym.Env[Any, Any] = FrameStackObservation(env, 3)
+    if axis:
+        window = TransformObservation(
+            window, lambda frames: np.moveaxis(frames, 0, axis), spaces.Box(0, 255, (2, 3, 3), np.uint8)
+        )
     with RecordEpisodes(window, path, compression="none", attachments={}, chunk_size=400) as recorder:
         roll(recorder, env, [3, 4, 2], action)
     episodes = expected(env)
     for episode in episodes:
         frames = [episode["states"][0]] * 2 + [*episode["states"], episode["final_state"]]
-        windows = [np.stack(frames[i : i + 3]) for i in range(len(frames) - 2)]
+        windows = [np.stack(frames[i : i + 3], axis) for i in range(len(frames) - 2)]
         *episode["states"], episode["final_state"] = windows
     return episodes
 
@@ -525,6 +529,7 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "stacked": stacked,
     "png_images": png_images,
     "unfinished_holes": unfinished_holes,
+    "stacked_last": lambda path: stacked(path, -1),
 }
 
 

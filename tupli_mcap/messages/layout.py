@@ -133,9 +133,10 @@ class ImageLayout(NamedTuple):
 
 
 def image_layout(leaf: Leaf) -> ImageLayout:
-    """The layout of an image leaf's messages; field `data` has the leaf's shape, `sec`/`nanosec` its stamp."""
-    frames = leaf.shape[0] if leaf.kind == "stack" else 1  # one picture below the other
-    height, width, channels = (*leaf.shape[1:], 1)[:3] if leaf.kind == "stack" else leaf.shape
+    """The layout of an image leaf's messages; field `data` has its stored shape, `sec`/`nanosec` its stamp."""
+    shape = leaf.stored_shape
+    frames = shape[0] if leaf.kind == "stack" else 1  # one picture below the other
+    height, width, channels = (*shape[1:], 1)[:3] if leaf.kind == "stack" else shape
     height *= frames
     encoding = {1: b"mono8", 3: b"rgb8", 4: b"rgba8"}[channels]
     body = bytearray(8)
@@ -153,6 +154,6 @@ def image_layout(leaf: Leaf) -> ImageLayout:
         Field("sec", np.dtype(np.int32), (), 0),
         Field("nanosec", np.dtype(np.uint32), (), 4),
         Field("fixed", u1, (len(body) - 8,), 8),
-        Field("data", u1, leaf.shape, len(body)),
+        Field("data", u1, shape, len(body)),
     ]
     return ImageLayout(record_dtype(fields, len(body) + leaf.size), bytes(body))

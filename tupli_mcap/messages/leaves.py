@@ -56,7 +56,8 @@ class Leaf:
     """One value of a space.
 
     `keys` leads to it from the root value, `path` says so for people (`state['pos'][1]`), `name` is its ROS field.
-    `dtype` and `shape` are the declared ones of a constant leaf; a variable leaf has `dtype` None.
+    `dtype` and `shape` are the declared ones of a constant leaf; a variable leaf has `dtype` None. `frames_last`: the
+    last axis of a stack holds its frames, not the first one.
     """
 
     keys: tuple[Any, ...]
@@ -66,6 +67,7 @@ class Leaf:
     kind: Literal["array", "scalar", "image", "stack", "variable"]
     dtype: DType | None
     shape: tuple[int, ...]
+    frames_last: bool = False
 
     @property
     def size(self) -> int:
@@ -81,6 +83,15 @@ class Leaf:
     def is_scalar(self) -> bool:
         """True where Gymnasium's own samples are scalars: a Discrete, and a Box of shape () of integers or bools."""
         return self.shape == () and self.dtype is not None and self.dtype.kind in "iub"
+
+    @property
+    def stored_shape(self) -> tuple[int, ...]:
+        """The shape of one value in the rows of its channel, where the frames of a stack come first."""
+        return (self.shape[-1], *self.shape[:-1]) if self.frames_last else self.shape
+
+    def as_values(self, stored: Any) -> Any:
+        """The view of an array of `stored_shape`, or of more such in one, that has the shape of values."""
+        return np.moveaxis(stored, -len(self.shape), -1) if self.frames_last else stored
 
     def get(self, value: Any) -> Any:
         """The leaf's value inside a value of the whole space."""

@@ -28,11 +28,12 @@ from tupli_mcap.messages.leaves import ROS_TYPES, DType, Leaf, NameRegistry, fla
 from tupli_mcap.messages.spaces import space_from_json, space_to_json
 from tupli_mcap.messages.variable import VariableField
 
-__all__ = ["FINAL_STATE_SCHEMA", "STEP_SCHEMA", "StepLayout", "can_stack"]
+__all__ = ["FINAL_STATE_SCHEMA", "STEP_SCHEMA", "Stack", "StepLayout", "can_stack", "stack_of"]
 
 STEP_SCHEMA = "tupli_mcap/msg/Step"
 FINAL_STATE_SCHEMA = "tupli_mcap/msg/FinalState"
 MAX_FRAMES = 256  # of a stack: what a row takes in memory is at most so many times what it takes in the file
+Stack = str | list[str]  # `name`, or `[name, "last"]`
 _RESERVED = ("episode", "step", "terminal", "timeout", "env")
 _U32, _BOOL = np.dtype(np.uint32), np.dtype(np.bool_)
 
@@ -42,7 +43,8 @@ class StepLayout:
 
     `dtypes` maps a constant leaf's ROS name to its stored dtype; leaves not named keep the declared one. `inner_dtypes`
     does the same inside leaves of variable size: ROS name -> path in the leaf -> dtype name. `stacks` names leaves
-    whose first axis are the frames of a sliding window; one whose values are not uint8 is an array like any other.
+    whose first axis are the frames of a sliding window, or as `[name, "last"]` the last one; one whose values are not
+    uint8 is an array like any other.
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
@@ -55,7 +57,7 @@ class StepLayout:
         reward_space: gym.Space[Any] | None = None,
         dtypes: Mapping[str, DType] | None = None,
         inner_dtypes: Mapping[str, Mapping[str, str]] | None = None,
-        stacks: Collection[str] = (),
+        stacks: Collection[Stack] = (),
     ) -> None:
         self.inner_dtypes = {name: dict(found) for name, found in (inner_dtypes or {}).items() if found}
         self.observation_space = observation_space
@@ -82,10 +84,9 @@ class StepLayout:
             for leaf in self.state
         ]
         self.state = [
-            _as_stack(leaf) if leaf.name in stacks and self.dtypes.get(leaf.name) == np.uint8 else leaf
-            for leaf in self.state
+            _as_stack(leaf, stacks) if self.dtypes.get(leaf.name) == np.uint8 else leaf for leaf in self.state
         ]
-        self.stacks = [leaf.name for leaf in self.state if leaf.kind == "stack"]
+        self.stacks = [stack_of(leaf) for leaf in self.state if leaf.kind == "stack"]
         self.nest_state = structure(observation_space)
         self.nest_action = structure(action_space)
         self.nest_reward = structure(reward)
@@ -221,9 +222,10 @@ class StepLayout:
                 f"channel metadata 'inner_dtypes': expected paths with dtypes, found {inner!r:.200}"
             )
         stacks = jsonvalue.loads(metadata.get("stacks", "[]"))
-        if not isinstance(stacks, list) or not all(isinstance(name, str) for name in stacks):
+        if not isinstance(stacks, list) or not all(map(_is_stack, stacks)):
             raise FormatError(
-                f"channel metadata 'stacks': expected a list of ROS names, found {stacks!r:.200}"
+                f"channel metadata 'stacks': expected a list of ROS names, each alone or in [name, 'last'], "
+                f"found {stacks!r:.200}"
             )
         try:
             layout = cls(
@@ -245,18 +247,35 @@ class StepLayout:
 
 
 def can_stack(leaf: Leaf) -> bool:
-    """Whether a leaf may be a stack of frames: uint8 of shape (frames, H, W) or (frames, H, W, 1|3|4)."""
-    pictures = len(leaf.shape) == 3 or (len(leaf.shape) == 4 and leaf.shape[3] in (1, 3, 4))
-    return leaf.dtype == np.uint8 and pictures and 0 not in leaf.shape and 2 <= leaf.shape[0] <= MAX_FRAMES
+    """Whether a leaf may be a stack of frames: uint8 of stored shape (frames, H, W) or (frames, H, W, 1|3|4)."""
+    if leaf.dtype != np.uint8 or len(leaf.shape) not in (3, 4) or 0 in leaf.shape:
+        return False
+    frames, *picture = leaf.stored_shape
+    return 2 <= frames <= MAX_FRAMES and (len(picture) == 2 or picture[2] in (1, 3, 4))
 
 
-def _as_stack(leaf: Leaf) -> Leaf:
-    if not can_stack(leaf):
+def stack_of(leaf: Leaf) -> Stack:
+    """What `stacks` say of a stack."""
+    return [leaf.name, "last"] if leaf.frames_last else leaf.name
+
+
+def _is_stack(entry: Any) -> bool:
+    if isinstance(entry, list):
+        return len(entry) == 2 and all(isinstance(part, str) for part in entry) and entry[1] == "last"
+    return isinstance(entry, str)
+
+
+def _as_stack(leaf: Leaf, stacks: Collection[Stack]) -> Leaf:
+    """The leaf as the stack that `stacks` say it is, if any."""
+    found = replace(leaf, kind="stack", frames_last=leaf.name not in stacks)
+    if stack_of(found) not in stacks:
+        return leaf
+    if not can_stack(found):
         raise SpaceError(
-            f"{leaf.path}: expected uint8 frames of shape (2 to {MAX_FRAMES}, H, W) or (…, H, W, 1, 3 or 4) "
-            f"as a stack, found {leaf.space}"
+            f"{leaf.path}: expected 2 to {MAX_FRAMES} uint8 frames of shape (H, W) or (H, W, 1, 3 or 4) "
+            f"along the {'last' if found.frames_last else 'first'} axis of a stack, found {leaf.space}"
         )
-    return replace(leaf, kind="stack")
+    return found
 
 
 def _entry(metadata: Mapping[str, str], key: str) -> str:

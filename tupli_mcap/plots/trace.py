@@ -132,7 +132,7 @@ def _pictures(recording: Recording, position: int, length: int, leaves: list[Lea
     for step in sorted({*shown, *averaged}):
         states = recording.read_steps(position, step, step + 1, ("states",)).states
         for pictures in found:
-            frame = _picture(pictures.leaf.get(states)[0])
+            frame = _picture(pictures.leaf, pictures.leaf.get(states)[0])
             if step in shown:
                 pictures.frames.append(frame)
             if step in averaged:
@@ -142,10 +142,10 @@ def _pictures(recording: Recording, position: int, length: int, leaves: list[Lea
     return found
 
 
-def _picture(value: Array) -> Array:
+def _picture(leaf: Leaf, value: Array) -> Array:
     """H x W or H x W x 3|4: the last of a stack; one channel becomes none."""
-    if value.ndim == 4:
-        value = value[-1]
+    if leaf.kind == "stack":
+        value = value[..., -1] if leaf.frames_last else value[-1]
     if value.ndim == 3 and value.shape[2] in (3, 4):
         return value
     if value.ndim == 3 and value.shape[2] == 1:

@@ -148,7 +148,7 @@ def plan_areas(
     for leaf in layout.images:
         row = layout.image_messages[leaf.name].dtype.itemsize
         # of a stack, most rows store one frame
-        stored = row // leaf.shape[0] if leaf.kind == "stack" else row
+        stored = row // leaf.stored_shape[0] if leaf.kind == "stack" else row
         # some images a chunk, within 2 MiB
         rows = rows_per_half(stored, max(size, min(16 * stored, 2 << 20)))
         rows = max(1, min(rows, _HALF // row))

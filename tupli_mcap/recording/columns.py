@@ -101,9 +101,8 @@ class ColumnReader:
         for leaf in leaves:
             if leaf.apart and leaf.name not in skipped:
                 moved = runs._replace(channels=self._image_channels(leaf.name, runs.channels))
-                tasks += self._tasks(
-                    moved, ["data"], {"data": out[leaf.name]}, layout.image_messages[leaf.name].dtype, keep
-                )
+                dtype = layout.image_messages[leaf.name].dtype
+                tasks += self._tasks(moved, ["data"], {"data": out[leaf.name]}, dtype, keep, leaf)
         do_all(tasks, threads)
         nest = {"states": layout.nest_state, "actions": layout.nest_action, "rewards": layout.nest_reward}
         columns = {
@@ -131,15 +130,25 @@ class ColumnReader:
         return images
 
     def _tasks(
-        self, runs: Runs, names: Sequence[str], out: Mapping[str, Any], dtype: Any, keep: bool
+        self,
+        runs: Runs,
+        names: Sequence[str],
+        out: Mapping[str, Any],
+        dtype: Any,
+        keep: bool,
+        image: Leaf | None = None,
     ) -> list[Callable[[], None]]:
         targets = [(name, out[name]) for name in names]
-        if len(targets[0][1]) >= _MANY_ROWS:
+        turned = image is not None and image.frames_last
+        if len(targets[0][1]) >= _MANY_ROWS and not turned:
             targets = [(name, items(column)) for name, column in targets]
             dtype = items_dtype(dtype)
 
         def copy(pieces: Pieces) -> None:
-            pieces.copy(self._store.rows(pieces.chunk, dtype, keep=keep), targets)
+            rows: Any = self._store.rows(pieces.chunk, dtype, keep=keep)
+            if image is not None and turned:
+                rows = {"data": image.as_values(rows["data"])}
+            pieces.copy(rows, targets)
 
         return [partial(copy, pieces) for pieces in Pieces.of(runs, self._store)]
 

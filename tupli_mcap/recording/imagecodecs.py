@@ -92,13 +92,10 @@ class StackCodec:
 
     def __init__(self, leaf: Leaf, layout: ImageLayout) -> None:
         self._dtype = layout.dtype
-        self._frames = leaf.shape[0]
-        self._height = leaf.shape[1]
+        self._frames, self._height, width = leaf.stored_shape[:3]
         self._frame_bytes = leaf.size // self._frames
         self._start = layout.dtype.itemsize - leaf.size  # of the pixels in a record
-        self._height_at = BODY + layout.body.index(
-            _HEIGHT_WIDTH.pack(self._frames * self._height, leaf.shape[2]), 8
-        )
+        self._height_at = BODY + layout.body.index(_HEIGHT_WIDTH.pack(self._frames * self._height, width), 8)
 
     def _windows(self, data: Any, count: int) -> Array:
         """The frames of each row, as bytes: (count, frames, bytes of a frame)."""

@@ -321,4 +321,4 @@ def _salvage_images(
         if pending is None or found.counts.get(channel, 0) > steps:
             tail.pending.pop(env, None)
         elif env in tail.pending:
-            tail.pending[env] += pending["data"].tobytes()
+            tail.pending[env] += leaf.as_values(pending["data"]).tobytes()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import FRAMES_AREA
 from tupli_mcap.recording.contents import step_channels
@@ -105,9 +106,8 @@ def _merge(gathered: Gathered, journal: JournalContents) -> None:
                 area = journal.areas.get(f"{leaf.name}/{env}")
                 if not isinstance(area, RowArea):
                     raise FormatError(f"the journal has no rows '{leaf.name}/{env}'")
-                pending = _add_images(
-                    gathered, Salvage(journal, area, 0, dtype, image, rewritten=True), image, stop
-                )
+                salvage = Salvage(journal, area, 0, dtype, image, rewritten=True)
+                pending = _add_images(gathered, salvage, leaf, image, stop)
             state = None if state is None or pending is None else state + pending
         if state is not None:
             gathered.states[env] = state
@@ -202,12 +202,12 @@ def _row_before(gathered: Gathered, channel: int, first: int, dtype: np.dtype[An
     return -1, -1, 0
 
 
-def _add_images(gathered: Gathered, salvage: Salvage, channel: int, stop: int) -> bytes | None:
+def _add_images(gathered: Gathered, salvage: Salvage, leaf: Leaf, channel: int, stop: int) -> bytes | None:
     """Takes the images of steps before `stop`; returns the running state's."""
     for low, high in _missing(gathered, channel):
         for rows in salvage.runs(low, min(high, stop)):
             rows["#publish_time"] = rows["#log_time"]
             _add(gathered, channel, int(rows["#sequence"][0]), len(rows), rows.view(np.uint8).tobytes())
     running = salvage.row(stop)
-    data: bytes | None = None if running is None else running["data"].tobytes()
+    data: bytes | None = None if running is None else leaf.as_values(running["data"]).tobytes()
     return data

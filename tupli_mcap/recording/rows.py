@@ -321,7 +321,7 @@ class ImageRows:
         for name in ("#opcode", "#length", "#channel", "#cdr"):
             self._rows[name] = template[name]
         self._rows["#sequence"] = HOLE  # zeros would look like the first row as soon as a time is written
-        self._data: Array = self._rows["data"]
+        self._data: Array = self._leaf.as_values(self._rows["data"])
         self._times: Array = self._rows["#log_time"]
         self._offsets = np.arange(area.rows, dtype=np.uint64) * np.uint64(area.row_size)
         if running is not None:

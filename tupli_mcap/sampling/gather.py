@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.pieces import items, items_dtype
 from tupli_mcap.recording.together import do_all
@@ -44,11 +45,20 @@ class Column(NamedTuple):
 
 
 class RowFormat(NamedTuple):
-    """How a file holds the rows: the dtype of a Message record, and the field of each column in it."""
+    """How a file holds the rows: the dtype of a Message record, and the field of each column in it.
+
+    `turned`: the image leaf whose frames lie first in these rows, and last in its values; None for all others.
+    """
 
     store: ChunkStore
     dtype: np.dtype[Any]
     fields: dict[str, str]
+    turned: Leaf | None = None
+
+    def values(self, rows: Array, column: str) -> Array:
+        """A column of rows of this dtype."""
+        found: Array = rows[self.fields.get(column, column)]
+        return found if self.turned is None else self.turned.as_values(found)
 
 
 class Rows(Protocol):
@@ -123,10 +133,9 @@ class ConstantRows:
 
     def _copy(self, piece: Piece, names: Sequence[str], out: dict[str, Any]) -> None:
         source = self._formats[int(self.segments.file_of[piece.unit])]
-        fields = source.fields
         chunk = source.store.rows(int(self.segments.chunk_of[piece.unit]), source.dtype)
         for name in names:
-            out[name][piece.out] = _shaped(chunk[fields.get(name, name)][piece.rows], out[name])
+            out[name][piece.out] = _shaped(source.values(chunk, name)[piece.rows], out[name])
 
     def _fill(self, held: _HeldColumns, rows: Array, threads: int) -> None:
         missing = held.missing(rows)
@@ -145,7 +154,7 @@ class ConstantRows:
         file, chunk = int(self.segments.file_of[unit]), int(self.segments.chunk_of[unit])
         source, as_items = self._formats[file], self._items[file]
         rows = source.store.rows(chunk, source.dtype if as_items is None else as_items, keep=False)
-        held.put(unit, rows, source.fields, as_items=as_items is not None)
+        held.put(unit, rows, source, as_items=as_items is not None)
 
 
 class _HeldColumns:
@@ -167,19 +176,19 @@ class _HeldColumns:
         wanted[self._segments.units[self._segments.of(rows)]] = True
         return np.flatnonzero(wanted & ~self.there).tolist()
 
-    def put(self, unit: int, chunk: Array, fields: dict[str, str], *, as_items: bool) -> None:
+    def put(self, unit: int, chunk: Array, source: RowFormat, *, as_items: bool) -> None:
         """Copies the rows of a chunk, or these as items, to where they belong."""
         chosen = self._order[self._ends[unit] : self._ends[unit + 1]]
         begins, starts = self._segments.begins[chosen], self._segments.starts[chosen]
         lengths = np.append(self._segments.starts[1:], self._segments.total)[chosen] - starts
         if len(chosen) == 1:
-            source: Any = slice(begins[0], begins[0] + lengths[0])
+            which: Any = slice(begins[0], begins[0] + lengths[0])
             place: Any = slice(starts[0], starts[0] + lengths[0])
         else:
             within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-            source, place = np.repeat(begins, lengths) + within, np.repeat(starts, lengths) + within
+            which, place = np.repeat(begins, lengths) + within, np.repeat(starts, lengths) + within
         for name, target in self._items.items():
-            values = chunk[fields.get(name, name)][source]
+            values = source.values(chunk, name)[which]
             if as_items:
                 target[place] = values
             else:
@@ -231,7 +240,10 @@ class DecodedRows:
 
 
 def _items_of(source: RowFormat, columns: Mapping[str, Column]) -> np.dtype[Any] | None:
-    """The dtype of the rows as items, which are copied faster; None where columns hold the values in another dtype."""
+    """The dtype of the rows as items, which are copied faster; None where columns hold the values in another dtype, or
+    in another order."""
+    if source.turned is not None:
+        return None
     fields: Mapping[str, Any] = source.dtype.fields or {}
     own = {source.fields.get(name, name): column.dtype for name, column in columns.items()}
     # there is no field for an array of no elements

@@ -20,6 +20,7 @@ __all__ = ["EPISODE", "final_rows", "image_rows", "step_rows"]
 EPISODE = "episode"  # the column of the number that a final state says its episode has
 _BOOL, _U32, _U64 = np.dtype(np.bool_), np.dtype(np.uint32), np.dtype(np.uint64)
 Decode = Callable[[memoryview], dict[str, Any]]
+_Format = tuple[Any, dict[str, str], Leaf | None]
 
 
 def step_rows(index: StepIndex) -> Rows:
@@ -30,7 +31,7 @@ def step_rows(index: StepIndex) -> Rows:
     if not index.layouts[0].constant:
         return _decoded(index, lambda layout: MessageDecoder(layout).step, columns, index.steps)
     return _constant(
-        index, lambda layout: (layout.step_message.dtype, _fields(index, layout)), columns, index.steps
+        index, lambda layout: (layout.step_message.dtype, _fields(index, layout), None), columns, index.steps
     )
 
 
@@ -38,11 +39,12 @@ def image_rows(index: StepIndex, name: str) -> Rows:
     """A leaf of the state (ROS name in the first layout) that is an image in one of the layouts."""
     (leaf,) = (leaf for leaf in index.layouts[0].state if leaf.name == name)
 
-    def of_layout(layout: StepLayout) -> tuple[Any, dict[str, str]]:
+    def of_layout(layout: StepLayout) -> _Format:
         own = _fields(index, layout)[name]
         if own in layout.image_messages:
-            return layout.image_messages[own].dtype, {name: "data"}
-        return layout.step_message.dtype, {name: own}
+            turned = next((one for one in layout.images if one.name == own and one.frames_last), None)
+            return layout.image_messages[own].dtype, {name: "data"}, turned
+        return layout.step_message.dtype, {name: own}, None
 
     return _constant(index, of_layout, {name: _column(index, leaf)}, index.images[name])
 
@@ -65,7 +67,10 @@ def final_rows(index: StepIndex) -> Rows:
     if not index.layouts[0].constant:
         return _decoded(index, decode, columns, index.finals)
     return _constant(
-        index, lambda layout: (layout.final_message.dtype, _fields(index, layout)), columns, index.finals
+        index,
+        lambda layout: (layout.final_message.dtype, _fields(index, layout), None),
+        columns,
+        index.finals,
     )
 
 
@@ -88,11 +93,11 @@ def _fields(index: StepIndex, layout: StepLayout) -> dict[str, str]:
 
 def _constant(
     index: StepIndex,
-    of_layout: Callable[[StepLayout], tuple[Any, dict[str, str]]],
+    of_layout: Callable[[StepLayout], _Format],
     columns: dict[str, Column],
     segments: Segments,
 ) -> Rows:
-    """Rows of constant size; `of_layout` gives the dtype of a record, and the field of a column."""
+    """Rows of constant size; `of_layout` gives what a `RowFormat` has beside the store."""
     found = [of_layout(layout) for layout in index.layouts]
     files = zip(index.stores, index.layout_of, strict=True)
     return ConstantRows(segments, [RowFormat(store, *found[i]) for store, i in files], columns)

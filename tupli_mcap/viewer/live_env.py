@@ -187,7 +187,7 @@ class LiveEnv:
             for panel in self._panels:
                 if found and getattr(panel, "leaf", None) is leaf:
                     rows = np.array(sorted(found))
-                    images = np.stack([found[row]["data"] for row in rows.tolist()])
+                    images = np.stack([leaf.as_values(found[row]["data"]) for row in rows.tolist()])
                     rows += self._shift
                     times = steps.times[rows - steps.first]
                     part: Any = _Columns(self._nested(leaf, images), None, None)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 
-from tupli_mcap.messages.step import StepLayout, can_stack
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import Stack, StepLayout, can_stack, stack_of
 from tupli_mcap.recording.pictures import ImageFormat
 
 __all__ = ["format_version", "with_stacks"]
@@ -16,17 +18,26 @@ _SIZES = ("stack_size", "num_stack")  # of FrameStackObservation, and of Gymnasi
 
 
 def with_stacks(env: Any, spaces: StepLayout) -> StepLayout:
-    """`spaces`, with the leaves that a wrapper around `env` stacks: the first axis is as long as an attribute
-    `stack_size` or `num_stack` of it says.
+    """`spaces`, with the leaves that a wrapper around `env` stacks: the first axis, or else the last one, is as long as
+    an attribute `stack_size` or `num_stack` of it says.
 
     A wrapper outside of it may change what it gives: then, too, what is stored is what the environment returned.
     """
-    frames = [leaf for leaf in spaces.state if can_stack(leaf)]
-    sizes = _sizes(env) if frames else set()
-    stacks = [leaf.name for leaf in frames if leaf.shape[0] in sizes]
+    leaves = [leaf for leaf in spaces.state if any(map(can_stack, _both(leaf)))]
+    sizes = _sizes(env) if leaves else set()
+    stacks: list[Stack] = []
+    for leaf in leaves:
+        found = next((one for one in _both(leaf) if one.stored_shape[0] in sizes), None)
+        if found is not None and can_stack(found):
+            stacks.append(stack_of(found))
     if not stacks:
         return spaces
     return StepLayout(spaces.observation_space, spaces.action_space, spaces.reward_space, stacks=stacks)
+
+
+def _both(leaf: Leaf) -> tuple[Leaf, Leaf]:
+    """The leaf with its frames along the first axis, and along the last one."""
+    return leaf, replace(leaf, frames_last=True)
 
 
 def _sizes(env: Any) -> set[Any]:
