@@ -38,7 +38,7 @@ class Kind:
     plain: bool = False  # states of one value each, for they are large
     rotates: bool = False  # goes on in other files
     silent: bool = False  # a reset tells nothing, so that rows tell of episodes
-    window: bool = False  # states are the newest frames, the oldest first
+    window: int | None = None  # the axis of states that holds the newest frames, the oldest first
     large: int = 0  # every episode's texts are longer than the last one's, up to here
 
 
@@ -83,7 +83,10 @@ KINDS = {
         (300, 60_000),
         threaded=True,
     ),
-    "stacked": Kind(spaces.Box(0, 255, (4, 90, 70), np.uint8), (20_000, 60_000), threaded=True, window=True),
+    "stacked": Kind(spaces.Box(0, 255, (4, 90, 70), np.uint8), (20_000, 60_000), threaded=True, window=0),
+    "stacked last": Kind(
+        spaces.Box(0, 255, (90, 70, 3), np.uint8), (20_000, 60_000), threaded=True, window=-1
+    ),
     "png": Kind(_IMAGE, (700, 2000, 20_000), options={"image_format": "png"}),
     "png frames": Kind(
         spaces.Box(0, 255, (80, 80, 3), np.uint8),
@@ -187,10 +190,11 @@ class Teller(gym.Env[Any, Any]):
             space = self.observation_space
             return np.full(space.shape, self._random.integers(256), space.dtype)
         state = self.observation_space.sample()
-        if self._kind.window and self._steps and self._random.integers(9):  # now and then it breaks off
-            state[:-1] = self._kept[1:]
-        if self._kind.window:
-            self._kept = state
+        if self._kind.window is not None:
+            frames = np.moveaxis(state, self._kind.window, 0)
+            if self._steps and self._random.integers(9):  # now and then it breaks off
+                frames[:-1] = self._kept[1:]
+            self._kept = frames
         if not self._kind.reuse:
             return state
         if self._kept is None:
@@ -206,9 +210,9 @@ class Teller(gym.Env[Any, Any]):
 class Stacked(FrameStackObservation):
     """Says that the environment stacks frames, which it does itself."""
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], axis: int) -> None:
         gym.Wrapper.__init__(self, env)
-        self.stack_size = env.observation_space.shape[0]  # type: ignore[index, misc]
+        self.stack_size = env.observation_space.shape[axis]  # type: ignore[index, misc]
 
     def reset(self, **kwargs: Any) -> Any:
         return self.env.reset(**kwargs)
@@ -231,8 +235,8 @@ def open_recorder(
         options["journal_dir"] = path.parent / "journals"
     if kind.reward is not None:
         options["reward_space"] = kind.reward
-    if kind.window:
-        return RecordEpisodes(Stacked(Teller(kind, 0, seed, tell)), path, **options)
+    if kind.window is not None:
+        return RecordEpisodes(Stacked(Teller(kind, 0, seed, tell), kind.window), path, **options)
     if kind.vector is None:
         return RecordEpisodes(Teller(kind, 0, seed, tell), path, **options)
     makers = [lambda i=i: Teller(kind, i, seed, tell) for i in range(SUB_ENVIRONMENTS)]
