@@ -320,6 +320,18 @@ def test_a_dimension_of_one_value_is_as_declared(tmp_path: Path) -> None:
     assert examine(path).of("constant-dimension") == ()
 
 
+@pytest.mark.parametrize("axis", [0, -1])
+def test_a_background_of_stacked_frames_is_no_defect(tmp_path: Path, axis: int) -> None:
+    def observe(n: int) -> Any:
+        return np.uint8([[0, 1], [2, n]])
+
+    screen = Scripted(observe, spaces.Box(0, 255, (2, 2), np.uint8), length=50)
+    stack = gym.wrappers.FrameStackObservation(screen, 4)
+    space = spaces.Box(0, 255, (2, 2, 4) if axis else (4, 2, 2), np.uint8)
+    moved = gym.wrappers.TransformObservation(stack, lambda frames: np.moveaxis(frames, 0, axis), space)
+    assert examine(record(tmp_path / "a.mcap", moved, 150)).of("constant-dimension") == ()
+
+
 @pytest.mark.parametrize("block_bytes", [1, 700, 8 << 20], ids=["single steps", "parts", "whole"])
 def test_frozen_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int) -> None:
     space = spaces.Box(0, 255, (2, 2, 3), np.uint8)

@@ -47,11 +47,11 @@ def _constant(chart: Chart, array: ArrayValues) -> Iterator[Finding]:
     constant = array.constant & (array.low < array.high)
     count = int(constant.sum())
     whole = count == leaf.size
-    if array.least is None or not count or (leaf.kind == "image" and not whole):
+    if array.least is None or not count or (leaf.apart and not whole):
         return  # a background is no defect
     seen, value = f"{array.seen:,}", f"{array.least[constant][0]:g}"
     advice = "guard against a standard deviation of 0 when normalising, or leave it out"
-    if leaf.kind == "image":
+    if leaf.apart:
         message, advice = f"all {seen} frames are the same", "look whether the camera works"
     elif whole:
         what = f"is always {value}" if count == 1 else "never changes"
