@@ -440,6 +440,56 @@ class TestLook:
         assert f"return       {said}\n" in ok("info", "r.mcap")
         assert run("info", "r.mcap", "--json").json["returns"]["nan"] == returns.count(math.nan)
 
+    @pytest.mark.parametrize(
+        ("returns", "told", "row", "mean"),
+        [
+            (
+                [2.0, math.nan, 4.0],
+                "mean return 3 (NaN in 1 episode, left out)",
+                "3 3 3 {} complete NaN in 1 episode, left out",
+                3,
+            ),
+            (
+                [math.nan, math.nan],
+                "return NaN in every episode",
+                "2 2 {} complete NaN in every episode",
+                {"$float": "nan"},
+            ),
+            ([2.0, 4.0], "mean return 3", "2 2 3 {} complete", 3),
+        ],
+    )
+    def test_means_of_returns_that_are_no_numbers(
+        self,
+        here: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        returns: list[float],
+        told: str,
+        row: str,
+        mean: object,
+    ) -> None:
+        rewards = iter(returns * 2)
+
+        def make(**_: Any) -> gym.Env[Any, Any]:
+            env = gym.wrappers.TimeLimit(gym.make("CartPole-v1"), 1)
+            return gym.wrappers.TransformReward(env, lambda _: next(rewards))
+
+        gym.register("tests/Rewarded-v0", make, disable_env_checker=True)
+        try:
+            said = ok("record", "tests/Rewarded-v0", "-o", "r.mcap", "--steps", len(returns))
+            as_json = run(
+                "record", "tests/Rewarded-v0", "-o", "s.mcap", "--steps", len(returns), "--json"
+            ).json
+        finally:
+            gym.registry.pop("tests/Rewarded-v0")
+        assert f"{len(returns)} steps, {told}, " in said
+        size = bytes_of(Path("r.mcap").stat().st_size)
+        assert " ".join(ok("ls", "r.mcap").splitlines()[1].split()) == f"r.mcap {row.format(size)}"
+        monkeypatch.setenv("COLUMNS", "60")
+        assert ok("ls", "r.mcap").splitlines()[1].startswith("r.mcap ")  # the note is what is cut
+        (listed,) = run("ls", "r.mcap", "--json").json
+        for facts in (as_json, listed):
+            assert (facts["return_mean"], facts["return_nan"]) == (mean, sum(map(math.isnan, returns)))
+
     def test_info_of_an_empty_recording(self, here: Path) -> None:
         spaces = gym.make("CartPole-v1")
         write_recording(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 from enum import StrEnum
@@ -150,10 +149,17 @@ def _record(
         paths = [str(path) for path in summary.paths]
         print_json({**summary._asdict(), "path": str(summary.path), "paths": paths})
         return
+    from tupli_mcap.recording.describe import nan_text
+
     last = "" if len(summary.paths) == 1 else f" to {summary.path.name}"
+    odd = nan_text(summary.return_nan, summary.episodes)
+    if summary.return_nan == summary.episodes:
+        mean = f"return {odd}"
+    else:
+        mean = f"mean return {number(summary.return_mean)}{f' ({odd})' if odd else ''}"
     print(
         f"{summary.paths[0]}{last}: {counted(summary.episodes, 'episode')}, {counted(summary.steps, 'step')}, "
-        f"mean return {number(summary.return_mean)}, {bytes_of(summary.size)} in {summary.seconds:.1f} s"
+        f"{mean}, {bytes_of(summary.size)} in {summary.seconds:.1f} s"
     )
 
 
@@ -172,6 +178,7 @@ def _ls(
     its writer was killed or failed, and all steps that were finished are there, if its journal is.
     Deleted episodes of a storage are not counted.
     """
+    from tupli_mcap.recording.describe import nan_text
     from tupli_mcap.storage.listing import list_recordings
 
     found = list(list_recordings(paths or [Path()]))
@@ -183,11 +190,13 @@ def _ls(
             Column("RECORDING", shrink="start"),
             *(Column(title, "right") for title in ("EPISODES", "STEPS", "RETURN", "SIZE")),
             Column("STATE"),
+            Column("NOTE ON RETURN", shrink="end"),
         )
-        means = numbers([item.return_mean for item in good])
+        means = numbers([None if r.return_nan == r.episodes else r.return_mean for r in good])
+        notes = [nan_text(r.return_nan, r.episodes) for r in good]
         rows = [
-            (short_ids(r.path), number(r.episodes), number(r.steps), mean, bytes_of(r.size), r.state)
-            for r, mean in zip(good, means, strict=True)
+            (short_ids(r.path), number(r.episodes), number(r.steps), mean, bytes_of(r.size), r.state, note)
+            for r, mean, note in zip(good, means, notes, strict=True)
         ]
         if good or not found:
             print_table(columns, rows, empty="no recordings")
@@ -331,21 +340,23 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         ("observation", d.observation_space or "not known before the first step"),
         ("action", d.action_space or "not known before the first step"),
         ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),
-        ("steps", f"{d.steps:,}{_spread_text(d.lengths, ' an episode')}"),
-        *([("return", _spread_text(d.returns).removeprefix(", "))] if d.returns else []),
+        ("steps", f"{d.steps:,}{_spread_text(d.lengths, d.episodes, ' an episode')}"),
+        *([("return", _spread_text(d.returns, d.episodes).removeprefix(", "))] if d.returns else []),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
 
 
-def _spread_text(spread: Spread | None, of: str = "") -> str:
+def _spread_text(spread: Spread | None, episodes: int, of: str = "") -> str:
     if spread is None:
         return ""
-    if math.isnan(spread.mean) and math.isnan(spread.min):
-        return ", NaN in every episode"
-    odd = f"; NaN in {counted(spread.nan, 'episode')}, left out" if spread.nan else ""
+    from tupli_mcap.recording.describe import nan_text
+
+    odd = nan_text(spread.nan, episodes)
+    if spread.nan == episodes:
+        return f", {odd}"
     return (
         f", mean {number(spread.mean)}{of}, std {number(spread.std)}, "
-        f"from {number(spread.min)} to {number(spread.max)}{odd}"
+        f"from {number(spread.min)} to {number(spread.max)}{f'; {odd}' if odd else ''}"
     )
 
 

@@ -14,7 +14,16 @@ from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.signed import claimed_signer
 
-__all__ = ["ChannelFacts", "RecordingDescription", "Spread", "describe", "describe_space", "state_of"]
+__all__ = [
+    "ChannelFacts",
+    "RecordingDescription",
+    "Spread",
+    "describe",
+    "describe_space",
+    "nan_text",
+    "spread_of",
+    "state_of",
+]
 
 
 class Spread(NamedTuple):
@@ -104,8 +113,8 @@ def describe(recording: Recording) -> RecordingDescription:
         episodes=len(rows),
         steps=recording.num_steps,
         ends={name: int((rows["end"] == i).sum()) for i, name in enumerate(END_NAMES)},
-        lengths=_spread(rows["length"]),
-        returns=_spread(rows["return"]),
+        lengths=spread_of(rows["length"]),
+        returns=spread_of(rows["return"]),
         observation_space=describe_space(recording.observation_space) if recording.num_envs else None,
         action_space=describe_space(recording.action_space) if recording.num_envs else None,
         compression=int(chunks["uncompressed"].sum()) / stored if stored else None,
@@ -140,7 +149,8 @@ def _bound(values: np.ndarray[Any, Any]) -> str:
     return f"{low:g}" if low == high else f"{low:g}..{high:g}"
 
 
-def _spread(values: np.ndarray[Any, Any]) -> Spread | None:
+def spread_of(values: np.ndarray[Any, Any]) -> Spread | None:
+    """The spread of one number an episode; None without an episode."""
     if len(values) == 0:
         return None
     numbers = values.astype(np.float64)
@@ -149,6 +159,17 @@ def _spread(values: np.ndarray[Any, Any]) -> Spread | None:
     with np.errstate(invalid="ignore", over="ignore"):  # infinite returns have no spread
         mean, std, least, most = map(float, (numbers.mean(), numbers.std(), numbers.min(), numbers.max()))
     return Spread(mean, std, least, most, int(none.sum()))
+
+
+def nan_text(count: int, episodes: int) -> str:
+    """How many of the episodes have NaN for a number, as words; empty if none has."""
+    if not count:
+        return ""
+    return (
+        "NaN in every episode"
+        if count == episodes
+        else f"NaN in {count:,} episode{'' if count == 1 else 's'}, left out"
+    )
 
 
 def _channels(recording: Recording) -> list[ChannelFacts]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.describe import state_of
+from tupli_mcap.recording.describe import spread_of, state_of
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.storage.scan import scan
 from tupli_mcap.storage.sidecar import Sidecar
@@ -20,7 +20,8 @@ __all__ = ["Compactable", "ListedRecording", "compactable", "find_recordings", "
 class ListedRecording(NamedTuple):
     """A recording without its deleted episodes; `error` says why there is nothing else.
 
-    return_mean: over all episodes that are left, None if there are none. size: bytes of the file.
+    return_mean: over the episodes that are left, None if there are none; without the `return_nan` whose return is
+        NaN, and NaN itself where that is so of all. size: bytes of the file.
     state: "complete", "recording" (a writer is at work) or "recovered" (a writer did not finish).
     """
 
@@ -28,6 +29,7 @@ class ListedRecording(NamedTuple):
     episodes: int = 0
     steps: int = 0
     return_mean: float | None = None
+    return_nan: int = 0
     size: int = 0
     created_ns: int = 0
     benchmark_id: str = ""
@@ -93,11 +95,13 @@ def _listed(path: Path) -> ListedRecording:
             rows = recording.index
             if deleted:
                 rows = rows[[int(number) not in deleted for number in rows["episode"]]]
+            returns = spread_of(rows["return"])
             return ListedRecording(
                 path=str(path),
                 episodes=len(rows),
                 steps=int(rows["length"].sum()),
-                return_mean=float(rows["return"].mean()) if len(rows) else None,
+                return_mean=None if returns is None else returns.mean,
+                return_nan=0 if returns is None else returns.nan,
                 size=path.stat().st_size,
                 created_ns=recording.created_ns,
                 benchmark_id=recording.benchmark_id,

@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.recording.describe import spread_of
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.framing import RENDER_MODE
 from tupli_mcap.recording.infos import RecordInfo
@@ -35,7 +36,8 @@ _REPORTS = 200  # progress is told about so often in a rollout
 class RolloutSummary(NamedTuple):
     """What one call recorded; interrupted episodes count too. `size` is that of whole files (bytes).
 
-    `path` is the last of the files, `paths` are all of them.
+    `path` is the last of the files, `paths` are all of them. `return_mean` leaves out the `return_nan` episodes whose
+    return is NaN; it is NaN itself where there is no other.
     """
 
     path: Path
@@ -43,6 +45,7 @@ class RolloutSummary(NamedTuple):
     episodes: int
     steps: int
     return_mean: float
+    return_nan: int
     seconds: float
     size: int
 
@@ -126,7 +129,9 @@ def record_rollouts(
         paths = wrapped.paths
     returns = np.concatenate([_returns(path) for path in paths])[known:]
     seconds, size = time.perf_counter() - began, sum(path.stat().st_size for path in paths)
-    return RolloutSummary(paths[-1], paths, len(returns), done, float(returns.mean()), seconds, size)
+    spread = spread_of(returns)
+    mean, odd = (float("nan"), 0) if spread is None else (spread.mean, spread.nan)
+    return RolloutSummary(paths[-1], paths, len(returns), done, mean, odd, seconds, size)
 
 
 def _returns(path: Path) -> np.ndarray[Any, Any]:
