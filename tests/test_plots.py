@@ -431,6 +431,26 @@ def test_many_episodes_become_bands(tmp_path: Path) -> None:
     check_formats(made, tmp_path, page=False)
 
 
+def test_seeds_beyond_64_bits_are_named(tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+        for seed in (None, None, 2**100, 7):  # the environment draws the first one, of 128 bits
+            env.reset(seed=seed)
+            env.step(0)
+    with Recording(tmp_path / "r.mcap") as recording:
+        drawn, none, *_ = (episode.seed for episode in recording.episodes)
+        assert drawn is not None and none is None
+        made = recording.plot(episode=0)
+        alone = recording.plot(episode=1, episode_filter=F("episode") < 2)
+        others = recording.plot(episode_filter=F("seed") == 7)
+        seedless = recording.plot(episode_filter=F("episode") == 1)
+    assert made.measured[0].seeds == sorted([drawn, 2**100, 7])
+    assert dict(made.facts)["seeds"] == f"3 from 7 to {max(drawn, 2**100):.4g}"
+    assert f", seed {drawn:.4g}" in "".join(texts(made))
+    assert dict(alone.facts)["seeds"] == str(drawn)
+    assert dict(others.facts)["seeds"] == "7"
+    assert dict(seedless.facts)["seeds"] == "none known"
+
+
 def test_a_recording_that_is_open(cartpole: Path) -> None:
     with Recording(cartpole) as recording:
         made = recording.plot(episode=3, episode_filter=F("n_tuples") > 10)

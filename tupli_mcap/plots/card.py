@@ -8,11 +8,13 @@ from datetime import UTC, datetime
 import numpy as np
 
 from tupli_mcap.plots.gather import Measured
-from tupli_mcap.plots.style import number_text
+from tupli_mcap.plots.style import number_text, seed_text
 from tupli_mcap.recording.blocks import Array
 from tupli_mcap.recording.events import END_NAMES
 
 __all__ = ["card", "notes_of", "title_of"]
+
+_MOST_SEEDS, _LONGEST_SEEDS = 6, 56  # that are listed; characters
 
 
 def title_of(measured: Sequence[Measured]) -> str:
@@ -45,7 +47,7 @@ def card(measured: Sequence[Measured]) -> list[tuple[str, str]]:
         ("steps", f"{one.steps:,}"),
         ("return", _spread(rows["return"])),
         ("length", _spread(rows["length"])),
-        ("seeds", _seeds(rows)),
+        ("seeds", _seeds(one.seeds)),
         ("benchmark", facts.benchmark_id[:12] or "none"),
         ("observation", facts.observation_space or "not known before the first step"),
         ("action", facts.action_space or "not known before the first step"),
@@ -82,13 +84,13 @@ def _spread(values: Array) -> str:
     return f"{mean} ± {std}, from {number_text(float(numbers.min()))} to {number_text(float(numbers.max()))}"
 
 
-def _seeds(rows: Array) -> str:
-    seeds = np.unique(rows["seed"][rows["has_seed"] != 0])
-    if not len(seeds):
+def _seeds(seeds: Sequence[int]) -> str:
+    if not seeds:
         return "none known"
-    if len(seeds) <= 6:
-        return ", ".join(map(str, seeds.tolist()))
-    return f"{len(seeds):,} from {seeds[0]} to {seeds[-1]}"
+    listed = ", ".join(map(str, seeds))
+    if len(seeds) <= _MOST_SEEDS and len(listed) <= _LONGEST_SEEDS:
+        return listed
+    return f"{len(seeds):,} from {seed_text(seeds[0])} to {seed_text(seeds[-1])}"
 
 
 def _times(one: Measured) -> str:

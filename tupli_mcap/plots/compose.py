@@ -14,7 +14,7 @@ from tupli_mcap.plots.draw_trace import add_trace
 from tupli_mcap.plots.draw_values import add_values
 from tupli_mcap.plots.gather import Measured
 from tupli_mcap.plots.page import Cell, Page
-from tupli_mcap.plots.style import GREY, INK, colours, cut, drawable
+from tupli_mcap.plots.style import GREY, INK, colours, cut, drawable, seed_text
 from tupli_mcap.plots.trace import Trace
 from tupli_mcap.plots.values import LeafValues
 
@@ -62,7 +62,7 @@ def _together(leaves: Sequence[Sequence[LeafValues]]) -> list[Sequence[LeafValue
 
 
 def _heading(measured: Measured, trace: Trace, *, several: bool) -> str:
-    seed = "" if trace.seed is None else f", seed {trace.seed}"
+    seed = "" if trace.seed is None else f", seed {seed_text(trace.seed)}"
     where = f" of {measured.name}" if several else ""
     env = f", sub-environment {trace.env}" if measured.facts.num_envs > 1 else ""
     return (

@@ -14,6 +14,7 @@ from tupli_mcap.plots.values import LeafValues
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Array, blocks, step_bytes
 from tupli_mcap.recording.describe import RecordingDescription, describe
+from tupli_mcap.recording.events import EpisodeStart
 
 __all__ = ["Measured", "measure"]
 
@@ -30,7 +31,8 @@ class Measured:
     """One recording.
 
     rows: the index rows of its chosen episodes. read_episodes, read_steps: how many of those the values are from.
-    states, actions, rewards: their leaves. trace: one episode, step by step; None without any.
+    states, actions, rewards: their leaves. seeds: of the chosen episodes, each once, ascending.
+    trace: one episode, step by step; None without any.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Measured:
     states: list[LeafValues] = field(default_factory=list)
     actions: list[LeafValues] = field(default_factory=list)
     rewards: list[LeafValues] = field(default_factory=list)
+    seeds: list[int] = field(default_factory=list)
     trace: Trace | None = None
 
     @property
@@ -86,6 +89,7 @@ def measure(recording: Recording, positions: Array) -> Measured:
     found = Measured(recording.name, describe(recording), rows, len(recording.index), layout)
     if layout is None:
         return found
+    found.seeds = _seeds(recording, rows)
     labels = recording.labels
     found.step_seconds = labels.step_seconds
     found.states = [LeafValues(leaf, labels) for leaf in layout.state]
@@ -107,6 +111,22 @@ def measure(recording: Recording, positions: Array) -> Measured:
     for leaf in found.leaves:
         leaf.finish()
     return found
+
+
+def _seeds(recording: Recording, rows: Array) -> list[int]:
+    """The seeds of some episodes, each once: those of the index, and the larger ones, which only starts hold."""
+    known = rows["has_seed"] != 0
+    found = set(rows["seed"][known].tolist())
+    starts = rows["start_row"][~known].astype(np.int64)
+    if len(starts):
+        first, wanted = int(starts.min()), set(starts.tolist())
+        bodies = recording._store.bodies(
+            recording._channel("/episode_start"), first, int(starts.max()) + 1 - first
+        )
+        for row, body in enumerate(bodies, first):
+            if row in wanted and (seed := EpisodeStart.decode(body).seed_number) is not None:
+                found.add(seed)
+    return sorted(found)
 
 
 def _read_positions(layout: StepLayout, positions: Array, lengths: Array) -> tuple[Array, int]:

@@ -11,7 +11,7 @@ from tupli_mcap.errors import MissingExtraError
 
 __all__ = [
     "BLUE", "ENDS", "GREY", "INK", "SERIES", "VERMILION", "colours", "cut", "drawable", "legend_above", "number_text",
-    "show_alone", "styled",
+    "seed_text", "show_alone", "styled",
 ]  # fmt: skip
 
 # Okabe and Ito's palette; https://jfly.uni-koeln.de/color/
@@ -101,6 +101,11 @@ def number_text(value: float) -> str:
     if value == int(value) and abs(value) < 1e6 if abs(value) < 1e300 else False:
         return f"{int(value):,}"
     return f"{value:.4g}" if abs(value) < 1e4 or abs(value) >= 1e7 else f"{value:,.0f}"
+
+
+def seed_text(seed: int) -> str:
+    """A seed in few characters: one that an environment drew may have 39 digits, and is rounded."""
+    return str(seed) if abs(seed) < 1 << 64 else number_text(float(seed))
 
 
 def colours(count: int) -> list[str]:

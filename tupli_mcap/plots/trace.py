@@ -78,7 +78,7 @@ def trace(recording: Recording, position: int, leaves: list[LeafValues]) -> Trac
         totals += thinners[""].put(drawn(running)[:, None])
     values = {name: np.concatenate([*found, *thinners[name].rest()]) for name, found in parts.items()}
     running = np.concatenate([*totals, *thinners[""].rest()])[:, 0]
-    seed = int(row["seed"]) if row["has_seed"] else None
+    seed = recording.episode_start(position).seed_number  # the index holds none beyond 64 bits
     at = np.arange(length) if width == 1 else np.repeat(np.arange(0, length, width), 2)
     if width > 1:
         at[1::2] = np.minimum(at[1::2] + width // 2, length - 1)
