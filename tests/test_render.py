@@ -26,6 +26,7 @@ from tupli_mcap.errors import MissingExtraError, RecordingError, UntrustedError
 from tupli_mcap.recording import rewrite_recording
 from tupli_mcap.recording.signature import SIGNATURE_NAME, sign_recording
 from tupli_mcap.replay import certify, covers, read_certificate, render, write_certificate
+from tupli_mcap.replay.movie import Indexed
 from tupli_mcap.signing import SigningKey
 from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -212,6 +213,37 @@ class TestOutput:
         with Image.open(tmp_path / "film.gif") as film:
             assert (film.size, film.n_frames) == ((12, 8), report.frames)  # type: ignore[attr-defined]
             assert film.info["duration"] == 100
+
+    def test_a_gif_of_few_colours_is_exact(self, tmp_path: Path) -> None:
+        path = recorded(tmp_path / "r.mcap", gym.make("CartPole-v1"), 1)
+        render(path, tmp_path / "film.gif")
+        render(path, tmp_path / "new.mcap", episodes=[0])
+        with Recording(tmp_path / "new.mcap") as recording, Image.open(tmp_path / "film.gif") as film:
+            frames = list(recording.episodes[0].frames)
+            shown = []
+            for i in range(film.n_frames):  # type: ignore[attr-defined]
+                film.seek(i)  # equal frames are one that lasts longer, and the last one does anyway
+                shown += [np.asarray(film.convert("RGB"))] * (film.info["duration"] // 20)
+        assert len(shown) == len(frames) + 50
+        np.testing.assert_array_equal(shown[: len(frames)], frames)
+
+    @pytest.mark.parametrize("shape", [(400, 600), (1, 90_000), (90_000, 1), (60, 90), (5, 7), (1, 1)])
+    @pytest.mark.parametrize("colours", [1, 2, 255, 256, 257, 30_000])
+    def test_images_of_at_most_256_colours(self, shape: tuple[int, int], colours: int) -> None:
+        rng = np.random.default_rng(colours)
+        indexed = Indexed()
+        for _ in range(2):  # other colours, and places of the first ones in the table
+            of_all = np.sort(
+                rng.integers(0, 255, (colours, 3), np.uint8), axis=0
+            )  # a curve through the colours
+            picture = of_all[rng.integers(0, colours, shape)]
+            image = indexed(picture)
+            found = np.asarray(image.convert("RGB"))
+            assert (image.mode, found.shape) == ("P", picture.shape)
+            if len(np.unique(picture.reshape(-1, 3), axis=0)) <= 256:
+                np.testing.assert_array_equal(found, picture)
+            else:
+                assert np.abs(found.astype(int) - picture).mean() < 2
 
     def test_a_fast_environment_keeps_its_pace_in_a_gif(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

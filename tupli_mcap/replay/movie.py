@@ -14,9 +14,11 @@ import numpy as np
 from tupli_mcap.errors import MissingExtraError, RecordingError
 from tupli_mcap.recording.pictures import Picture, resized
 
-__all__ = ["check_movie", "write_movie"]
+__all__ = ["Indexed", "check_movie", "write_movie"]
 
 _GIF_FPS = 50  # browsers show faster ones at 10 frames a second
+_GIF_COLOURS = 256
+_GIF_SAMPLE = 15_000  # pixels that the colours of a picture with more than that are chosen from
 _CODECS = ("libx264", "h264", "mpeg4")
 
 
@@ -80,8 +82,6 @@ def _with(first: Picture, rest: Iterator[Picture]) -> Iterator[Picture]:
 
 
 def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, fps: float) -> None:
-    from PIL import Image
-
     stride = max(1, math.ceil(fps / _GIF_FPS))
     shown = math.ceil(count / stride)
     ends = np.round(
@@ -89,7 +89,47 @@ def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, 
     )  # in hundredths of a second, as GIF has them
     durations = (np.diff(ends, prepend=0) * 10).astype(int).tolist()
     durations[-1] += 1000  # a moment to see the end
-    images = (Image.fromarray(picture) for picture in islice(rest, stride - 1, None, stride))
-    Image.fromarray(first).save(
+    indexed = Indexed()
+    images = map(indexed, islice(rest, stride - 1, None, stride))
+    indexed(first).save(
         path, format="GIF", save_all=True, append_images=images, duration=durations, loop=0, disposal=1
     )
+
+
+class Indexed:
+    """Makes images of at most 256 colours from pictures; those of a picture that has no more are exact."""
+
+    def __init__(self) -> None:
+        self._places: np.ndarray[Any, Any] | None = None  # of colours in the palette
+
+    def __call__(self, picture: Picture) -> Any:
+        """A Pillow image of mode P."""
+        from PIL import Image
+
+        image = Image.fromarray(picture)
+        counts = image.getcolors(_GIF_COLOURS)
+        if counts is not None:
+            return self._exact(picture, np.array(sorted(colour for _, colour in counts), np.uint8))
+        apart = math.isqrt(image.width * image.height // _GIF_SAMPLE)
+        if apart < 2:
+            return image.quantize(_GIF_COLOURS)
+        size = -(-image.width // apart), -(-image.height // apart)
+        palette = image.resize(size, Image.Resampling.NEAREST).quantize(_GIF_COLOURS)
+        return image.quantize(palette=palette, dither=Image.Dither.NONE)
+
+    def _exact(self, picture: Picture, colours: Picture) -> Any:
+        """Pillow, which chooses colours even where there are few, takes ten times as long."""
+        from PIL import Image
+
+        if self._places is None:
+            self._places = np.zeros(1 << 24, np.uint8)
+        self._places[_codes(colours)] = np.arange(len(colours))
+        image = Image.fromarray(self._places[_codes(picture)])
+        image.putpalette(colours.tobytes())
+        return image
+
+
+def _codes(colours: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Each colour (the last axis) as a number of 24 bits."""
+    red, green, blue = (colours[..., i].astype(np.uint32) for i in range(3))
+    return red << 16 | green << 8 | blue
