@@ -1,7 +1,7 @@
 """The application: its commands, and the one place where errors become a line and an exit code.
 
-Exit codes: 0, 1 (the operation failed), 2 (usage). Only light modules are imported here; each command imports
-what it calls, so that help and completion stay quick.
+Exit codes: 0, 1 (it failed, or found something), 2 (usage). Only light modules are imported here; each command
+imports what it calls, so that help and completion stay quick.
 """
 
 from __future__ import annotations
@@ -143,7 +143,8 @@ def _root(
 ) -> None:
     """Record reinforcement-learning episodes as MCAP files, look at them, share them.
 
-    Commands that print tables print JSON with --json. Exit codes: 0, 1 (the operation failed), 2 (usage).
+    Commands that print tables print JSON with --json. Exit codes: 0, 1 (it failed, or found
+    something), 2 (usage).
     """
     if context.invoked_subcommand is None:
         print(context.get_help())

@@ -26,7 +26,7 @@ def register(app: typer.Typer) -> None:
 
 def _merge(
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Recordings of the same spaces.", readable=False)
+        list[Path], typer.Argument(metavar="FILE", help="Recordings of the same spaces.", readable=False)
     ],
     output: _Output,
     force: _Force = False,
@@ -84,7 +84,7 @@ def _filter(
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Write the episodes that a filter is true of into a new recording.
+    """Write the episodes that a filter is true of into a file.
 
     They keep their ids. A signature is left out.
     """

@@ -43,7 +43,7 @@ def register(app: typer.Typer) -> None:
 def _doctor(
     paths: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[PATH]...", help="Recordings, directories, storages, URLs; here by default."),
+        typer.Argument(metavar="PATH", help="Recordings, directories, storages, URLs; here by default."),
     ] = None,
     filter_text: FilterText = None,
     fail_on: Annotated[

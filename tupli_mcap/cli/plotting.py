@@ -21,7 +21,7 @@ def register(app: typer.Typer) -> None:
 
 def _plot(
     paths: Annotated[
-        list[str], typer.Argument(metavar="FILE|STORAGE...", help="Recordings, directories, storages, URLs.")
+        list[str], typer.Argument(metavar="FILE|STORAGE", help="Recordings, directories, storages, URLs.")
     ],
     output: Annotated[
         Path | None,
@@ -39,10 +39,11 @@ def _plot(
     force: Annotated[bool, typer.Option("--force", help="Replace the output if it is there.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Draw a report: returns, lengths, states, actions, rewards, and one episode step by step.
+    """Draw a report of recordings as a picture or a page.
 
-    Several recordings are compared. The extension of the output says what it is; an .html needs no network.
-    Needs the extra plot (matplotlib). Nothing in a file is executed.
+    Returns, lengths, states, actions, rewards, and one episode step by step. Several recordings are compared.
+    The extension of the output says what it is; an .html needs no network. Needs the extra plot (matplotlib).
+    Nothing in a file is executed.
     """
     from tupli_mcap.plots import check_goal, report
 

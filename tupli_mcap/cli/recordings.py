@@ -166,9 +166,7 @@ def _record(
 def _ls(
     paths: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="[PATH]...", help="Files, directories, storages; here by default.", readable=False
-        ),
+        typer.Argument(metavar="PATH", help="Files, directories, storages; here by default.", readable=False),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -208,7 +206,7 @@ def _ls(
 
 
 def _info(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or an URL.")],
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or a URL.")],
     as_json: Json = False,
 ) -> None:
     """Show what is in a recording.

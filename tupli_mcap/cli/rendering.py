@@ -41,7 +41,7 @@ def _render(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="FILE|STORAGE", help="A recording: a path or an URL; or a directory with the recording."
+            metavar="FILE|STORAGE", help="A recording: a path or a URL; or a directory with the recording."
         ),
     ],
     output: Annotated[

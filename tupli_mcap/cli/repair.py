@@ -39,7 +39,7 @@ def _verify(
     paths: Annotated[
         list[Path],
         typer.Argument(
-            metavar="PATH...", help="Recordings, other MCAP files, directories, storages.", readable=False
+            metavar="PATH", help="Recordings, other MCAP files, directories, storages.", readable=False
         ),
     ],
     replay: Annotated[
@@ -56,10 +56,11 @@ def _verify(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check files for damage: structure, CRCs, indexes, layouts, alignment, digests.
+    """Check files for damage.
 
-    Every episode has to start, go on and end, without a gap or a step twice. Of a storage, artifacts, benchmarks
-    and the catalog are checked too. Nothing is executed, nothing is written. Exit code 1 if something is damaged.
+    Structure, CRCs, indexes, layouts, alignment and digests are checked. Every episode has to start, go on and
+    end, without a gap or a step twice. Of a storage, artifacts, benchmarks and the catalog are checked too.
+    Nothing is executed, nothing is written. Exit code 1 if something is damaged.
 
     --replay rebuilds the environment of each recording, takes every episode again with its seed, options and
     actions, and says where something differs. Exit code 1 if something does, or nothing could be checked.
@@ -139,10 +140,11 @@ def _recover(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what could be saved.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Save everything good in a damaged or unfinished file into a new one.
+    """Save everything good in a damaged file into a new one.
 
-    The file itself is only read. What was lost is said by episode and step; an episode that lost steps in the
-    middle becomes several. Exit code 1 only if nothing could be saved, or no step of a recording that had some.
+    One that its writer did not finish is damaged, too. The file itself is only read. What was lost is said by
+    episode and step; an episode that lost steps in the middle becomes several. Exit code 1 only if nothing
+    could be saved, or no step of a recording that had some.
     """
     from tupli_mcap.recording.repair import recover_recording
 

@@ -21,7 +21,7 @@ def register(app: typer.Typer) -> None:
 
 def _replay(
     sources: Annotated[
-        list[str], typer.Argument(metavar="PATH...", help="Recordings, URLs, directories of a storage.")
+        list[str], typer.Argument(metavar="PATH", help="Recordings, URLs, directories of a storage.")
     ],
     episode: Annotated[
         str | None,

@@ -242,7 +242,7 @@ def _refusals_told(name: str, offset: int, length: int, read: Callable[[], _T]) 
 
 
 def open_source(source: str | os.PathLike[str] | BinaryIO) -> Source:
-    """A Source for a path, an URL (`https://…`, `s3://…`, through fsspec) or an open binary file."""
+    """A Source for a path, a URL (`https://…`, `s3://…`, through fsspec) or an open binary file."""
     if isinstance(source, str) and "://" in source:
         return _open_url(source)
     if isinstance(source, str | os.PathLike):
