@@ -431,6 +431,26 @@ def test_many_episodes_become_bands(tmp_path: Path) -> None:
     check_formats(made, tmp_path, page=False)
 
 
+@pytest.mark.parametrize(
+    ("returns", "told", "note"),
+    [
+        ([2.0, np.nan, 4.0], "3 ± 1, from 2 to 4", ["return: NaN in 1 episode, left out."]),
+        ([np.nan, np.nan], "NaN in every episode", ["return: NaN in every episode."]),
+        ([2.0], "2", []),
+        ([np.inf], None, []),
+        ([], None, []),
+    ],
+)
+def test_returns_that_are_nan_are_counted(
+    tmp_path: Path, returns: list[float], told: str | None, note: list[str]
+) -> None:
+    episodes = [EpisodeData([UNIT.low], [0], [total], [True], [False]) for total in returns]
+    write_recording(tmp_path / "r.mcap", episodes, observation_space=UNIT, action_space=spaces.Discrete(2))
+    made = report(tmp_path / "r.mcap")
+    assert dict(made.facts).get("return") == told
+    assert [text for text in made.notes if text.startswith("return: ")] == note
+
+
 def test_seeds_beyond_64_bits_are_named(tmp_path: Path) -> None:
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
         for seed in (None, None, 2**100, 7):  # the environment draws the first one, of 128 bits

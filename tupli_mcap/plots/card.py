@@ -10,6 +10,7 @@ import numpy as np
 from tupli_mcap.plots.gather import Measured
 from tupli_mcap.plots.style import number_text, seed_text
 from tupli_mcap.recording.blocks import Array
+from tupli_mcap.recording.describe import nan_text
 from tupli_mcap.recording.events import END_NAMES
 
 __all__ = ["card", "notes_of", "title_of"]
@@ -61,6 +62,9 @@ def notes_of(measured: Sequence[Measured]) -> list[str]:
     for one in measured:
         prefix = f"{one.name}: " if len(measured) > 1 else ""
         found.update((prefix + note, None) for note in one.notes())
+        odd = int(np.isnan(one.rows["return"]).sum())
+        if odd:
+            found[f"{prefix}return: {nan_text(odd, len(one.rows))}."] = None
         if not len(one.rows):
             found[f"{prefix}There is no episode."] = None
     return list(found)
@@ -74,9 +78,10 @@ def _in_short(one: Measured) -> str:
 
 def _spread(values: Array) -> str:
     numbers = values.astype(np.float64)
+    none = np.isnan(numbers)
     numbers = numbers[np.isfinite(numbers)]
     if not len(numbers):
-        return ""
+        return nan_text(len(none), len(none)) if none.all() else ""
     if len(numbers) == 1:
         return number_text(float(numbers[0]))
     with np.errstate(over="ignore", invalid="ignore"):
