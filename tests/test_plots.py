@@ -451,6 +451,17 @@ def test_returns_that_are_nan_are_counted(
     assert [text for text in made.notes if text.startswith("return: ")] == note
 
 
+@pytest.mark.parametrize("episodes", [1, 2, 7])
+def test_few_episodes_are_counted_in_whole_numbers(tmp_path: Path, episodes: int) -> None:
+    found = [EpisodeData([UNIT.low], [0], [float(i)], [True], [False]) for i in range(episodes)]
+    write_recording(tmp_path / "r.mcap", found, observation_space=UNIT, action_space=spaces.Discrete(2))
+    counted = [axes for axes in report(tmp_path / "r.mcap").figure.axes if axes.get_ylabel() == "episodes"]
+    assert len(counted) == 2  # of returns, of lengths
+    for axes in counted:
+        assert len(axes.get_yticks()) >= 2
+        assert all(float(tick).is_integer() for tick in axes.get_yticks())
+
+
 def test_seeds_beyond_64_bits_are_named(tmp_path: Path) -> None:
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
         for seed in (None, None, 2**100, 7):  # the environment draws the first one, of 128 bits

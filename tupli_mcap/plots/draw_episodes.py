@@ -113,6 +113,7 @@ def _draw_distribution(axes: Any, measured: Sequence[Measured], column: str, nam
     show_alone(axes, edges)
     if len(measured) == 1:
         axes.set_ylabel("episodes", color=GREY)
+        axes.yaxis.get_major_locator().set_params(integer=True)
         _draw_ends(axes, measured[0].rows, column, edges)
         if len(pooled) > MOST_DOTS:  # else the dots at the left have told
             legend_above(axes)
