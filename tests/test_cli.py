@@ -25,7 +25,15 @@ from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper, trust, write_recording
+from tupli_mcap import (
+    EpisodeData,
+    FileStorage,
+    RecordEpisodes,
+    Recording,
+    TupliEnvWrapper,
+    trust,
+    write_recording,
+)
 from tupli_mcap.cli import app
 from tupli_mcap.cli.output import bytes_of, number, numbers
 from tupli_mcap.errors import RecordingError
@@ -503,6 +511,14 @@ class TestLook:
     def test_info_of_nested_spaces_fits_one_line_each(self, here: Path) -> None:
         ok("record", "Blackjack-v1", "-o", "a.mcap", "--steps", 20)
         assert "observation  Tuple(Discrete(32), Discrete(11), Discrete(2))\n" in ok("info", "a.mcap")
+
+    def test_info_of_texts_counts_their_characters(self, here: Path) -> None:
+        space = gym.spaces.Dict({"say": gym.spaces.Text(20), "bit": gym.spaces.Text(1, charset="01")})
+        states = [{"say": "up", "bit": "1"}]
+        episode = EpisodeData(states, [0], [1.0], [True], [False])
+        write_recording("r.mcap", [episode], observation_space=space, action_space=gym.spaces.Discrete(2))
+        said = "Dict('bit': Text(1..1, 2 characters), 'say': Text(1..20, 62 characters))"
+        assert f"observation  {said}\n" in ok("info", "r.mcap")
 
     def test_episodes_of_a_file(self, cartpole: Path, here: Path) -> None:
         header, *rows = ok("episodes", cartpole).splitlines()

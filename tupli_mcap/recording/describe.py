@@ -139,6 +139,8 @@ def describe_space(space: gym.Space[Any]) -> str:
         return f"Dict({', '.join(f'{key!r}: {describe_space(inner)}' for key, inner in space.items())})"
     if isinstance(space, gym.spaces.Tuple):
         return f"Tuple({', '.join(describe_space(inner) for inner in space)})"
+    if isinstance(space, gym.spaces.Text):
+        return f"Text({space.min_length}..{space.max_length}, {len(space.character_set)} characters)"
     return " ".join(str(space).split())
 
 
