@@ -761,6 +761,20 @@ def test_a_sketch_is_of_the_whole_data(cartpole: Path) -> None:
     assert (found.sampled, found.hidden, found.error) == (400, 0, "")
 
 
+def test_info_says_what_is_not_finite(tmp_path: Path) -> None:
+    odd = {3: np.nan, 7: np.inf, 11: -np.inf}
+    path = scripted(
+        tmp_path / "r.mcap", lambda n: np.array([odd.get(n, n), 2 * n, np.nan]), spaces.Box(-99, 99, (3,), np.float64),
+        20, length=20,
+    )  # fmt: skip
+    with Recording(path) as recording:
+        assert [series.odd for series in sketch(recording, 10).distributions] == [0, 3, 0, 20, 0]
+    out = run("info", path)[1]
+    assert "\nnot finite, left out: 3 of state[0], 20 of state[2]\n" in out
+    (line,) = [line for line in out.splitlines() if line.startswith("state[2]")]
+    assert line == "state[2]"  # neither a smallest value nor a largest one
+
+
 def test_of_a_long_recording_a_sketch_reads_a_few_chunks(
     cartpole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from tupli_mcap.cli.output import Column, number, print_table, terminal_width, visible
+from tupli_mcap.cli.output import Column, number, print_table, print_wrapped, terminal_width, visible
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Recording
@@ -60,6 +60,9 @@ def print_sketch(recording: Recording) -> None:
         hidden = f"{number(found.hidden)} more dimensions" if found.hidden else ""
         if told or hidden:
             print(", ".join(filter(None, (hidden, told))))
+        odd = [f"{number(one.odd)} of {one.name}" for one in found.distributions if one.odd]
+        if odd:
+            print_wrapped(f"not finite, left out: {', '.join(odd)}", "", "")
     if found.error:
         print(f"no step is shown: {visible(found.error)}")
 
@@ -71,8 +74,7 @@ def _print(title: str, spark: str, series: Sequence[Series], *, zero_based: bool
         (
             one.name if len(one.name) <= _LONGEST_NAME else f"{one.name[:8]}...{one.name[-13:]}",
             sparkline(one.values, zero_based=zero_based, blocks=blocks),
-            number(one.least, 3),
-            number(one.most, 3),
+            *("" if math.isnan(end) else number(end, 3) for end in (one.least, one.most)),
         )
         for one in series
     ]

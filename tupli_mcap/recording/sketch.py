@@ -28,12 +28,16 @@ _MOST_REWARDS, _MOST_STATES, _MOST_ACTIONS = 2, 12, 6
 
 
 class Series(NamedTuple):
-    """Some numbers in their order (NaN: there is none), and the range of the values they stand for."""
+    """Some numbers in their order (NaN: there is none), and the range of the values they stand for.
+
+    odd: how many values are left out, since they are not finite.
+    """
 
     name: str
     values: tuple[float, ...]
     least: float
     most: float
+    odd: int
 
 
 class Sketch(NamedTuple):
@@ -84,10 +88,11 @@ def _course(name: str, values: Array, points: int) -> Series | None:
         return None
     edges = np.linspace(0, len(values), min(points, len(values)) + 1).round().astype(np.int64)
     known = np.isfinite(values)
+    odd = int((~known).sum())
     counts = np.add.reduceat(known.astype(np.float64), edges[:-1])
     with np.errstate(invalid="ignore", over="ignore"):
         means = np.add.reduceat(np.where(known, values, 0.0), edges[:-1]) / np.where(counts, counts, np.nan)
-    return Series(name, tuple(means.tolist()), float(finite.min()), float(finite.max()))
+    return Series(name, tuple(means.tolist()), float(finite.min()), float(finite.max()), odd)
 
 
 def _pieces(recording: Recording) -> Iterator[Columns]:
@@ -128,9 +133,11 @@ def _distributions(
 
 
 def _distribution(leaf: Leaf, name: str, values: Array, points: int) -> Series:
-    values = values[np.isfinite(values)]
+    known = np.isfinite(values)
+    odd = int((~known).sum())
+    values = values[known]
     if not len(values):
-        return Series(name, (), np.nan, np.nan)
+        return Series(name, (), np.nan, np.nan, odd)
     least, most = float(values.min()), float(values.max())
     if isinstance(leaf.space, spaces.Discrete):  # values that never occur are seen, too
         least, most = float(leaf.space.start), float(leaf.space.start + leaf.space.n - 1)
@@ -138,8 +145,8 @@ def _distribution(leaf: Leaf, name: str, values: Array, points: int) -> Series:
     if np.array_equal(values, np.round(values)):
         bins = int(min(points, most - least + 1))
     if not most > least or not np.isfinite(most - least):
-        return Series(name, (float(len(values)),), least, most)
+        return Series(name, (float(len(values)),), least, most, odd)
     with np.errstate(over="ignore"):
         at = np.minimum((values - least) / (most - least) * bins, bins - 1).astype(np.int64)
     counts = np.bincount(np.maximum(at, 0), minlength=bins)
-    return Series(name, tuple(counts.astype(np.float64).tolist()), least, most)
+    return Series(name, tuple(counts.astype(np.float64).tolist()), least, most, odd)
