@@ -511,6 +511,18 @@ def test_recordings_are_compared(tmp_path: Path) -> None:
         report(tmp_path, episode=3)
 
 
+def test_counts_of_compared_recordings(tmp_path: Path) -> None:
+    for name, lengths in (("one", [1]), ("two", [1, 2])):
+        found = [
+            EpisodeData([UNIT.low] * n, [0] * n, [1.0] * n, [False] * n, [False] * (n - 1) + [True])
+            for n in lengths
+        ]
+        write_recording(tmp_path / name, found, observation_space=UNIT, action_space=spaces.Discrete(2))
+    told = dict(report([tmp_path / "one", tmp_path / "two"]).facts)
+    assert told["one"] == "1 episode, 1 step, return 1"
+    assert told["two"].startswith("2 episodes, 3 steps, return 1.5")
+
+
 def test_recordings_of_different_spaces_are_compared_by_their_returns(tmp_path: Path) -> None:
     record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 100)
     record(tmp_path / "b.mcap", gym.make("Pendulum-v1"), 300)

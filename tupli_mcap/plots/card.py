@@ -71,7 +71,7 @@ def notes_of(measured: Sequence[Measured]) -> list[str]:
 
 
 def _in_short(one: Measured) -> str:
-    text = f"{len(one.rows):,} episodes, {one.steps:,} steps"
+    text = f"{_counted(len(one.rows), 'episode')}, {_counted(one.steps, 'step')}"
     spread = _spread(one.rows["return"])
     return f"{text}, return {spread}" if spread else text
 
@@ -87,6 +87,10 @@ def _spread(values: Array) -> str:
     with np.errstate(over="ignore", invalid="ignore"):
         mean, std = number_text(float(numbers.mean())), number_text(float(numbers.std()))
     return f"{mean} ± {std}, from {number_text(float(numbers.min()))} to {number_text(float(numbers.max()))}"
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def _seeds(seeds: Sequence[int]) -> str:
