@@ -30,7 +30,7 @@ from tupli_mcap.cli import (
     viewing,
 )
 from tupli_mcap.cli.output import warnings_in_one_line
-from tupli_mcap.errors import FilterError, TupliError, UntrustedError
+from tupli_mcap.errors import FilterError, RecordingError, TupliError, UntrustedError
 
 __all__ = ["app", "main"]
 
@@ -101,6 +101,8 @@ def _report(err: BaseException) -> int:
         code = USAGE  # filters come from the command line only
     elif isinstance(err, UntrustedError):  # each command that may raise it has the option
         message = message.replace("pass trust=True", "pass --trust")
+    elif isinstance(err, RecordingError):  # only `record` has modes
+        message = message.replace('mode="a"', "--mode a").replace('"w" to replace', "w to replace")
     elif isinstance(err, OSError):
         name = "" if err.filename is None else f"{os.fsdecode(err.filename)}: "
         message = f"{name}{err.strerror or err}"
