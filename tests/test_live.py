@@ -254,6 +254,26 @@ def test_rerun_is_sent_what_is_recorded(tmp_path: Path) -> None:
     assert last_card(tmp_path / "r.rrd").split("\n")[2] == "recorded"  # it is over, and stays in the window
 
 
+@pytest.mark.parametrize(
+    ("returns", "told"),
+    [
+        ([2.0, np.nan, 4.0], "3 episodes; the last 3: mean return 3 (NaN in 1 episode, left out)"),
+        ([np.nan, np.nan], "2 episodes; the last 2: return NaN in every episode"),
+    ],
+)
+def test_the_mean_return_leaves_nan_out(returns: list[float], told: str, tmp_path: Path) -> None:
+    port, rewards = free_port(), iter(returns)
+    env = gym.wrappers.TransformReward(gym.make("CartPole-v1"), lambda _: next(rewards))
+    with (
+        receiver(port, tmp_path / "r.rrd"),
+        RecordEpisodes(env, tmp_path / "r.mcap", live=url(port)) as recorder,
+    ):
+        for _ in returns:
+            recorder.reset(seed=1)
+            recorder.step(0)
+    assert told in last_card(tmp_path / "r.rrd")
+
+
 def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:
     path, port = tmp_path / "r.mcap", free_port()
     inner = gym.vector.SyncVectorEnv([lambda: Sampler(MIXED, MIXED)] * 2)

@@ -62,6 +62,21 @@ def card(found: Rrd) -> str:
     return str(found.rows("/card", "TextDocument:text")[0][0])
 
 
+@pytest.mark.parametrize(
+    ("returns", "told"),
+    [
+        ([2.0, np.nan, 4.0], "mean 3, from 2 to 4; NaN in 1 episode, left out"),
+        ([np.nan, np.nan], "NaN in every episode"),
+        ([2.0, 4.0], "mean 3, from 2 to 4"),
+    ],
+)
+def test_the_card_leaves_returns_that_are_nan_out(tmp_path: Path, returns: list[float], told: str) -> None:
+    space = spaces.Discrete(2)
+    episodes = [EpisodeData([0], [0], [total], [True], [False]) for total in returns]
+    write_recording(tmp_path / "r.mcap", episodes, observation_space=space, action_space=space)
+    assert f"| return | {told} |" in card(Rrd(viewer.save(tmp_path / "r.mcap", tmp_path / "r.rrd")))
+
+
 def test_dimensions_of_other_scales_are_other_entities(tmp_path: Path) -> None:
     scales = np.array([1.0, 500.0, 2.0, 0.001, 0.0])
     found = replayed(tmp_path, Sampled(Box(-np.inf, np.inf, (5,), np.float64), lambda t: scales * (t + 1)))

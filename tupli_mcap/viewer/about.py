@@ -12,7 +12,7 @@ import numpy as np
 
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.describe import describe
+from tupli_mcap.recording.describe import describe, nan_text
 from tupli_mcap.viewer.names import title_of
 
 __all__ = ["card", "plain", "send_about"]
@@ -74,8 +74,9 @@ def card(recording: Recording) -> str:
     rows += [("steps", f"{d.steps:,}")]
     for name, spread in (("return", d.returns), ("length", d.lengths)):
         if spread:
-            odd = f"; NaN in {spread.nan:,} more" if spread.nan else ""
-            rows.append((name, f"mean {spread.mean:.4g}, from {spread.min:.4g} to {spread.max:.4g}{odd}"))
+            odd = nan_text(spread.nan, d.episodes)
+            told = f"mean {spread.mean:.4g}, from {spread.min:.4g} to {spread.max:.4g}{f'; {odd}' if odd else ''}"
+            rows.append((name, odd if spread.nan == d.episodes else told))
     rows += _leaf_rows(recording)
     rows += [
         ("benchmark", d.benchmark_id[:12] or "none"),

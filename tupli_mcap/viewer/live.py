@@ -12,6 +12,7 @@ import numpy as np
 
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.describe import nan_text, spread_of
 from tupli_mcap.recording.watching import NewInfo, NewSteps, Watcher
 from tupli_mcap.viewer.about import plain
 from tupli_mcap.viewer.arrange import blueprint_of
@@ -138,10 +139,12 @@ class LivePicture:
 
         lines = [f"### {plain(self._title)}", "", state, ""]
         if self._episodes:
-            mean = float(np.mean(self._returns))
-            lines.append(
-                f"{self._episodes:,} episodes; the last {len(self._returns):,}: mean return {mean:.4g}"
-            )
+            spread = spread_of(np.array(self._returns))
+            if spread is not None:
+                odd = nan_text(spread.nan, len(self._returns))
+                told = f"mean return {spread.mean:.4g}{f' ({odd})' if odd else ''}"
+                told = f"return {odd}" if spread.nan == len(self._returns) else told
+                lines.append(f"{self._episodes:,} episodes; the last {len(self._returns):,}: {told}")
             for name, values in (("return", self._returns), ("length", self._lengths)):
                 finite = np.nan_to_num(np.array(values, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
                 stream.log(f"/overview/{name}", rr.BarChart(tensor_array([finite], ["episode"])), static=True)
