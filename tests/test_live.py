@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import copy
 import gc
 import os
 import shutil
@@ -145,6 +146,18 @@ def last_card(path: Path) -> str:
 
 # ---- what is looked at
 
+ENDED = ["episode", "env", "first_row", "length", "return", "end"]
+
+
+def watched(path: Path, inner: gym.Env[Any, Any], num_envs: int, **options: Any) -> tuple[Any, Watcher]:
+    """A recorder and who looks at it; of sub-environments, if `num_envs` is not 0."""
+    if num_envs:
+        vector = gym.vector.SyncVectorEnv([lambda: copy.deepcopy(inner)] * num_envs)
+        env: Any = RecordVectorEpisodes(vector, path, **options)
+    else:
+        env = RecordEpisodes(inner, path, **options)
+    return env, Watcher(env._writer)
+
 
 @pytest.mark.parametrize(
     "space", [MIXED, spaces.Text(8), spaces.Box(-1, 1, (3,))], ids=["mixed", "text", "box"]
@@ -200,8 +213,7 @@ def test_a_watcher_in_another_thread_sees_what_is_recorded(
         layout = recording.layout
         firsts = recording.index["first_row"].tolist()
         episodes = list(zip(recording.episodes, firsts, strict=True))
-        names = ["episode", "env", "first_row", "length", "return", "end"]
-        assert sorted(np.concatenate(ended)[names].tolist()) == recording.index[names].tolist()
+        assert sorted(np.concatenate(ended)[ENDED].tolist()) == recording.index[ENDED].tolist()
         assert until_closing > 10
         rows = {(e.env, first + i): (e, i) for e, first in episodes for i in range(len(e))}
         assert {new.env for new, _ in seen} == set(range(min(num_envs, 2) or 1))
@@ -233,6 +245,32 @@ def test_a_watcher_numbers_the_steps_of_an_appended_recording(tmp_path: Path) ->
             env.step(0)
         ((new,), ended) = watcher.look(1)
     assert (new.first, new.steps.tolist(), len(ended)) == (50, [0, 1, 2, 3, 4], 0)
+
+
+@pytest.mark.parametrize("every", [1, 7])
+@pytest.mark.parametrize("num_envs", [0, 2])
+@pytest.mark.parametrize("chunk_size", [200, 2**18])
+def test_an_end_is_seen_before_anything_follows_it(
+    every: int, num_envs: int, chunk_size: int, tmp_path: Path
+) -> None:
+    """Not only at the next reset: until then a policy may be trained, or an environment take its time."""
+    path, space = tmp_path / "r.mcap", spaces.Box(-1, 1, (3,))
+    env, watcher = watched(path, Sampler(space, space, 3), num_envs, chunk_size=chunk_size)
+    found, ended, over = [], 0, False
+    env.reset(seed=1)
+    for i in range(100):
+        if over and not num_envs:
+            env.reset(seed=2 if i > 50 and i % 2 else None)
+        *_, terminal, timeout, _ = env.step(env.action_space.sample())
+        over = bool(np.any(terminal | timeout))
+        ended += over * (num_envs or 1)
+        if (i + 1) % every == 0:
+            found += watcher.look(2)[1][ENDED].tolist()
+            assert len(found) == ended
+    env.close()
+    found += watcher.look(2)[1][ENDED].tolist()
+    with Recording(path) as recording:
+        assert sorted(found) == recording.index[ENDED].tolist()
 
 
 # ---- Rerun

@@ -31,7 +31,7 @@ from tupli_mcap.recording.logs import FRONT, EvenRecords, EventLog, Sink
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels
 
-__all__ = ["EPISODE_AND_ENV", "EpisodeLog", "ResetFacts", "StartedEpisode"]
+__all__ = ["EPISODE_AND_ENV", "EpisodeLog", "Foretold", "ResetFacts", "StartedEpisode"]
 
 _RECORD = BODY - len(CDR_HEADER)  # bytes of a record before its CDR header
 _LENGTH = _RECORD - 9  # of which its length counts
@@ -60,6 +60,19 @@ class ResetFacts(NamedTuple):
     def goes_on(self) -> bool:
         """True if the reset had no seed, so that it went on with the random stream of what came before it."""
         return self.seed is None and self.drawn_seed is None and not self.continued
+
+
+class Foretold(NamedTuple):
+    """What rows will tell of the episodes up to now.
+
+    Attributes:
+        tables: whole records, by channel.
+        first: the place in the index of the first of `ended` (EPISODE_ROWS, without what starts say).
+    """
+
+    tables: dict[int, Array]
+    first: int
+    ended: Array
 
 
 # makes a StartedEpisode of its fields without a call of Python
@@ -170,17 +183,28 @@ class EpisodeLog(EventLog):
 
     def extend(self, told: EpisodeBatch) -> None:
         """Adds `/episode_start`, `/final_state` and `/episode_end` of what rows have told."""
-        starts, ends, states = told
-        if not len(starts) and not len(ends):
+        if not len(told.starts) and not len(told.ends):
             return
+        begun, final, ended = self._tables(told)
+        self.latest_ns = max(self.latest_ns, *(int(t["#log_time"][-1]) for t in (begun, ended) if len(t)))
+        self._tell_index(begun, ended, final["#sequence"])
+        self._add({self._start: begun, self._final: final, self._end: ended})
+
+    def foretell(self, told: EpisodeBatch) -> Foretold:
+        """What `extend` would add; nothing changes."""
+        begun, final, ended = self._tables(told)
+        tables = {self._start: begun, self._final: final, self._end: ended}
+        return Foretold(tables, self._index.count, _index_rows(ended, final["#sequence"]))
+
+    def _tables(self, told: EpisodeBatch) -> tuple[Array, Array, Array]:
+        """Records of starts, final states and ends."""
+        starts, ends, states = told
         size = states.shape[1]
         begun = self._table(self._start, _START_BODY, _START, starts)
         final = self._table(self._final, bytes(8 + size), (*_BOTH, ("state", f"V{size}", 8)), ends)
         final["state"] = np.ascontiguousarray(states).view(f"V{size}")[:, 0]
         ended = self._table(self._end, _END_BODY, _END, ends)
-        self.latest_ns = max(self.latest_ns, *(int(t["#log_time"][-1]) for t in (begun, ended) if len(t)))
-        self._tell_index(begun, ended, final["#sequence"])
-        self._add({self._start: begun, self._final: final, self._end: ended})
+        return begun, final, ended
 
     def _table(self, channel: int, body: bytes, fields: _Fields, rows: Array) -> Array:
         """Records of one channel: `body` with the fields that `rows` have, in their order and at their times."""
@@ -195,14 +219,7 @@ class EpisodeLog(EventLog):
         return table
 
     def _tell_index(self, begun: Array, ended: Array, final_rows: Array) -> None:
-        rows = np.zeros(len(ended), EPISODE_ROWS)
-        for name in ("first_row", "length", "return", "episode", "env", "end"):
-            rows[name] = ended[name]
-        rows["end_time"], rows["end_row"], rows["final_row"] = (
-            ended["#log_time"],
-            ended["#sequence"],
-            final_rows,
-        )
+        rows = _index_rows(ended, final_rows)
         at = np.searchsorted(begun["episode"], ended["episode"])
         here = np.append(begun["episode"], -1)[at] == ended["episode"]
         rows["start_time"][here] = begun["#log_time"][at[here]]
@@ -236,6 +253,15 @@ class EpisodeLog(EventLog):
         end = self._position + size
         self._records[self._position : end] = sealed
         self._position = self._commit[0] = end
+
+
+def _index_rows(ended: Array, final_rows: Array) -> Array:
+    """Rows of the index, but for what starts say."""
+    rows = np.zeros(len(ended), EPISODE_ROWS)
+    for name in ("first_row", "length", "return", "episode", "env", "end"):
+        rows[name] = ended[name]
+    rows["end_time"], rows["end_row"], rows["final_row"] = ended["#log_time"], ended["#sequence"], final_rows
+    return rows
 
 
 @functools.lru_cache(maxsize=64)

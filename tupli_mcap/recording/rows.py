@@ -19,7 +19,7 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
-from tupli_mcap.recording.episode_log import EpisodeLog
+from tupli_mcap.recording.episode_log import EpisodeLog, Foretold
 from tupli_mcap.recording.episode_rows import EpisodeRows, StartedEpisode
 from tupli_mcap.recording.events import EpisodeEnd
 from tupli_mcap.recording.journal import RowArea
@@ -128,6 +128,7 @@ class SingleRows:
         self._events: EpisodeLog | None = None
         self._told = 0  # rows of the running half that have told it
         self._asked = False  # for what is told at the next reset
+        self._changes = 0  # of what was told; odd while it changes
         self._episodes = EpisodeRows(1, encoder.state_end)
         self._state_end = encoder.state_end
         self.begin_episode(0)
@@ -178,7 +179,9 @@ class SingleRows:
         if self._asked:
             self._asked = False
             start = self._half * area.half
+            self._changes += 1
             self._tell(start, (self.cursor.offset - start) // area.row_size)
+            self._changes += 1
 
     def ask(self) -> None:
         """Rows tell what they have to tell at the next reset, and not only when they go to the file. For any thread."""
@@ -187,11 +190,25 @@ class SingleRows:
     def tell(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
         """The rows from here on will tell `events` of their episodes, and of the final state of the one that has
         ended just now."""
+        self._changes += 1
         self._events = events
         self._told = (self.cursor.offset - self._half * self._area.half) // self._area.row_size
         self._episodes.begin([None])
         self._episodes.wait_for(ended, time.time_ns())
         events.leave_to_rows(started)
+        self._changes += 1
+
+    def foretell(self) -> Foretold | None:
+        """What rows would tell now; None if that is nothing, or just changes. For any thread."""
+        changes, events = self._changes, self._events
+        if changes % 2 or events is None:
+            return None
+        half, row, table = self.committed()
+        copy = self._episodes.copy(table[None, half, self._told : row + 1])
+        if self._changes != changes:
+            return None
+        told = events.foretell(copy())
+        return told if self._changes == changes else None
 
     def settle(self, *, over: bool) -> StartedEpisode | None:
         """Rows tell what they have to tell, and from here on nothing; returns the running episode, if it has a row.
@@ -203,8 +220,10 @@ class SingleRows:
             return None
         half = self._half * self._area.half
         row = (self.cursor.offset - half) // self._area.row_size
+        self._changes += 1
         self._tell(half, row, {0: self.pending_state()} if over else None)
         self._events = None
+        self._changes += 1
         number = int(self._episodes.running[0])
         return None if number < 0 else events.take_back(number)
 
@@ -235,6 +254,7 @@ class SingleRows:
     def _switch(self) -> None:
         """The half is full: go on in the other one, then write this one as a chunk."""
         area, half = self._area, self._half
+        self._changes += 1
         # before the other half's last row goes, whose hole may be here
         self._tell(half * area.half, area.rows)
         spare = half * area.half + area.rows * area.row_size
@@ -246,6 +266,7 @@ class SingleRows:
         flushed, self._flushed = self._flushed, 0
         self.cursor.offset, self.cursor.end = start, start + area.rows * area.row_size
         self._told = 0
+        self._changes += 1
         self._emit(half * area.half, flushed, area.rows)
 
     def flush(self) -> None:
@@ -253,7 +274,9 @@ class SingleRows:
         start = self._half * self._area.half
         rows = (self.cursor.offset - start) // self._area.row_size
         flushed, self._flushed = self._flushed, rows
+        self._changes += 1
         self._tell(start, rows)
+        self._changes += 1
         self._emit(start, flushed, rows)
 
     def _emit(self, start: int, begin: int, end: int) -> None:

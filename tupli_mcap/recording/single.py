@@ -68,6 +68,7 @@ class SingleRecorder:
         self._episode: StartedEpisode | None = None
         self._over: int | None = None  # how the last step has ended its episode, if that is not written yet
         self._is_plain = False  # rows can tell of episodes
+        self._began_plain = False  # the running episode's reset had no seed, options and info
         self._begin_next: Callable[[int, Any], None] = lambda *_: None
         self._put: Put = self._unreset
         self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
@@ -103,6 +104,7 @@ class SingleRecorder:
             rows.begin_episode(writer.next_episode)
             rows.put_state(state)
             self._episode = writer.start_episode(0, rows.count, facts)
+            self._began_plain = facts.goes_on and not facts.options and facts.info == "{}"
             self.put = rows.put
         except BaseException as err:
             writer.stop(err)
@@ -115,6 +117,11 @@ class SingleRecorder:
         if not self._is_plain:
             self.end(end)
             return
+        if self._episode is not None and self._writer.is_watched:
+            if self.resets_itself or not self._began_plain:
+                self.end(end)
+                return
+            self._leave_to_rows(self._episode, end)
         self._over = end
         self.put = self._continue
 
@@ -270,6 +277,7 @@ class SingleRecorder:
         rows.begin_episode(self._writer.next_episode)
         facts = ResetFacts(None, None, "", "{}", 0, continued=True)
         self._episode = self._writer.start_episode(0, rows.count, facts)
+        self._began_plain = False
         self.put = rows.put
         rows.put(action, state, reward, terminal, timeout)
 

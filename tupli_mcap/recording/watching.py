@@ -18,6 +18,7 @@ from tupli_mcap.messages.labels import LABELS_NAME, Labels
 from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.cameras import EncodedFrame, decode_frame
+from tupli_mcap.recording.episode_log import Foretold
 from tupli_mcap.recording.index import EPISODE_ROWS
 from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.logs import EventLog, StepLog, iter_records
@@ -84,7 +85,8 @@ class NewInfo(NamedTuple):
 class Watcher:
     """Reads what `writer` has committed since the last look. For one thread, any but the writer's.
 
-    Where starts and ends of episodes are left to rows, each look asks for those that the next one shows.
+    Where starts and ends of episodes are left to rows, they are made of copies of these rows; each look asks the
+    recorder to write them soon, so that these are few.
     """
 
     def __init__(self, writer: RecordingWriter) -> None:
@@ -96,6 +98,7 @@ class Watcher:
         self._note_ends(np.frombuffer(bytes(writer.index.rows), EPISODE_ROWS))
         self._recent: Array = np.zeros(0, EPISODE_ROWS)
         self._episodes = writer.index.count  # of earlier sessions: not shown
+        writer.is_watched = True
         # frames of steps that have not been looked at: episode, step, message
         self._pictures: dict[int, list[tuple[int, int, bytes]]] = {}
         self._infos: list[tuple[int, bytes]] = []  # of such steps: log_time, message
@@ -141,7 +144,7 @@ class Watcher:
         # ended
         store = self._writer.rows if self._writer.rows is not None else self._writer.vector
         tells = isinstance(store, SingleRows | VectorRows) and store.tells
-        ended = self._ended()
+        ended = self._ended(self._foretell())
         if isinstance(store, SingleRows | VectorRows) and tells:
             store.ask()
         placed = [self._placed(*new, tells=tells) for new in found if new is not None]
@@ -242,6 +245,10 @@ class Watcher:
         self._seen[env] = found[-1][0]
         return env, found[0][0], None, [(time_ns, message) for _, time_ns, message in found]
 
+    def _foretell(self) -> Foretold | None:
+        store = self._writer.rows if self._writer.rows is not None else self._writer.vector
+        return store.foretell() if isinstance(store, SingleRows | VectorRows) else None
+
     def _new_events(self, name: str, log: EventLog) -> list[tuple[int, int, bytes]]:
         return [(c, time_ns, message) for c, _, time_ns, message in self._committed(name, 0, log.committed())]
 
@@ -258,13 +265,18 @@ class Watcher:
         except FormatError:  # written over while it was copied
             return
 
-    def _ended(self) -> Array:
+    def _ended(self, foretold: Foretold | None) -> Array:
+        """New ends: those that have been told, then those that will be."""
         index, size = self._writer.index, EPISODE_ROWS.itemsize
         count = index.count  # read once: it may grow meanwhile
         first = max(self._episodes, count - _EPISODES)
         # a copy: a view would keep the recorder from adding to it
         found = np.frombuffer(bytes(index.rows[first * size : count * size]), EPISODE_ROWS)
-        self._episodes = count
+        if foretold is not None:
+            skip = max(self._episodes, count) - foretold.first
+            found = np.concatenate([found, foretold.ended[skip:]])
+            count = max(count, foretold.first + len(foretold.ended))
+        self._episodes = max(self._episodes, count)
         self._note_ends(found)
         self._recent = np.concatenate([self._recent[-_EPISODES:], found])
         return found

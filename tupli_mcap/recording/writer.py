@@ -88,6 +88,7 @@ class RecordingWriter:
         self.start_is_droppable: Callable[[], bool] = lambda: False
         # sub-environments whose random stream does not come from their last recorded episode
         self.lost_streams: set[int] = set()
+        self.is_watched = False  # ends of episodes are to be seen as they come
         self.num_envs = 1
         self.is_vector = False
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
