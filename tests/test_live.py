@@ -147,6 +147,7 @@ def last_card(path: Path) -> str:
 # ---- what is looked at
 
 ENDED = ["episode", "env", "first_row", "length", "return", "end"]
+EPISODES = ("/episode_start", "/episode_end", "/final_state")
 
 
 def watched(path: Path, inner: gym.Env[Any, Any], num_envs: int, **options: Any) -> tuple[Any, Watcher]:
@@ -271,6 +272,35 @@ def test_an_end_is_seen_before_anything_follows_it(
     found += watcher.look(2)[1][ENDED].tolist()
     with Recording(path) as recording:
         assert sorted(found) == recording.index[ENDED].tolist()
+
+
+@pytest.mark.parametrize("num_envs", [0, 2])
+@pytest.mark.parametrize("options", [{}, {"chunk_size": 200}, {"record_info": True}], ids=str)
+def test_every_start_and_end_is_seen_once(num_envs: int, options: Any, tmp_path: Path) -> None:
+    path, space = tmp_path / "r.mcap", spaces.Box(-1, 1, (3,))
+    env, watcher = watched(path, Sampler(space, space, 3), num_envs, **options)
+    found: list[tuple[int, int, bytes]] = []
+    env.reset(seed=1)
+    for i in range(200):
+        *_, terminal, timeout, _ = env.step(env.action_space.sample())
+        if not num_envs and (terminal or timeout):
+            env.reset(seed=3 if i % 4 == 0 else None)
+        if i % 20 in (0, 10):
+            found += watcher.events()
+        if i % 20 in (5, 15):
+            env.flush()
+        if i % 50 == 40:  # the first one's start is taken back
+            env.reset(seed=4)
+            found += watcher.events()
+            env.reset(seed=5)
+    env.close()
+    found += watcher.events()
+    topics = {channel.id: channel.topic for channel in watcher.writer.container.channels.values()}
+    wanted = [key for key in in_file(path) if key[0] in EPISODES]
+    seen = [key for c, time_ns, message in found if (key := (topics[c], time_ns, message))[0] in EPISODES]
+    for topic in EPISODES:
+        assert [key for key in seen if key[0] == topic] == [key for key in wanted if key[0] == topic]
+    assert [time_ns for _, time_ns, _ in seen] == sorted(time_ns for _, time_ns, _ in seen)
 
 
 # ---- Rerun
@@ -679,6 +709,32 @@ def test_foxglove_gets_the_messages_of_the_file(kind: str, tmp_path: Path) -> No
     decode = generate_dynamic(schema["schemaName"], schema["schema"])["tupli_mcap/Step"]
     first = decode(next(m[2] for m in client.messages if m[0] == f"{top}/step"))
     assert first.reward == (first.step + 1) / 2
+
+
+@pytest.mark.parametrize("num_envs", [0, 2])
+def test_foxglove_gets_ends_while_the_rollout_pauses(num_envs: int, tmp_path: Path) -> None:
+    path, port, space = tmp_path / "r.mcap", free_port(), spaces.Box(-1, 1, (3,))
+    env, _ = watched(path, Sampler(space, space, 4), num_envs, live=f"foxglove://127.0.0.1:{port}")
+    client = Client(port)
+    with env:
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+        wait_for(lambda: bool(client.channels))
+        time.sleep(0.5)  # for what it asks for then
+        over = False
+        for _ in range(58 if num_envs else 63):
+            if over and not num_envs:
+                env.reset()
+            over = bool(np.any(env.step(env.action_space.sample())[2:4]))
+        assert over
+        wanted = 16 if not num_envs else 24
+        wait_for(lambda: sum(m[0] == "/episode_end" for m in client.messages) == wanted)
+        assert sum(m[0] == "/final_state" for m in client.messages) == wanted
+    client.join()
+    known = in_file(path)
+    for topic in EPISODES:
+        found = [known[m] for m in client.messages if m[0] == topic]
+        assert found == list(range(found[0], found[0] + len(found)))
 
 
 def test_foxgloves_port_is_taken(tmp_path: Path) -> None:

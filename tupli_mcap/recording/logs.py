@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 from zlib import crc32
 
@@ -39,6 +39,7 @@ __all__ = [
 Sink = Callable[[Rows], None]
 Encoder = Callable[[Any, bytearray, int], None]
 _HEADER = 64
+_KEPT = 16  # times that a log has gone to the file
 FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
 _LOG_TIME = FRONT.size - 8
 
@@ -120,6 +121,8 @@ class EventLog:
         self.latest_ns = time_ns
         # what the journal holds by channel, so that a flush need not take it apart
         self._whole: defaultdict[int, list[bytes]] = defaultdict(list)
+        # what it held before that, newest last; None while nobody wants it
+        self._written: tuple[Mapping[int, list[bytes]], ...] | None = None
         self._last = 0  # where the last message began
         self._last_channel = 0
         self._can_drop = False
@@ -168,6 +171,29 @@ class EventLog:
         """The records in the journal, for another thread to copy from."""
         return self._records[: self._commit[0]]
 
+    def newest(self, firsts: Mapping[int, int]) -> list[tuple[int, int, int, bytes]]:
+        """(channel, sequence, log_time, CDR message) of the records of channels from a sequence on; for another thread.
+
+        Since it was asked first, a log keeps for a while what has gone to the file.
+        """
+        whole = (
+            self._whole
+        )  # before `_written`: what goes to the file meanwhile is found twice, and not missed
+        if self._written is None:
+            self._written = ()
+        halves = [*self._written, whole]
+        found: dict[tuple[int, int], tuple[int, bytes]] = {}
+        for channel, first in firsts.items():
+            for half in halves:
+                for group in reversed(list(half.get(channel, ()))):
+                    for start, end, _, sequence, time_ns in iter_records(memoryview(group)):
+                        if sequence >= first:
+                            message = group[start + RECORD_HEADER.size : end]
+                            found[channel, sequence] = time_ns, message
+                    if sequence < first:
+                        break
+        return [(*key, *found[key]) for key in sorted(found)]
+
     def drop_last(self, channel: int) -> None:
         """Takes back the message of the last `append`, which was one of `channel`, unless it is in the file already."""
         if not self._can_drop:
@@ -191,7 +217,10 @@ class EventLog:
 
     def _write(self, kept: int = 0) -> None:
         """Writes the records to the file, but the last `kept` of the last channel, which are taken out."""
-        whole, self._whole = self._whole, defaultdict(list)
+        whole = self._whole
+        if self._written is not None:
+            self._written = (*self._written, whole)[-_KEPT:]
+        self._whole = defaultdict(list)
         for channel, records in whole.items():
             if records:
                 before = sum(map(_count, records)) + (kept if channel == self._last_channel else 0)

@@ -31,6 +31,7 @@ __all__ = ["NewInfo", "NewSteps", "Watcher"]
 Array = np.ndarray[Any, Any]
 _EPISODES = 4096  # ended episodes looked at in one go
 _HEADER = RECORD_HEADER.size
+_START = struct.Struct("<IIQ")  # episode, sub-environment and first row, with which starts begin
 _PAIR = struct.Struct("<II")  # episode and step, with which the messages of infos begin
 
 
@@ -103,6 +104,7 @@ class Watcher:
         self._pictures: dict[int, list[tuple[int, int, bytes]]] = {}
         self._infos: list[tuple[int, bytes]] = []  # of such steps: log_time, message
         self._places: dict[str, tuple[int, int]] = {}  # log -> half and position
+        self._told: dict[int, int] = {}  # starts, ends and final states, by channel
 
     @property
     def writer(self) -> RecordingWriter:
@@ -163,8 +165,8 @@ class Watcher:
     def events(self) -> list[tuple[int, int, bytes]]:
         """(channel, log_time, CDR message) of new starts, ends, final states, infos and frames."""
         frames = [(f"frames/{env}", log) for env, log in enumerate(self._writer.frames)]
-        found = []
-        for name, log in (("events", self._writer.events), ("infos", self._writer.infos), *frames):
+        found = self._episode_events()
+        for name, log in (("infos", self._writer.infos), *frames):
             if log is not None:
                 found += self._new_events(name, log)
         return found
@@ -244,6 +246,35 @@ class Watcher:
             return None
         self._seen[env] = found[-1][0]
         return env, found[0][0], None, [(time_ns, message) for _, time_ns, message in found]
+
+    def _episode_events(self) -> list[tuple[int, int, bytes]]:
+        """New starts, ends and final states: those that have been told, and those that will be."""
+        log, channels = self._writer.events, self._writer.channels
+        if log is None:
+            return []
+        foretold = self._foretell()  # before the log: what is told meanwhile is found there, too
+        order = [channels.final_state, channels.end, channels.start]
+        found = log.newest({channel: self._told.get(channel, 0) for channel in order})
+        for channel, table in {} if foretold is None else foretold.tables.items():
+            heads = zip(table["#sequence"].tolist(), table["#log_time"].tolist(), table, strict=True)
+            found += [(channel, row, time_ns, one.tobytes()[_HEADER:]) for row, time_ns, one in heads]
+        new = []
+        for channel, row, time_ns, message in found:
+            if row < self._told.get(channel, 0) or (channel == channels.start and self._is_empty(message)):
+                continue
+            self._told[channel] = row + 1
+            new.append((channel, time_ns, message))
+        return sorted(new, key=lambda one: (one[1], order.index(one[0])))
+
+    def _is_empty(self, start: bytes) -> bool:
+        """True for the start of an episode without a step, which may be taken back."""
+        _, env, first_row = _START.unpack_from(start, BODY - _HEADER)
+        store: Any = self._writer.rows if self._writer.rows is not None else self._writer.vector
+        if isinstance(store, VectorRows):
+            count = int(store.counts[env])
+        else:
+            count = store[env].count if isinstance(store, list) else store.count
+        return bool(first_row >= count) and not self.is_over
 
     def _foretell(self) -> Foretold | None:
         store = self._writer.rows if self._writer.rows is not None else self._writer.vector
