@@ -303,6 +303,20 @@ def test_every_start_and_end_is_seen_once(num_envs: int, options: Any, tmp_path:
     assert [time_ns for _, time_ns, _ in seen] == sorted(time_ns for _, time_ns, _ in seen)
 
 
+def test_infos_do_not_come_between_ends_and_who_wants_the_newest(tmp_path: Path) -> None:
+    env, watcher = watched(tmp_path / "r.mcap", Told(7), 0, record_info=True)
+    with env:
+        roll(env, 700)
+        events = watcher.events()
+    channels = watcher.writer.channels
+    assert sum(channel == channels.info for channel, _, _ in events) == 700
+    assert {channel for channel, _, _ in events[-200:]} == {
+        channels.start,
+        channels.end,
+        channels.final_state,
+    }
+
+
 # ---- Rerun
 
 

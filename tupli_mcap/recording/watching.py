@@ -163,13 +163,13 @@ class Watcher:
         return found
 
     def events(self) -> list[tuple[int, int, bytes]]:
-        """(channel, log_time, CDR message) of new starts, ends, final states, infos and frames."""
+        """(channel, log_time, CDR message) of new infos and frames, then of new starts, ends and final states."""
         frames = [(f"frames/{env}", log) for env, log in enumerate(self._writer.frames)]
-        found = self._episode_events()
+        found = []
         for name, log in (("infos", self._writer.infos), *frames):
             if log is not None:
                 found += self._new_events(name, log)
-        return found
+        return found + self._episode_events()
 
     def camera(self, env: int) -> str | None:
         """The camera whose frames are recorded, if any."""
