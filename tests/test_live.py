@@ -38,6 +38,7 @@ from tupli_mcap.recording.options import WriterOptions
 from tupli_mcap.recording.watching import Watcher
 from tupli_mcap.recording.writer import RecordingWriter
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
+from tupli_mcap.viewer.live import Sketch
 
 MIXED = spaces.Dict(
     {
@@ -318,6 +319,23 @@ def test_infos_do_not_come_between_ends_and_who_wants_the_newest(tmp_path: Path)
 
 
 # ---- Rerun
+
+
+def test_the_overview_counts_all_episodes(tmp_path: Path) -> None:
+    import rerun as rr
+
+    space = spaces.Box(-1, 1, (3,))
+    env, watcher = watched(tmp_path / "r.mcap", Sampler(space, space, 1), 0)
+    with env:
+        roll(env, 10_000)
+        picture = Sketch("many")(watcher)
+        assert picture is not None
+        stream = rr.RecordingStream("many")
+        stream.save(tmp_path / "r.rrd")
+        picture.declare(stream)
+        picture.send(stream, watcher)
+        stream.flush()
+    assert "10,000 episodes" in last_card(tmp_path / "r.rrd")
 
 
 def test_rerun_is_sent_what_is_recorded(tmp_path: Path) -> None:

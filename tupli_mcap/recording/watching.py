@@ -98,7 +98,7 @@ class Watcher:
         self._ends: dict[int, int] = {}  # where its last ended episode ended
         self._note_ends(np.frombuffer(bytes(writer.index.rows), EPISODE_ROWS))
         self._recent: Array = np.zeros(0, EPISODE_ROWS)
-        self._episodes = writer.index.count  # of earlier sessions: not shown
+        self._episodes = self._earlier = writer.index.count  # of earlier sessions: not shown
         writer.is_watched = True
         # frames of steps that have not been looked at: episode, step, message
         self._pictures: dict[int, list[tuple[int, int, bytes]]] = {}
@@ -130,6 +130,11 @@ class Watcher:
     def is_over(self) -> bool:
         """True once the recording is closed: what is there now is the rest."""
         return self._writer.closed
+
+    @property
+    def episodes(self) -> int:
+        """Episodes that have ended up to the last look."""
+        return self._episodes - self._earlier
 
     @property
     def labels(self) -> Labels:

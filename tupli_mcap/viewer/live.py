@@ -118,9 +118,9 @@ class LivePicture:
             env.send_frames(watcher)
         self._envs[0].send_infos(gathered.infos)
         for ended in gathered.ended:
-            self._episodes += len(ended)
             self._returns = [*self._returns, *ended["return"].tolist()][-_BARS:]
             self._lengths = [*self._lengths, *ended["length"].tolist()][-_BARS:]
+        self._episodes = watcher.episodes
         if time.monotonic() >= self._next_overview or watcher.is_over:
             self._send_overview(stream, "recorded" if watcher.is_over else "being recorded")
             self._next_overview = time.monotonic() + _EVERY
