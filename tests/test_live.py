@@ -660,6 +660,7 @@ class Client:
 
     def __init__(self, port: int) -> None:
         self.channels: dict[int, dict[str, Any]] = {}
+        self._topics: set[str] = set()  # listened to
         self.messages: list[tuple[str, int, bytes]] = []
         self._port = port
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -686,10 +687,16 @@ class Client:
                             await asyncio.sleep(0.1)  # else too early for the server
                             wanted = [{"id": i, "channelId": i} for i in new]
                             await ws.send_json({"op": "subscribe", "subscriptions": wanted})
+                            self._topics |= {channel["topic"] for channel in new.values()}
                     elif message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 1:
                         number = int.from_bytes(message.data[1:5], "little")
                         time_ns = int.from_bytes(message.data[5:13], "little")
                         self.messages.append((self.channels[number]["topic"], time_ns, message.data[13:]))
+
+    def wait(self) -> None:
+        """Until it listens to the starts and ends of episodes."""
+        wait_for(lambda: self._topics >= set(EPISODES))
+        time.sleep(0.2)  # for the server to hear of it
 
     def join(self) -> None:
         self._thread.join(10)
@@ -751,8 +758,7 @@ def test_foxglove_gets_ends_while_the_rollout_pauses(num_envs: int, tmp_path: Pa
     with env:
         env.reset(seed=1)
         env.step(env.action_space.sample())
-        wait_for(lambda: bool(client.channels))
-        time.sleep(0.5)  # for what it asks for then
+        client.wait()
         over = False
         for _ in range(58 if num_envs else 63):
             if over and not num_envs:
@@ -767,6 +773,23 @@ def test_foxglove_gets_ends_while_the_rollout_pauses(num_envs: int, tmp_path: Pa
     for topic in EPISODES:
         found = [known[m] for m in client.messages if m[0] == topic]
         assert found == list(range(found[0], found[0] + len(found)))
+
+
+def test_foxglove_gets_the_last_end_before_the_server_stops(tmp_path: Path) -> None:
+    space = spaces.Box(-1, 1, (3,))
+    for number in range(6):  # a server that stops at once is now and then quick enough
+        path, port = tmp_path / f"{number}.mcap", free_port()
+        with RecordEpisodes(Sampler(space, space, 5), path, live=f"foxglove://127.0.0.1:{port}") as env:
+            client = Client(port)
+            env.reset(seed=1)
+            env.step(env.action_space.sample())
+            client.wait()
+            roll(env, 52)
+        client.join()
+        known = in_file(path)
+        for topic in EPISODES:
+            last = max(known[m] for m in known if m[0] == topic)
+            assert known[[m for m in client.messages if m[0] == topic][-1]] == last
 
 
 def test_foxgloves_port_is_taken(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ _STEPS = 250  # of a sub-environment at a time
 _IMAGES = 2
 _ENVS = 8
 _EVENTS = 250
+_FAREWELL = 0.2  # seconds for clients to take what was published last: a server that stops drops it
 
 
 class FoxgloveView:
@@ -103,5 +105,7 @@ class FoxgloveView:
         self._channels = {}
 
     def close(self) -> None:
+        if any(channel.has_sinks() for channel in self._channels.values()):
+            time.sleep(_FAREWELL)
         self._close_channels()
         self._server.stop()
