@@ -171,17 +171,19 @@ class EventLog:
         """The records in the journal, for another thread to copy from."""
         return self._records[: self._commit[0]]
 
+    def keep_written(self) -> None:
+        """From now on, what goes to the file is kept for a while, for those who watch."""
+        self._written = self._written or ()
+
     def newest(self, firsts: Mapping[int, int]) -> list[tuple[int, int, int, bytes]]:
         """(channel, sequence, log_time, CDR message) of the records of channels from a sequence on; for another thread.
 
-        Since it was asked first, a log keeps for a while what has gone to the file.
+        Those that have gone to the file are there since `keep_written`, for a while.
         """
         whole = (
             self._whole
         )  # before `_written`: what goes to the file meanwhile is found twice, and not missed
-        if self._written is None:
-            self._written = ()
-        halves = [*self._written, whole]
+        halves = [*(self._written or ()), whole]
         found: dict[tuple[int, int], tuple[int, bytes]] = {}
         for channel, first in firsts.items():
             for half in halves:

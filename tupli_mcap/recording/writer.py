@@ -225,6 +225,8 @@ class RecordingWriter:
         )  # fmt: skip
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
         self.events, self.infos, self.frames = stores.events, stores.infos, stores.frames
+        if self.is_watched:
+            self.events.keep_written()
 
     # ---- episodes
 
