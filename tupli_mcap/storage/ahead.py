@@ -33,7 +33,7 @@ __all__ = ["Ahead", "ReadRecording"]
 
 _MOST_EPISODES = 50_000  # of a recording that is read ahead: its rows are in memory twice
 _TRIAL = 1.0  # seconds of reading here before it is known whether more processes are worth their start
-_WORTH = 10.0  # seconds that must be left then
+_WORTH = 3.0  # seconds that must be left then
 _MOST_WORKERS = 8
 _SIZE = struct.Struct("<I")
 _PROGRAM = "from tupli_mcap.storage.ahead import serve; serve()"
