@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from tupli_mcap.recording.describe import RecordingDescription, Spread
     from tupli_mcap.schema import EpisodeHeader
+    from tupli_mcap.wrappers.rollout import RolloutSummary
 
 __all__ = ["print_episodes", "register"]
 
@@ -149,18 +150,24 @@ def _record(
         paths = [str(path) for path in summary.paths]
         print_json({**summary._asdict(), "path": str(summary.path), "paths": paths})
         return
+    last = "" if len(summary.paths) == 1 else f" to {summary.path.name}"
+    facts = [
+        counted(summary.episodes, "episode"),
+        counted(summary.steps, "step"),
+        *_mean_text(summary),
+        f"{bytes_of(summary.size)} in {summary.seconds:.1f} s",
+    ]
+    print(f"{summary.paths[0]}{last}: {', '.join(facts)}")
+
+
+def _mean_text(summary: RolloutSummary) -> list[str]:
+    """The mean return, and what it leaves out; nothing where no episode was recorded."""
     from tupli_mcap.recording.describe import nan_text
 
-    last = "" if len(summary.paths) == 1 else f" to {summary.path.name}"
     odd = nan_text(summary.return_nan, summary.episodes)
-    if summary.return_nan == summary.episodes:
-        mean = f"return {odd}"
-    else:
-        mean = f"mean return {number(summary.return_mean)}{f' ({odd})' if odd else ''}"
-    print(
-        f"{summary.paths[0]}{last}: {counted(summary.episodes, 'episode')}, {counted(summary.steps, 'step')}, "
-        f"{mean}, {bytes_of(summary.size)} in {summary.seconds:.1f} s"
-    )
+    if summary.return_nan < summary.episodes:
+        return [f"mean return {number(summary.return_mean)}{f' ({odd})' if odd else ''}"]
+    return [f"return {odd}"] if odd else []
 
 
 def _ls(
