@@ -114,8 +114,7 @@ class Watcher:
     @property
     def layout(self) -> StepLayout | None:
         """None until the first step."""
-        writer = self._writer
-        return writer.layout if writer.rows is not None or writer.vector is not None else None
+        return None if self._store is None else self._writer.layout
 
     @property
     def num_envs(self) -> int:
@@ -149,10 +148,10 @@ class Watcher:
         found = [self._new_records(env) for env in range(min(envs, self.num_envs))]
         # after the rows: unless they tell of their episodes, one that is not there by now has begun where the last one
         # ended
-        store = self._writer.rows if self._writer.rows is not None else self._writer.vector
-        tells = isinstance(store, SingleRows | VectorRows) and store.tells
+        store = self._rows
+        tells = store is not None and store.tells
         ended = self._ended(self._foretell())
-        if isinstance(store, SingleRows | VectorRows) and tells:
+        if store is not None and tells:
             store.ask()
         placed = [self._placed(*new, tells=tells) for new in found if new is not None]
         return [new for new in placed if len(new)], ended
@@ -226,9 +225,19 @@ class Watcher:
             for row, time_ns, message in found[-most:]
         ]
 
+    @property
+    def _store(self) -> Any:
+        """What takes the steps: rows, or a log of each sub-environment; None before the first step."""
+        return self._writer.rows if self._writer.rows is not None else self._writer.vector
+
+    @property
+    def _rows(self) -> SingleRows | VectorRows | None:
+        """The same, if these are rows of constant size."""
+        store = self._store
+        return store if isinstance(store, SingleRows | VectorRows) else None
+
     def _new_records(self, env: int) -> tuple[int, int, Array | None, list[tuple[int, bytes]]] | None:
-        writer, seen = self._writer, self._seen.get(env, -1)
-        store: Any = writer.rows if writer.rows is not None else writer.vector
+        store, seen = self._store, self._seen.get(env, -1)
         if isinstance(store, StepLog | list):
             log = store if isinstance(store, StepLog) else store[env]
             return self._new_messages(env, log, seen)
@@ -274,7 +283,7 @@ class Watcher:
     def _is_empty(self, start: bytes) -> bool:
         """True for the start of an episode without a step, which may be taken back."""
         _, env, first_row = _START.unpack_from(start, BODY - _HEADER)
-        store: Any = self._writer.rows if self._writer.rows is not None else self._writer.vector
+        store: Any = self._store
         if isinstance(store, VectorRows):
             count = int(store.counts[env])
         else:
@@ -282,8 +291,8 @@ class Watcher:
         return bool(first_row >= count) and not self.is_over
 
     def _foretell(self) -> Foretold | None:
-        store = self._writer.rows if self._writer.rows is not None else self._writer.vector
-        return store.foretell() if isinstance(store, SingleRows | VectorRows) else None
+        store = self._rows
+        return None if store is None else store.foretell()
 
     def _new_events(self, name: str, log: EventLog) -> list[tuple[int, int, bytes]]:
         return [(c, time_ns, message) for c, _, time_ns, message in self._committed(name, 0, log.committed())]
