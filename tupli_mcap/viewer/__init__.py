@@ -90,7 +90,7 @@ def display(
     Without `rerun-notebook`, the cell shows what is known of them, and what to install.
 
     Args:
-        width, height: of the viewer (pixels).
+        width, height: of the viewer (pixels); by default as wide as the cell.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.

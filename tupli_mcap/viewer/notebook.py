@@ -6,13 +6,13 @@ import html
 import importlib
 import sys
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Literal
 
 from tupli_mcap.viewer.plan import Plan
 
 __all__ = ["Display", "in_notebook"]
 
-_SIZE = (1200, 700)  # pixels
+_HEIGHT = 700  # pixels
 
 
 def in_notebook() -> bool:
@@ -34,11 +34,12 @@ class Display:
     """Episodes that show themselves as the result of a cell.
 
     Args:
-        width, height: of the viewer (pixels).
+        width, height: of the viewer (pixels); by default as wide as the cell.
     """
 
     def __init__(self, plans: Iterable[Plan], width: int | None = None, height: int | None = None) -> None:
-        self._width, self._height = width or _SIZE[0], height or _SIZE[1]
+        self._width: int | Literal["auto"] = width or "auto"
+        self._height = height or _HEIGHT
         installed = _widget_installed()
         self._facts: list[tuple[str, str]] = []
         self._streams: list[tuple[Any, Any]] = []
