@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import copy
+import fcntl
 import gc
 import os
 import shutil
@@ -12,6 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import warnings
@@ -578,9 +580,18 @@ def test_something_else_listens_at_the_viewers_port(tmp_path: Path) -> None:
     assert_exact(path, 300)
 
 
+@pytest.fixture
+def nobody_at_the_default_port() -> Iterator[None]:
+    """For one test at a time, whichever process runs it."""
+    with (Path(tempfile.gettempdir()) / "tupli-mcap-tests-9876").open("w") as turn:
+        fcntl.flock(turn, fcntl.LOCK_EX)
+        if answers(9876):
+            pytest.skip("a Rerun viewer runs on this machine")
+        yield
+
+
+@pytest.mark.usefixtures("nobody_at_the_default_port")
 def test_no_display_to_start_a_viewer_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if answers(9876):
-        pytest.skip("a Rerun viewer runs on this machine")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.warns(UserWarning, match="there is no display to start a Rerun viewer on; start one") as said:
@@ -619,9 +630,8 @@ def roll_until(env: RecordEpisodes, condition: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
+@pytest.mark.usefixtures("nobody_at_the_default_port")
 def test_a_viewer_that_cannot_start_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if answers(9876):
-        pytest.skip("a Rerun viewer runs on this machine")
     monkeypatch.setenv("DISPLAY", ":77")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with warnings.catch_warnings(record=True) as said:
@@ -633,9 +643,8 @@ def test_a_viewer_that_cannot_start_is_told_once(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.skipif(shutil.which("Xvfb") is None, reason="Xvfb is not installed")
+@pytest.mark.usefixtures("nobody_at_the_default_port")
 def test_a_viewer_is_started_and_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if answers(9876):
-        pytest.skip("a Rerun viewer runs on this machine")
     screen = subprocess.Popen(["Xvfb", ":78", "-screen", "0", "800x600x24"], stderr=subprocess.DEVNULL)
     monkeypatch.setenv("DISPLAY", ":78")
     viewer = None
