@@ -13,11 +13,14 @@ import pytest
 from environments import Sampler
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
+from gymnasium.wrappers import FrameStackObservation
 from mcap.reader import make_reader
 from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.container import Rows
+from tupli_mcap.recording.merge import merge_recordings
 from tupli_mcap.recording.options import WriterOptions
 from tupli_mcap.recording.pngcodec import PngCodec
 from tupli_mcap.recording.repair import recover_recording
@@ -146,16 +149,22 @@ def test_another_format_is_refused_before_a_file_is_made(tmp_path: Path) -> None
     assert not list(tmp_path.iterdir())
 
 
-def test_a_chunk_of_other_pictures_is_a_format_error() -> None:
-    layout = StepLayout(spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Discrete(2))
+def encoded_rows(layout: StepLayout, pixels: Any) -> tuple[PngCodec, Any, Rows]:
+    """A codec, rows of a journal, and what the codec makes of them."""
     (leaf,) = layout.images
     image = layout.image_messages["state"]
-    rows = np.zeros(3, image.dtype)
+    rows = np.zeros(len(pixels), image.dtype)
     rows["fixed"] = np.frombuffer(image.body[8:], np.uint8)
     rows["#opcode"], rows["#length"] = 5, image.dtype.itemsize - 9
-    rows["data"] = np.random.default_rng(0).integers(0, 256, (3, 4, 5, 3))
+    rows["data"] = pixels
     codec = PngCodec(leaf, image)
-    encoded = codec.encode(even_rows(1, 0, rows.tobytes(), rows))
+    return codec, rows, codec.encode(even_rows(1, 0, rows.tobytes(), rows))
+
+
+def test_a_chunk_of_other_pictures_is_a_format_error() -> None:
+    layout = StepLayout(spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Discrete(2))
+    image = layout.image_messages["state"]
+    codec, rows, encoded = encoded_rows(layout, np.random.default_rng(0).integers(0, 256, (3, 4, 5, 3)))
     data = bytes(encoded.data)
     found = np.frombuffer(codec.decode(data, 3, "here"), image.dtype)
     assert np.array_equal(found["data"], rows["data"])
@@ -177,3 +186,95 @@ def test_a_chunk_of_other_pictures_is_a_format_error() -> None:
         except FormatError:
             continue
         assert len(pixels) == 3
+
+
+def test_a_chunk_of_other_stacks_is_a_format_error() -> None:
+    layout = StepLayout(spaces.Box(0, 255, (3, 4, 5), np.uint8), spaces.Discrete(2), stacks=["state"])
+    frames = np.random.default_rng(0).integers(0, 256, (8, 4, 5))
+    codec, rows, encoded = encoded_rows(layout, [frames[i : i + 3] for i in range(6)])
+    data = bytes(encoded.data)
+    found = np.frombuffer(codec.decode(data, 6, "here"), rows.dtype)
+    assert np.array_equal(found["data"], rows["data"])
+    assert codec.encode(encoded) is encoded
+    first, second, third = (int(at) for at in encoded.offsets[:3])
+    with pytest.raises(FormatError, match="here: expected 3 frames in the first picture, found 1"):
+        codec.decode(data[second:], 5, "here")
+    with pytest.raises(FormatError, match="here: expected 7 images, found 6"):
+        codec.decode(data, 7, "here")
+    for height in (3, 7, 16):  # no frame, and more than there are
+        _, _, wrong = encoded_rows(
+            StepLayout(spaces.Box(0, 255, (height, 5, 1), np.uint8), spaces.Discrete(2)),
+            np.zeros((1, height, 5, 1)),
+        )
+        with pytest.raises(
+            FormatError, match=f"here: expected a PNG of L, 5 x 1 to 3 times 4 .* 5 x {height}$"
+        ):
+            codec.decode(data[first:second] + bytes(wrong.data) + data[third:], 6, "here")
+    for at in range(0, len(data), 3):
+        broken = bytearray(data)
+        broken[at] ^= 0x41
+        try:
+            found = np.frombuffer(codec.decode(bytes(broken), 6, "here"), rows.dtype)
+        except FormatError:
+            continue
+        assert len(found) == 6
+
+
+class Seen(gym.ObservationWrapper[Any, Any, Any]):
+    """An image beside a stack."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        picture = spaces.Box(0, 255, (6, 5, 3), np.uint8)
+        self.observation_space = spaces.Dict({"last": env.observation_space, "seen": picture})
+
+    def observation(self, observation: Any) -> Any:
+        return {"last": observation, "seen": np.repeat(observation[-1][:6, :5, None], 3, axis=2)}
+
+
+def beside(path: Path, **options: Any) -> RecordEpisodes:
+    space = spaces.Box(0, 255, (8, 7), np.uint8)
+    return RecordEpisodes(
+        Seen(FrameStackObservation(Sampler(space, spaces.Discrete(2), length=9), 4)),
+        path,
+        attachments={},
+        **options,
+    )
+
+
+def formats(path: Path) -> dict[str, str]:
+    with Recording(path) as recording:
+        channels = recording._contents.channels.values()
+        return {c.metadata["leaf"]: c.metadata.get("codec", "raw") for c in channels if "leaf" in c.metadata}
+
+
+def test_a_leaf_keeps_its_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Earlier versions left stacks as they are; such recordings go on, and none is made of two formats."""
+    path = tmp_path / "old.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr(RecordingWriter, "_png", lambda self, layout: frozenset({"state_seen"}))
+        with beside(path, image_format="png") as env:
+            states = play(env, 40)
+    old = {"state_last": "raw", "state_seen": "png"}
+    assert formats(path) == old
+    for form in ("png", "raw"):
+        with beside(path, mode="a", image_format=form) as env:
+            states += play(env, 30)
+    with beside(tmp_path / "new.mcap", image_format="png") as env:
+        more = play(env, 20)
+    assert formats(tmp_path / "new.mcap") == {"state_last": "png", "state_seen": "png"}
+    rewritten, repaired, merged = (tmp_path / f"{name}.mcap" for name in ("rewritten", "repaired", "merged"))
+    with Recording(path) as recording:
+        rewrite_recording(recording, rewritten)
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(path.read_bytes()[:-100])
+    recover_recording(damaged, repaired)
+    merge_recordings([path, tmp_path / "new.mcap"], merged)
+    for one in (path, rewritten, repaired, merged):
+        assert formats(one) == old
+        expected = states + more if one is merged else states
+        with Recording(one) as recording:
+            found = recording.read().states
+            for key in ("last", "seen"):
+                assert np.array_equal(found[key], np.array([state[key] for state in expected]))
+        assert verify_recording(one).ok

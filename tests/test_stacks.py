@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections import deque
 from pathlib import Path
@@ -14,15 +15,18 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.wrappers import FrameStackObservation, TransformObservation
 from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.imagecodecs import StackCodec
+from tupli_mcap.recording.merge import merge_recordings
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.rows import even_rows
+from tupli_mcap.recording.stackcodec import StackCodec
 from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -85,6 +89,7 @@ def frames_first(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
 
 
 BOTH = pytest.mark.parametrize("placed", [frames_first, frames_last])
+FORMATS = pytest.mark.parametrize("form", ["raw", "png"])
 
 
 def named(name: str, placed: Any) -> list[Any]:
@@ -124,24 +129,32 @@ def record(env: gym.Env[Any, Any], path: Path, steps: int, **options: Any) -> tu
     return states, finals
 
 
-def stored(path: Path) -> list[int]:
-    """Bytes of the images, as any reader of MCAP sees them."""
-    return [len(data) for data in messages(path)]
-
-
-def messages(path: Path) -> list[bytes]:
-    """The images themselves."""
+def pictures(path: Path) -> list[Array]:
+    """The images as ROS tools see them: (height, width x channels)."""
+    found: list[Array] = []
     with path.open("rb") as file:
-        return [message.data for _, _, message in make_reader(file).iter_messages(topics=["/image/state"])]
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, _, _, image in reader.iter_decoded_messages(topics=["/image/state"]):
+            data = bytes(image.data)
+            if schema is not None and schema.name == "sensor_msgs/msg/CompressedImage":
+                assert image.format == "png"
+                with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
+                    found.append(np.asarray(picture).reshape(picture.height, -1))
+            else:
+                found.append(np.frombuffer(data, np.uint8).reshape(image.height, image.step))
+    return found
 
 
-@pytest.mark.parametrize("shape", [(H, W), (H, W, 1), (H, W, 3)])
+@pytest.mark.parametrize("shape", [(H, W), (H, W, 1), (H, W, 3), (H, W, 4)])
 @pytest.mark.parametrize("padding", ["reset", "zero"])
 @BOTH
-def test_each_frame_is_stored_once(tmp_path: Path, shape: tuple[int, ...], padding: str, placed: Any) -> None:
+@FORMATS
+def test_each_frame_is_stored_once(
+    tmp_path: Path, shape: tuple[int, ...], padding: str, placed: Any, form: str
+) -> None:
     path = tmp_path / "r.mcap"
     env = placed(FrameStackObservation(Screen(shape), 4, padding_type=padding))
-    states, finals = record(env, path, 300)
+    states, finals = record(env, path, 300, image_format=form)
     with Recording(path) as recording:
         assert recording.metadata["format_version"] == "2"
         assert np.array_equal(recording.read().states, np.array(states))
@@ -150,30 +163,38 @@ def test_each_frame_is_stored_once(tmp_path: Path, shape: tuple[int, ...], paddi
         assert recording.observation_space == env.observation_space
         layout = recording.layout
         assert layout is not None and layout.stacks == named("state", placed)
-        chunks = len(recording._store.chunks(recording._topics["/image/state"]))
+        image = recording._topics["/image/state"]
+        assert recording._contents.channels[image].metadata.get("codec", "raw") == form
+        chunks = len(recording._store.chunks(image))
+        for threads in (1, 2):
+            assert np.array_equal(recording.read(threads=threads).states, np.array(states))
     assert verify_recording(path).ok
-    frames = [size // int(np.prod(shape)) for size in stored(path)]
+    shown = pictures(path)
+    frames = [len(picture) // H for picture in shown]
     episodes = 300 // 23 + 1
     assert sum(frames) <= 300 + 3 * (chunks + episodes) < 2 * 300
     assert min(frames) == 1 and max(frames) == 4
-    for data, state in zip(messages(path), states, strict=True):  # the newest frame is the lowest one
+    for picture, state in zip(shown, states, strict=True):  # the newest frame is the lowest one
         newest = state[..., -1] if placed is frames_last else state[-1]
-        assert data.endswith(newest.tobytes())
+        assert np.array_equal(picture[-H:], newest.reshape(H, -1))
 
 
 @BOTH
-def test_stacks_that_are_none_come_back_too(tmp_path: Path, placed: Any) -> None:
+@FORMATS
+def test_stacks_that_are_none_come_back_too(tmp_path: Path, placed: Any, form: str) -> None:
     path = tmp_path / "r.mcap"
-    states, _ = record(placed(Odd(FrameStackObservation(Screen(), 5))), path, 400)
+    states, _ = record(placed(Odd(FrameStackObservation(Screen(), 5))), path, 400, image_format=form)
     with Recording(path) as recording:
         assert np.array_equal(recording.read().states, np.array(states))
     assert verify_recording(path).ok
 
 
 @BOTH
-def test_leaves_of_a_dict(tmp_path: Path, placed: Any) -> None:
+@FORMATS
+def test_leaves_of_a_dict(tmp_path: Path, placed: Any, form: str) -> None:
     path = tmp_path / "r.mcap"
-    states, _ = record(placed(FrameStackObservation(Screen(as_dict=True), 3)), path, 60)
+    env = placed(FrameStackObservation(Screen(as_dict=True), 3))
+    states, _ = record(env, path, 60, image_format=form)
     with Recording(path) as recording:
         found = recording.read().states
         assert recording.layout.stacks == named("state_see", placed)  # type: ignore[union-attr]
@@ -216,9 +237,10 @@ def test_sub_environments_are_asked_before(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
 @pytest.mark.parametrize("stacked", [FrameStackObservation, Older])
 @BOTH
-def test_sub_environments(tmp_path: Path, kind: Any, stacked: Any, placed: Any) -> None:
+@FORMATS
+def test_sub_environments(tmp_path: Path, kind: Any, stacked: Any, placed: Any, form: Any) -> None:
     path = tmp_path / "r.mcap"
-    env = RecordVector(kind([lambda: placed(stacked(Screen(), 4))] * 3), path)
+    env = RecordVector(kind([lambda: placed(stacked(Screen(), 4))] * 3), path, image_format=form)
     taken: list[list[Array]] = [[], [], []]
     states, _ = env.reset(seed=1)
     for t in range(200):
@@ -249,9 +271,10 @@ def test_frames_that_ale_stacks(tmp_path: Path) -> None:
 
 
 @BOTH
-def test_killed_appended_rewritten_and_repaired(tmp_path: Path, placed: Any) -> None:
+@FORMATS
+def test_killed_appended_rewritten_and_repaired(tmp_path: Path, placed: Any, form: Any) -> None:
     path, killed = tmp_path / "r.mcap", tmp_path / "killed.mcap"
-    env = RecordEpisodes(placed(FrameStackObservation(Screen(), 4)), path, chunk_size=4000)
+    env = RecordEpisodes(placed(FrameStackObservation(Screen(), 4)), path, chunk_size=4000, image_format=form)
     states = []
     state, _ = env.reset(seed=1)
     for t in range(100):
@@ -288,7 +311,19 @@ def test_killed_appended_rewritten_and_repaired(tmp_path: Path, placed: Any) -> 
             assert recording.metadata["format_version"] == "2"
             assert np.array_equal(recording.read().states, expected)
         assert verify_recording(one).ok
-        assert sum(size // (H * W) for size in stored(one)) < 2.5 * len(expected)
+        assert sum(len(picture) // H for picture in pictures(one)) < 2.5 * len(expected)
+
+
+@FORMATS
+def test_stacks_of_two_recordings_are_merged(tmp_path: Path, form: str) -> None:
+    paths, states = [tmp_path / f"{i}.mcap" for i in range(2)], []
+    for path, other in zip(paths, (form, "raw"), strict=True):
+        states += record(FrameStackObservation(Screen(), 4), path, 60, image_format=other, attachments={})[0]
+    merge_recordings(paths, tmp_path / "all.mcap")
+    with Recording(tmp_path / "all.mcap") as merged:
+        assert np.array_equal(merged.read().states, np.array(states))
+    assert verify_recording(tmp_path / "all.mcap").ok
+    assert sum(len(picture) // H for picture in pictures(tmp_path / "all.mcap")) < 2 * len(states)
 
 
 def test_a_chunk_that_holds_no_stacks_is_a_format_error() -> None:

@@ -126,12 +126,13 @@ def painting(episode: int, t: int) -> Any:
 
 def stored_png(picture: Any, form: str = "png") -> bytes:
     """A PNG that is not compressed: what a compressor writes changes with its version."""
-    height, width, _ = picture.shape
+    height, width, channels = picture.shape
     lines = b"".join(b"\0" + row.tobytes() for row in picture)
     size = len(lines).to_bytes(2, "little")
     complement = bytes(255 - byte for byte in size)
     data = b"\x78\x01\x01" + size + complement + lines + zlib.adler32(lines).to_bytes(4, "big")
-    head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\x08\x02\0\0\0"
+    head = width.to_bytes(4, "big") + height.to_bytes(4, "big")
+    head += b"\x08" + {1: b"\0", 3: b"\x02"}[channels] + bytes(3)  # 8 bits: grey, or RGB
     chunks = ((b"IHDR", head), (b"IDAT", data), (b"IEND", b""))
     parts = (
         len(b).to_bytes(4, "big") + name + b + zlib.crc32(name + b).to_bytes(4, "big") for name, b in chunks
@@ -202,7 +203,7 @@ def constant(path: Path, compression: str) -> list[Log]:
     return episodes
 
 
-def stacked(path: Path, axis: int = 0) -> list[Log]:
+def stacked(path: Path, axis: int = 0, **options: Any) -> list[Log]:
     def observe(episode: int, t: int) -> Any:
         return np.arange(6, dtype=np.uint8).reshape(2, 3) + np.uint8(40 * episode + 7 * t)
 
@@ -212,7 +213,9 @@ def stacked(path: Path, axis: int = 0) -> list[Log]:
         window = TransformObservation(
             window, lambda frames: np.moveaxis(frames, 0, axis), spaces.Box(0, 255, (2, 3, 3), np.uint8)
         )
-    with RecordEpisodes(window, path, compression="none", attachments={}, chunk_size=400) as recorder:
+    with RecordEpisodes(
+        window, path, compression="none", attachments={}, chunk_size=400, **options
+    ) as recorder:
         roll(recorder, env, [3, 4, 2], action)
     episodes = expected(env)
     for episode in episodes:
@@ -232,6 +235,11 @@ def png_images(path: Path) -> list[Log]:
     ):
         roll(recorder, env, [3, 4, 2], action)
     return expected(env)
+
+
+def png_stacks(path: Path) -> list[Log]:
+    with mock.patch("tupli_mcap.recording.pngcodec.encode_pixels", stored_png):
+        return stacked(path, image_format="png")
 
 
 def dict_with_images(path: Path) -> list[Log]:
@@ -530,6 +538,7 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "png_images": png_images,
     "unfinished_holes": unfinished_holes,
     "stacked_last": lambda path: stacked(path, -1),
+    "png_stacks": png_stacks,
 }
 
 

@@ -87,6 +87,13 @@ KINDS = {
     "stacked last": Kind(
         spaces.Box(0, 255, (90, 70, 3), np.uint8), (20_000, 60_000), threaded=True, window=-1
     ),
+    "stacked png": Kind(
+        spaces.Box(0, 255, (4, 90, 70), np.uint8),
+        (20_000, 60_000),
+        threaded=True,
+        window=0,
+        options={"image_format": "png"},
+    ),
     "png": Kind(_IMAGE, (700, 2000, 20_000), options={"image_format": "png"}),
     "png frames": Kind(
         spaces.Box(0, 255, (80, 80, 3), np.uint8),

@@ -9,7 +9,7 @@ import numpy as np
 
 from tupli_mcap.errors import MissingExtraError
 from tupli_mcap.live.target import Target
-from tupli_mcap.messages.layout import IMAGE_SCHEMA, RECORD_HEADER
+from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA, RECORD_HEADER
 from tupli_mcap.recording.imagecodecs import CODEC
 from tupli_mcap.recording.watching import NewSteps, Watcher
 from tupli_mcap.recording.writer import RecordingWriter
@@ -69,7 +69,7 @@ class FoxgloveView:
             schema = container.schemas[channel.schema_id]
             name, text = schema.name, schema.data
             if CODEC in channel.metadata:  # what is shown comes out of the journal, as pixels
-                name, text = "sensor_msgs/msg/Image", IMAGE_SCHEMA.encode()
+                name, text = IMAGE_NAME, IMAGE_SCHEMA.encode()
             self._channels[channel.id] = self._sdk.Channel(
                 channel.topic,
                 schema=self._sdk.Schema(name=name, encoding=schema.encoding, data=text),

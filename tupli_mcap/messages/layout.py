@@ -19,6 +19,7 @@ __all__ = [
     "BODY",
     "CDR_HEADER",
     "HEADER_FIELDS",
+    "IMAGE_NAME",
     "IMAGE_SCHEMA",
     "RECORD_HEADER",
     "Field",
@@ -45,6 +46,7 @@ HEADER_FIELDS: list[tuple[str, str, int]] = [
 
 _TIME_MSG = "int32 sec\nuint32 nanosec\n"
 _SEPARATOR = "=" * 80 + "\n"
+IMAGE_NAME = "sensor_msgs/msg/Image"
 IMAGE_SCHEMA = (
     "std_msgs/Header header\nuint32 height\nuint32 width\n"
     "string encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"

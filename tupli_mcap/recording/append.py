@@ -17,7 +17,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import COMPRESSIONS, Container
 from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.durability import sync_file
-from tupli_mcap.recording.imagecodecs import image_codecs, image_format
+from tupli_mcap.recording.imagecodecs import image_codecs
 from tupli_mcap.recording.journal import journal_info, journal_path, recorded_journal
 from tupli_mcap.recording.recover import belongs, head, misplaced_journal
 from tupli_mcap.recording.signed import SIGNATURE_NAME
@@ -204,7 +204,6 @@ def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> Non
         writer.container.codecs = image_codecs(writer.layout, writer.container.channels)
         writer.recorded_envs = len(steps)
         writer.recorded_vector = steps[0].topic != "/step"
-        writer.options = writer.options._replace(image_format=image_format(writer.container.channels))
     elif contents.metadata["format_version"] < writer.options.format_version:
         raise RecordingError(
             f"{writer.path} was begun in format version {contents.metadata['format_version']}, holds no step, and "

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.messages.layout import IMAGE_SCHEMA
-from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.cameras import (
     CAMERA_NAME,
@@ -20,7 +19,6 @@ from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.events import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.recording.imagecodecs import CODEC, image_codecs
 from tupli_mcap.recording.journal import Area, LogArea, RowArea
-from tupli_mcap.recording.pictures import ImageFormat
 from tupli_mcap.recording.rows import CHUNKS_PER_HALF, rows_per_half
 
 __all__ = ["FRAMES_AREA", "Channels", "plan_areas", "register_channels"]
@@ -48,12 +46,13 @@ def register_channels(
     sub_environments: int | None,
     info: tuple[str, Mapping[str, str]] | None,
     cameras: Sequence[str] = (),
-    images_as: ImageFormat = "raw",
+    png: Collection[str] = (),
 ) -> Channels:
     """Adds the channels a layout needs, or finds them in a recording that is appended to.
 
     `sub_environments` is None for a single environment; `info` is the schema and the metadata of `/info`.
-    `cameras` are names; the ids of the last one's channels are returned.
+    `cameras` are names; the ids of the last one's channels are returned. `png` are the image leaves that are stored as
+    PNG, by name.
 
     Raises:
         RecordingError: a channel of that topic has another schema.
@@ -83,8 +82,8 @@ def register_channels(
         [
             channel(
                 f"{top}/image/{leaf.name}",
-                *_image_schema(leaf, images_as),
-                {"env": str(i), "leaf": leaf.name, **({CODEC: "png"} if _is_png(leaf, images_as) else {})},
+                *((CAMERA_NAME, CAMERA_SCHEMA) if leaf.name in png else (IMAGE_NAME, IMAGE_SCHEMA)),
+                {"env": str(i), "leaf": leaf.name, **({CODEC: "png"} if leaf.name in png else {})},
             )
             for i, top in enumerate(tops)
         ]
@@ -110,16 +109,6 @@ def register_channels(
             )
     container.codecs = image_codecs(layout, container.channels)
     return Channels(steps, images, *others, pairs)
-
-
-def _is_png(leaf: Leaf, images_as: ImageFormat) -> bool:
-    return leaf.kind == "image" and images_as == "png"
-
-
-def _image_schema(leaf: Leaf, images_as: ImageFormat) -> tuple[str, str]:
-    return (
-        (CAMERA_NAME, CAMERA_SCHEMA) if _is_png(leaf, images_as) else ("sensor_msgs/msg/Image", IMAGE_SCHEMA)
-    )
 
 
 def plan_areas(

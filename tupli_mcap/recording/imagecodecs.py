@@ -6,30 +6,22 @@ asked for. Which one a channel has stands in the metadata.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-import numpy as np
 from mcap.records import Channel
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.layout import BODY, ImageLayout
+from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.container import Rows
-from tupli_mcap.recording.pictures import ImageFormat
 from tupli_mcap.recording.pngcodec import PngCodec
+from tupli_mcap.recording.stackcodec import StackCodec
 
-__all__ = ["CODEC", "ImageCodec", "StackCodec", "image_codecs", "image_format", "uses_codecs"]
+__all__ = ["CODEC", "ImageCodec", "image_codecs", "png_leaves", "uses_codecs"]
 
 CODEC = "codec"  # key of the metadata of an image channel
-
-Array = np.ndarray[Any, Any]
-_LENGTH = struct.Struct("<Q")  # of a Message record, after its opcode
-_HEIGHT_WIDTH = struct.Struct("<II")
-_COUNT = struct.Struct("<I")
 
 
 class ImageCodec(Protocol):
@@ -56,126 +48,33 @@ def image_codecs(layout: StepLayout, channels: Mapping[int, Channel]) -> dict[in
         leaf = leaves.get(channel.metadata.get("leaf", ""))
         if leaf is None or "/image/" not in channel.topic:
             continue
-        name = channel.metadata.get(CODEC, "stack" if leaf.kind == "stack" else "raw")
-        if name != "raw":
-            found[number] = _codec(name, leaf, layout.image_messages[leaf.name], channel.topic)
+        codec = _codec(channel, leaf, layout.image_messages[leaf.name])
+        if codec is not None:
+            found[number] = codec
     return found
 
 
-def _codec(name: str, leaf: Leaf, layout: ImageLayout, topic: str) -> ImageCodec:
-    """The codec of a name; one of video would be named and made here."""
-    if name == "stack" and leaf.kind == "stack":
-        return StackCodec(leaf, layout)
-    if name == "png" and leaf.kind == "image":
+def _codec(channel: Channel, leaf: Leaf, layout: ImageLayout) -> ImageCodec | None:
+    """The codec a channel names; one of video would be named and made here."""
+    name = channel.metadata.get(CODEC)
+    if name is None:
+        return StackCodec(leaf, layout) if leaf.kind == "stack" else None
+    if name == "png":
         return PngCodec(leaf, layout)
     raise FormatError(
-        f"{topic}: expected images as 'png' or none of the name, found {name!r:.40}; update tupli-mcap"
+        f"{channel.topic}: expected images as 'png' or none of the name, found {name!r:.40}; update tupli-mcap"
     )
 
 
-def image_format(channels: Mapping[int, Channel]) -> ImageFormat:
-    """The format of the images in a recording with these channels."""
-    return "png" if any(channel.metadata.get(CODEC) == "png" for channel in channels.values()) else "raw"
+def png_leaves(channels: Mapping[int, Channel]) -> frozenset[str]:
+    """The names of the leaves whose images are PNG in a recording with these channels."""
+    return frozenset(
+        channel.metadata.get("leaf", "")
+        for channel in channels.values()
+        if channel.metadata.get(CODEC) == "png"
+    )
 
 
 def uses_codecs(channels: Mapping[int, Channel]) -> bool:
     """True if a recording with these channels has format version 2."""
     return any("stacks" in channel.metadata or CODEC in channel.metadata for channel in channels.values())
-
-
-class StackCodec:
-    """Frames of a sliding window, each stored once.
-
-    A message holds the newest frames of a row, as one picture below the other: so many that the older ones are the
-    newest of the row before it in the chunk. The first row of a chunk holds all of them, and so does any other misfit.
-    """
-
-    def __init__(self, leaf: Leaf, layout: ImageLayout) -> None:
-        self._dtype = layout.dtype
-        self._frames, self._height, width = leaf.stored_shape[:3]
-        self._frame_bytes = leaf.size // self._frames
-        self._start = layout.dtype.itemsize - leaf.size  # of the pixels in a record
-        self._height_at = BODY + layout.body.index(_HEIGHT_WIDTH.pack(self._frames * self._height, width), 8)
-
-    def _windows(self, data: Any, count: int) -> Array:
-        """The frames of each row, as bytes: (count, frames, bytes of a frame)."""
-        size = self._frame_bytes
-        shape, strides = (count, self._frames, size), (self._dtype.itemsize, size, 1)
-        return np.ndarray(shape, np.uint8, data, self._start, strides)
-
-    def _new_frames(self, windows: Array) -> list[int]:
-        """How many frames of each row are not the newest ones of the row before, at least 1."""
-        k = self._frames
-        new = [k] * len(windows)
-        moved = (windows[1:, : k - 1] == windows[:-1, 1:]).all(axis=(1, 2))
-        for i in range(1, len(windows)):
-            if moved[i - 1]:
-                new[i] = 1
-                continue
-            same = (m for m in range(2, k) if np.array_equal(windows[i, : k - m], windows[i - 1, m:]))
-            new[i] = next(same, k)
-        return new
-
-    def encode(self, rows: Rows) -> Rows:
-        size, count, data = self._dtype.itemsize, len(rows.offsets), memoryview(rows.data).cast("B")
-        if len(data) != size * count:
-            return rows
-        parts: list[Any] = []
-        lengths = np.empty(count, np.uint64)
-        for i, new in enumerate(self._new_frames(self._windows(data, count))):
-            end = (i + 1) * size
-            pixels = new * self._frame_bytes
-            head = bytearray(data[i * size : i * size + self._start])
-            lengths[i] = len(head) + pixels
-            _LENGTH.pack_into(head, 1, len(head) + pixels - 9)
-            _COUNT.pack_into(head, self._height_at, new * self._height)
-            _COUNT.pack_into(head, self._start - 4, pixels)
-            parts += [head, data[end - pixels : end]]
-        offsets = np.zeros(count, np.uint64)
-        np.cumsum(lengths[:-1], out=offsets[1:])
-        return rows._replace(data=b"".join(parts), offsets=offsets)
-
-    def decode(self, data: Any, count: int, where: str) -> Any:
-        size, start, frame = self._dtype.itemsize, self._start, self._frame_bytes
-        if count * size > MAX_CHUNK:
-            raise FormatError(
-                f"{where}: expected at most {MAX_CHUNK} bytes of stacked frames, found {count * size}"
-            )
-        if len(data) == count * size:
-            return data
-        if len(data) < count * (start + frame):  # before anything is allocated
-            raise FormatError(f"{where}: expected {count} stacks of frames, found {len(data)} bytes")
-        out = bytearray(count * size)
-        source, windows, at = memoryview(data), self._windows(out, count), 0
-        for i in range(count):
-            if at + start > len(source):
-                raise FormatError(f"{where}: expected {count} stacks of frames, found {i}")
-            (length,) = _LENGTH.unpack_from(source, at + 1)
-            new, rest = divmod(length + 9 - start, frame)
-            end = at + start + new * frame
-            least = 1 if i else self._frames  # the first row of a chunk has nothing to go on with
-            if rest or not least <= new <= self._frames or end > len(source):
-                raise FormatError(
-                    f"{where}: row {i} expected 1 to {self._frames} frames, found {length} bytes"
-                )
-            head = memoryview(out)[i * size : i * size + start]
-            head[:] = source[at : at + start]
-            told = _COUNT.unpack_from(head, self._height_at)[0], _COUNT.unpack_from(head, start - 4)[0]
-            if told != (new * self._height, new * frame):
-                raise FormatError(
-                    f"{where}: row {i} expected a picture of {new} frames, found one of height {told[0]}"
-                )
-            _LENGTH.pack_into(head, 1, size - 9)
-            _COUNT.pack_into(head, self._height_at, self._frames * self._height)
-            _COUNT.pack_into(head, start - 4, self._frames * frame)
-            if new < self._frames:
-                windows[i, : self._frames - new] = windows[i - 1, new:]
-            windows[i, self._frames - new :] = np.frombuffer(source[at + start : end], np.uint8).reshape(
-                new, frame
-            )
-            at = end
-        if at != len(source):
-            raise FormatError(
-                f"{where}: expected {count} stacks of frames in {at} bytes, found {len(source)} bytes"
-            )
-        return out

@@ -17,7 +17,7 @@ from tupli_mcap.errors import RecordingError, SpaceError
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
-from tupli_mcap.recording.imagecodecs import image_format
+from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.library import library
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.replacing import replacing
@@ -155,8 +155,8 @@ def _define_missing(source: Recording, container: Container) -> None:
         text = source._contents.schemas[channel.schema_id].data.decode()
         info = text, {key: value for key, value in channel.metadata.items() if key != "crc"}
     vector = source.num_envs if source.is_vector else None
-    images = image_format(container.channels)  # a recording has one, whatever the others have
-    register_channels(container, source.name, source.layout, vector, info, source.cameras, images)
+    png = png_leaves(container.channels)  # as the first one has them, whatever the others have
+    register_channels(container, source.name, source.layout, vector, info, source.cameras, png)
 
 
 def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool) -> None:

@@ -112,8 +112,10 @@ def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
     return out.getvalue()
 
 
-def decode_pixels(data: bytes, shape: tuple[int, ...], where: str) -> np.ndarray[Any, Any]:
-    """The pixels of a PNG, of this shape.
+def decode_pixels(
+    data: bytes, shape: tuple[int, int, int], where: str, most: int = 1
+) -> np.ndarray[Any, Any]:
+    """The pixels of a PNG of 1 to `most` pictures of this shape (height, width, channels), one below the other.
 
     Raises:
         FormatError: it is no PNG, or of another size, depth or kind.
@@ -121,12 +123,17 @@ def decode_pixels(data: bytes, shape: tuple[int, ...], where: str) -> np.ndarray
     """
     image_module = _pillow()
     height, width, channels = shape
-    expected = (width, height), {1: "L", 3: "RGB", 4: "RGBA"}[channels]
+    sizes = {(width, n * height) for n in range(1, most + 1)}
+    mode = {1: "L", 3: "RGB", 4: "RGBA"}[channels]
     try:
         with image_module.open(io.BytesIO(data), formats=("PNG",)) as image:
-            if (image.size, image.mode) != expected:
-                raise FormatError(f"{where}: expected a PNG of {expected}, found {image.size, image.mode}")
-            return np.asarray(image).reshape(shape)
+            if image.size not in sizes or image.mode != mode:
+                heights = f"{height}" if most == 1 else f"1 to {most} times {height}"
+                raise FormatError(
+                    f"{where}: expected a PNG of {mode}, {width} x {heights} pixels, found {image.mode}, "
+                    f"{image.width} x {image.height}"
+                )
+            return np.asarray(image).reshape(-1, width, channels)
     except FormatError:
         raise
     except Exception as err:  # Pillow's decoders raise many kinds

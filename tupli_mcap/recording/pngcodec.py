@@ -1,4 +1,4 @@
-"""Images as a PNG each: `sensor_msgs/msg/CompressedImage`, which viewers show and which gives every pixel back."""
+"""Images as PNG: `sensor_msgs/msg/CompressedImage`, which viewers show and which gives every pixel back."""
 
 from __future__ import annotations
 
@@ -14,17 +14,25 @@ from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.pictures import decode_pixels, encode_pixels
+from tupli_mcap.recording.stackcodec import new_frames
 
 __all__ = ["PngCodec"]
 
+Array = np.ndarray[Any, Any]
+
 
 class PngCodec:
-    """An `ImageCodec`: the rows of an image leaf, each of them a PNG. It needs Pillow."""
+    """An `ImageCodec`: a PNG of each row of an image leaf, or of the newest frames of a stack. It needs Pillow.
+
+    A stack's frames are each stored once, as `StackCodec` does it; an image is a stack of one frame.
+    """
 
     def __init__(self, leaf: Leaf, layout: ImageLayout) -> None:
         self._leaf = leaf
         self._dtype = layout.dtype
         self._fixed = np.frombuffer(layout.body[8:], np.uint8)
+        self._frames, *frame = leaf.stored_shape if leaf.kind == "stack" else (1, *leaf.shape)
+        self._height, self._width, self._channels = (*frame, 1)[:3]
 
     def _is_raw(self, data: Any, count: int) -> bool:
         """Whether these are the rows of a journal."""
@@ -32,14 +40,22 @@ class PngCodec:
             return False
         return bool((np.frombuffer(data, self._dtype)["fixed"] == self._fixed).all())
 
+    def _windows(self, rows: Array) -> Array:
+        """The frames of each row, as bytes: (rows, frames, bytes of a frame)."""
+        size = self._height * self._width * self._channels
+        windows: Array = rows["data"].reshape(len(rows), self._frames, size)
+        return windows
+
     def encode(self, rows: Rows) -> Rows:
         count = len(rows.offsets)
         if not self._is_raw(rows.data, count):
             return rows
         records = []
-        for row in np.frombuffer(rows.data, self._dtype):
+        images = np.frombuffer(rows.data, self._dtype)
+        windows = self._windows(images)
+        for row, window, new in zip(images, windows, new_frames(windows), strict=True):
             time_ns = int(row["sec"]) * 10**9 + int(row["nanosec"])
-            png = encode_pixels(row["data"].reshape(self._leaf.shape))
+            png = encode_pixels(window[-new:].reshape(new * self._height, self._width, self._channels))
             body = encode_frame(self._leaf.name, EncodedFrame(time_ns, "png", png))
             times = int(row["#log_time"]), int(row["#publish_time"])
             head = RECORD_HEADER.pack(5, BODY - 9 + len(body), rows.channel, int(row["#sequence"]), *times)
@@ -56,7 +72,7 @@ class PngCodec:
             return data
         out = np.zeros(count, self._dtype)
         out["fixed"] = self._fixed
-        view, found = memoryview(data), 0
+        view, windows, found = memoryview(data), self._windows(out), 0
         for start, end, channel, sequence, log_time in iter_records(view):
             if found == count:
                 raise FormatError(f"{where}: expected {count} images, found more")
@@ -71,7 +87,16 @@ class PngCodec:
             row["#publish_time"] = RECORD_HEADER.unpack_from(view, start)[5]
             row["#cdr"] = int.from_bytes(view[start + BODY - 4 : start + BODY], "little")
             row["sec"], row["nanosec"] = divmod(frame.time_ns, 10**9)
-            row["data"] = decode_pixels(frame.data, self._leaf.shape, where)
+            shape = self._height, self._width, self._channels
+            frames = decode_pixels(frame.data, shape, where, self._frames).reshape(-1, windows.shape[2])
+            old = self._frames - len(frames)
+            if old and not found:
+                raise FormatError(
+                    f"{where}: expected {self._frames} frames in the first picture, found {len(frames)}"
+                )
+            if old:
+                windows[found, :old] = windows[found - 1, -old:]
+            windows[found, old:] = frames
             found += 1
         if found != count:
             raise FormatError(f"{where}: expected {count} images, found {found}")

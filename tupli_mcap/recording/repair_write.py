@@ -20,7 +20,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.events import record
-from tupli_mcap.recording.imagecodecs import image_codecs, image_format, uses_codecs
+from tupli_mcap.recording.imagecodecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.library import library
 from tupli_mcap.recording.logs import group_records
@@ -106,7 +106,7 @@ class RepairWriter:
             envs,
             info,
             cameras.names,
-            image_format(channels),
+            png_leaves(channels),
         )
         self._container.define_channels()
         rows: dict[int, int] = {}  # first row of each episode in the new file

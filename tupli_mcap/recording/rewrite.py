@@ -14,7 +14,7 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import RECORDING_METADATA
-from tupli_mcap.recording.imagecodecs import image_codecs, image_format
+from tupli_mcap.recording.imagecodecs import image_codecs, png_leaves
 from tupli_mcap.recording.library import library
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.replacing import replacing
@@ -138,5 +138,5 @@ def camera_channels(
     if new is not None and new.camera not in found:
         vector = source.num_envs if source.is_vector else None
         where = (container, source.name, source.layout, vector, None, (new.camera,))
-        found[new.camera] = register_channels(*where, image_format(source._contents.channels)).cameras
+        found[new.camera] = register_channels(*where, png_leaves(source._contents.channels)).cameras
     return found

@@ -13,7 +13,7 @@ from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, Si
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
-from tupli_mcap.recording.imagecodecs import image_format
+from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.infos import info_schema
 from tupli_mcap.recording.journal import journal_info, recorded_journal
 from tupli_mcap.recording.lock import is_locked
@@ -151,10 +151,8 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
     vector = None if "/step" in topics else recording.num_envs
     try:
         infos = None if info is None else (info_schema(info.metadata), info.metadata)
-        images_as = image_format(recording._contents.channels)
-        register_channels(
-            wanted, recording.name, recording.layout, vector, infos, recording.cameras, images_as
-        )
+        png = png_leaves(recording._contents.channels)
+        register_channels(wanted, recording.name, recording.layout, vector, infos, recording.cameras, png)
     except FormatError as err:
         findings.error("layout", str(err))
         return

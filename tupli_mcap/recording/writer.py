@@ -25,6 +25,7 @@ from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
 from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
+from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_path, owner_among
 from tupli_mcap.recording.library import library
@@ -177,7 +178,7 @@ class RecordingWriter:
             num_envs if vector else None,
             info_schema,
             self.options.cameras,
-            self.options.image_format,
+            self._png(layout),
         )
         self._make_stores(self._areas())
         # after the journal: a file that has channels and no end has one
@@ -186,6 +187,12 @@ class RecordingWriter:
         if self._durable:
             self._settle()
             sync_directory(self._place.parent)
+
+    def _png(self, layout: StepLayout) -> frozenset[str]:
+        """The image leaves stored as PNG: as the options say, on append as they are in the file."""
+        if self.recorded_envs is not None:
+            return png_leaves(self.container.channels)
+        return frozenset(leaf.name for leaf in layout.images if self.options.image_format == "png")
 
     def cut(self) -> None:
         """On append: takes index and summary off the file. Before, nothing in it has changed."""
