@@ -12,6 +12,11 @@ from tools.bench.measure import ratio
 
 MATERIALIZED = "tupli-mcap, materialized"
 NPY, HDF5 = ".npy, mapped", "HDF5 by hand"
+_SIZES = {
+    "bytes": "lengths of the files",
+    "apparent": "lengths of files and directories",
+    "allocated": "allocated on disk",
+}
 MINARI = ("Minari HDF5", "Minari Arrow", "Minari Parquet")
 
 
@@ -130,7 +135,7 @@ def _recording(m: Matrix) -> Iterator[Target]:
 
 def _sizes(m: Matrix) -> Iterator[Target]:
     for work, limit in (("cartpole", 0.25), ("images", 0.6)):
-        for key, words in (("bytes", "lengths of the files"), ("allocated", "allocated on disk")):
+        for key, words in _SIZES.items():
             sizes = [size for name in MINARI if (size := m.built(work, name).get(key))]
             mine = m.built(work, OURS).get(key)
             figure = mine / min(sizes) if mine and sizes else None

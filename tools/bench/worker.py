@@ -72,19 +72,16 @@ class Worker:
         self._contender.record(workload, where, len(data.lengths))
         self._built[work, path] = data
         narrowed = self._check(where, data)
-        lengths, allocated = _sizes(where)
         return {
             "steps": data.steps,
             "episodes": len(data.lengths),
             "narrowed": narrowed,
-            "bytes": lengths / data.steps,
-            "allocated": allocated / data.steps,
+            **_sizes(where, data.steps),
         }
 
     def _build_vector(self, where: Path, steps: int, seconds: float | None) -> dict[str, Any]:
         _, count = self._record_vector(where, steps, math.inf if seconds is None else seconds)
-        lengths, allocated = _sizes(where)
-        return {"steps": count, "bytes": lengths / count, "allocated": allocated / count}
+        return {"steps": count, **_sizes(where, count)}
 
     def _record_vector(self, where: Path, steps: int, seconds: float) -> tuple[float, int]:
         """Microseconds an env-step, and how many: `steps`, or what takes about `seconds`."""
@@ -289,7 +286,7 @@ class Worker:
             with contextlib.suppress(CannotError):
                 made[name] = task()
         made["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        made["bytes"] = float(_sizes(where)[0])
+        made["bytes"] = _sizes(where, 1)["bytes"]
         self.do_forget(path)
         return made
 
@@ -327,10 +324,16 @@ def _sorted(leaves: dict[str, Any]) -> dict[str, Any]:
     return {"rows": rows[np.lexsort(rows.T[:64])]}
 
 
-def _sizes(path: Path) -> tuple[int, int]:
-    """Bytes of a file or a directory: the sum of the lengths, and what the disk allocates."""
-    files = [file.stat() for file in (path.rglob("*") if path.is_dir() else [path]) if file.is_file()]
-    return sum(file.st_size for file in files), sum(file.st_blocks * 512 for file in files)
+def _sizes(path: Path, steps: int) -> dict[str, float]:
+    """Bytes a step of a file or a directory: `bytes` by the lengths of the files, `apparent` with the directories that
+    they lie in (`du --apparent-size`), `allocated` by what the disk takes for both (`du`).
+    """
+    found = [(each, each.stat()) for each in ([path, *path.rglob("*")] if path.is_dir() else [path])]
+    return {
+        "bytes": sum(stat.st_size for each, stat in found if each.is_file()) / steps,
+        "apparent": sum(stat.st_size for _, stat in found) / steps,
+        "allocated": sum(stat.st_blocks * 512 for _, stat in found) / steps,
+    }
 
 
 def _remove(path: Path) -> None:
