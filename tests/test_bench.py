@@ -36,7 +36,9 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [sys.executable, "-m", "tools.bench", "--quick", "--output", str(output)]
     command += ["--readme", str(output / "front.md")]
     command += [part for side in SIDES for part in ("--with", side)]
-    command += [part for name in ("floats", "growth", "noise", "vector") for part in ("--only", name)]
+    command += [
+        part for name in ("floats", "growth", "noise", "vector", "pictures") for part in ("--only", name)
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
     assert done.returncode == 0, done.stderr
     return output
@@ -62,6 +64,13 @@ class TestQuickRun:
         }
         assert all(cell["values"] for row in cells.values() for cell in row.values())
         assert "## Recording 64 sub-environments" in (quick / "README.md").read_text()
+
+    def test_both_formats_of_images_are_compared(self, quick: Path) -> None:
+        rows = json.loads((quick / "results.json").read_text())["pictures"]
+        assert [row["form"] for row in rows] == ["raw", "png"] * 5
+        assert all(row[key] > 0 for row in rows for key in ("bytes", "read1", "read2"))
+        page = (quick / "README.md").read_text()
+        assert page.count("| pixels |") == page.count("| PNG |") == 5
 
     def test_growth_has_all_sizes(self, quick: Path) -> None:
         growth = json.loads((quick / "results.json").read_text())["growth"]

@@ -18,7 +18,7 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from tools.bench import draw, machine, report, targets
+from tools.bench import draw, machine, pictures, report, targets
 from tools.bench.cases import CASES, MORE
 from tools.bench.contenders import ENTRIES
 from tools.bench.fleet import ROOT
@@ -36,7 +36,7 @@ GROWING = [
     "PyTupli",
     "d3rlpy",
 ]
-PARTS = [*STEPS, "growth", *CASES, *MORE]
+PARTS = [*STEPS, "growth", "pictures", *CASES, *MORE]
 
 
 def _options() -> argparse.Namespace:
@@ -114,6 +114,9 @@ def _measure(options: argparse.Namespace, log: _Log) -> dict[str, Any]:
         finally:
             for process in processes.values():
                 process.stop()
+        if "pictures" in wanted:
+            log.say("pictures ...")
+            results["pictures"] = pictures.compare(run, run.directory / "frames.npy")
         results["targets"] = _targets(run, wanted, matrix, log)
     results["failures"] = log.failures
     return results

@@ -176,6 +176,26 @@ def vectors(found: dict[str, Any]) -> list[str]:
     return lines
 
 
+PICTURES = (
+    "Images and stacks of frames (`FrameStackObservation`), which are stored once each, in both formats of "
+    "`image_format`, both exact: pixels in compressed chunks (the default), and PNG. *record* is what a step costs "
+    "over the same rollout without a recorder; *read* opens and gives all states, with one thread and with two."
+)
+
+
+def pictures(found: list[dict[str, Any]]) -> str:
+    """A row a kind of pictures and a format."""
+    lines = [
+        "| | format | record<br>µs/step ▼ | size<br>bytes/step ▼ | read<br>steps/s ▲ | read, 2 threads<br>steps/s ▲ |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    for row in found:
+        form = {"raw": "pixels", "png": "PNG"}[row["form"]]
+        values = (figure(row[key]) for key in ("record", "bytes", "read1", "read2"))
+        lines.append(f"| {row['what']} | {form} | {' | '.join(values)} |")
+    return "\n".join(lines)
+
+
 def page(results: dict[str, Any]) -> str:
     """Everything."""
     parts = ["# Benchmark", f"`python -m tools.bench` writes this page. {LEGEND}"]
@@ -184,6 +204,8 @@ def page(results: dict[str, Any]) -> str:
         parts.append(f"## {WORKLOADS[work].title}\n\n![{work}]({work}.svg)\n\n{table(found)}")
     if "vectors" in results:
         parts.append(f"## Recording {NUM_ENVS} sub-environments\n\n{VECTORS}\n\n{table(results['vectors'])}")
+    if "pictures" in results:
+        parts.append(f"## Pixels and PNG\n\n{PICTURES}\n\n{pictures(results['pictures'])}")
     notes = [f"- {name}: {e['note']}" for name, e in results["contenders"].items() if e["note"]]
     parts.append("## Contenders\n\n" + "\n".join(notes))
     parts.append("## Promises\n\n" + targets(results["targets"]))
