@@ -20,6 +20,7 @@ import numpy as np
 from tupli_mcap.errors import FormatError
 
 __all__ = [
+    "decode_string",
     "read_array",
     "read_length",
     "read_string",
@@ -94,15 +95,20 @@ def read_string(data: memoryview, offset: int, origin: int) -> tuple[str, int]:
         raise FormatError(
             f"expected a string of {length} bytes at offset {offset}, found the end at {len(data)}"
         )
-    if length == 0:
-        return "", end
+    return decode_string(data[offset:end], offset), end
+
+
+def decode_string(stored: bytes | memoryview, offset: int) -> str:
+    """Return the string that is stored, with its NUL, at `offset`."""
+    if not stored:
+        return ""
     try:
-        text = str(data[offset : end - 1], "utf-8")
+        text = str(stored[:-1], "utf-8")
     except UnicodeDecodeError as err:
         raise FormatError(f"expected UTF-8 at offset {offset + err.start}, found {err.reason}") from err
-    if data[end - 1] != 0 or "\0" in text:
+    if stored[-1] != 0 or "\0" in text:
         raise FormatError(f"expected a string with one NUL, at its end, at offset {offset}")
-    return (_ESCAPED.sub(_unescape, text) if "\x1a" in text else text), end
+    return _ESCAPED.sub(_unescape, text) if "\x1a" in text else text
 
 
 def _unescape(match: re.Match[str]) -> str:

@@ -29,18 +29,22 @@ from tupli_mcap.recording.source import Source
 
 __all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Located", "Span"]
 
+Array = np.ndarray[Any, Any]
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
 _CHUNK_HEAD = struct.Struct(
     "<BQQQQII"
 )  # opcode, length, start, end, uncompressed size, crc, compression length
 
+_LENGTH = struct.Struct("<Q")  # of a record, after its opcode
+_MESSAGE_HEAD = np.dtype(
+    {"names": ["opcode", "channel"], "formats": ["u1", "<u2"], "offsets": [0, 9], "itemsize": 11}
+)
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
 _MANY_ROWS = 1 << 16
 _HEAD, _REST = (
     np.dtype("V8"),
     np.dtype("V4"),
 )  # bytes 0 to 7 and 7 to 10: NumPy copies them faster than items of 11
-_TIME, _TIME_OFFSET = struct.Struct("<Q"), 15  # in a Message record
 
 
 class Span(NamedTuple):
@@ -63,12 +67,12 @@ class Located(NamedTuple):
 class KeptChunk:
     """A decompressed chunk, and what has been found out about it."""
 
-    __slots__ = ("data", "rows", "spans")
+    __slots__ = ("data", "records", "rows")
 
     def __init__(self, data: Any) -> None:
         self.data = data
         self.rows: np.ndarray[Any, Any] | None = None  # their headers checked
-        self.spans: list[tuple[int, int]] | None = None
+        self.records: np.ndarray[Any, Any] | None = None  # where each begins and ends
 
 
 class ChunkCache:
@@ -317,33 +321,40 @@ class ChunkStore:
                 self._cache.put((self._number, ~i), kept)
         return kept
 
-    def messages(self, i: int) -> list[tuple[int, int]]:
-        """(start, end) of each message record of a chunk of variable layout."""
-        kept = self.chunk(i)
-        if kept.spans is None:
-            data = memoryview(kept.data)
-            spans = []
-            for start, end, channel, _, _ in iter_records(data):
-                if channel != self.table["channel"][i]:
-                    raise FormatError(f"{self._source.name}: chunk {i} holds a message of channel {channel}")
-                spans.append((start, end))
-            if len(spans) != self.table["rows"][i]:
-                raise FormatError(
-                    f"{self._source.name}: chunk {i} expected {self.table['rows'][i]} messages, found {len(spans)}"
-                )
-            kept.spans = spans
-        return kept.spans
+    def records(self, i: int, *, keep: bool = True) -> tuple[Any, Array]:
+        """A chunk of variable layout, and where each message record begins and ends in it: int64 (rows, 2)."""
+        kept = self.chunk(i, keep=keep)
+        if kept.records is None:
+            kept.records = self._find_records(i, kept.data)
+        return kept.data, kept.records
+
+    def _find_records(self, i: int, data: Any) -> Array:
+        rows, channel, size = int(self.table["rows"][i]), int(self.table["channel"][i]), len(data)
+        starts, at, length_at = [], 0, _LENGTH.unpack_from
+        while at + BODY <= size:
+            starts.append(at)
+            at += 9 + length_at(data, at + 1)[0]
+        if at == size and len(starts) == rows:
+            found = np.array([starts, [*starts[1:], at][:rows]], np.int64).T
+            heads = np.ndarray(max(0, size - 10), _MESSAGE_HEAD, data, 0, (1,))[found[:, 0]]
+            sound = (heads["opcode"] == 5).all() and (found[:, 1] - found[:, 0] >= BODY).all()
+            if sound and (heads["channel"] == channel).all():
+                return found
+        where = f"{self._source.name}: chunk {i}"
+        for _, _, other, _, _ in iter_records(memoryview(data)):
+            if other != channel:
+                raise FormatError(f"{where} holds a message of channel {other}")
+        raise FormatError(f"{where} expected {rows} messages, found {len(starts)}")
+
+    def messages(self, i: int) -> list[list[int]]:
+        """The same as a list of [start, end]."""
+        found: list[list[int]] = self.records(i)[1].tolist()
+        return found
 
     def bodies(self, channel: int, first: int, count: int) -> Iterator[memoryview]:
         """The CDR bodies of messages of a channel of variable layout."""
         for span in self.spans(channel, first, count):
-            data = memoryview(self.load(span.chunk))
-            for start, end in self.messages(span.chunk)[span.begin : span.end]:
-                yield data[start + BODY : end]
-
-    def times(self, channel: int, first: int, count: int) -> Iterator[int]:
-        """The log times (ns) of messages of a channel of variable layout."""
-        for span in self.spans(channel, first, count):
-            data = memoryview(self.load(span.chunk))
-            for start, _ in self.messages(span.chunk)[span.begin : span.end]:
-                yield _TIME.unpack_from(data, start + _TIME_OFFSET)[0]
+            data, records = self.records(span.chunk)
+            view = memoryview(data)
+            for start, end in records[span.begin : span.end].tolist():
+                yield view[start + BODY : end]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.batches import LOG_TIME, BatchDecoder
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.pieces import Pieces, Runs, final_runs, items, items_dtype
+from tupli_mcap.recording.pieces import Pieces, Runs, final_runs, items, items_dtype, put
 from tupli_mcap.recording.together import do_all
 
 __all__ = ["FIELDS", "ColumnReader", "Columns"]
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
-_TIME = "#log_time"
 Array = np.ndarray[Any, Any]
+Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]
 _MANY_ROWS = 1000  # fewer are copied before they have been looked at in another way
 
 
@@ -55,7 +54,7 @@ class ColumnReader:
         self._layout = layout
         self._store = store
         self._images = images  # leaf name -> step channel -> image channel
-        self._decoder = None if layout.constant else MessageDecoder(layout)
+        self._decoder = None if layout.constant else BatchDecoder(layout)
 
     def read(
         self,
@@ -87,17 +86,15 @@ class ColumnReader:
         }
         out.update({name: np.empty(total, np.bool_) for name in flags})
         if "times" in fields:
-            out[_TIME] = np.empty(total, np.uint64)
+            out[LOG_TIME] = np.empty(total, np.uint64)
         tasks: list[Callable[[], None]] = []
         plain = [leaf.name for leaf in leaves if not leaf.apart and leaf.size] + flags
-        if layout.constant and "times" in fields:
-            plain.append(_TIME)
-        elif "times" in fields:
-            self._read_times(runs, out[_TIME])
-        if plain and layout.constant:
-            tasks += self._tasks(runs, plain, out, layout.step_message.dtype, keep)
+        if "times" in fields:
+            plain.append(LOG_TIME)
+        if plain and self._decoder is not None:
+            tasks += self._decoding(runs, self._decoder.steps, {name: out[name] for name in plain}, keep)
         elif plain:
-            self._decode(runs, plain, out)
+            tasks += self._tasks(runs, plain, out, layout.step_message.dtype, keep)
         for leaf in leaves:
             if leaf.apart and leaf.name not in skipped:
                 moved = runs._replace(channels=self._image_channels(leaf.name, runs.channels))
@@ -112,9 +109,9 @@ class ColumnReader:
         }
         columns.update({f"{name}s": out[name] for name in flags})
         if "times" in fields:
-            columns["times"] = out[_TIME].view(np.int64)
+            columns["times"] = out[LOG_TIME].view(np.int64)
             if (columns["times"] < 0).any():
-                raise FormatError(f"expected times of steps below 2**63 ns, found {out[_TIME].max()}")
+                raise FormatError(f"expected times of steps below 2**63 ns, found {out[LOG_TIME].max()}")
         return columns
 
     def _empty(self, leaf: Leaf, total: int) -> Any:
@@ -152,42 +149,32 @@ class ColumnReader:
 
         return [partial(copy, pieces) for pieces in Pieces.of(runs, self._store)]
 
-    def _decode(self, runs: Runs, names: list[str], out: dict[str, Any]) -> None:
-        if self._decoder is None:
-            raise RecordingError("a constant layout is not decoded message by message")
-        for channel, first, steps, place in runs.each():
-            for i, body in enumerate(self._store.bodies(channel, first, steps)):
-                values = self._decoder.step(body)
-                for name in names:
-                    out[name][place + i] = values[name]
+    def _decoding(
+        self, runs: Runs, decode: Decode, out: Mapping[str, Any], keep: bool
+    ) -> list[Callable[[], None]]:
+        """Tasks that fill columns with messages of variable size."""
 
-    def _read_times(self, runs: Runs, out: Array) -> None:
-        for channel, first, steps, place in runs.each():
-            out[place : place + steps] = np.fromiter(
-                self._store.times(channel, first, steps), np.uint64, steps
-            )
+        def fill(pieces: Pieces) -> None:
+            data, records = self._store.records(pieces.chunk, keep=keep)
+            rows, places = pieces.indexes()
+            for name, values in decode(data, records[rows], out).items():
+                put(out[name], places, values)
+
+        return [partial(fill, pieces) for pieces in Pieces.of(runs, self._store)]
 
     def final_columns(self, channel: int, episodes: Array) -> list[Any]:
         """A column of final states for each leaf of the state, of index rows that all have one."""
-        if self._decoder is not None:
-            found = [values for values in self.final_states(channel, episodes) if values is not None]
-            return [
-                [values[leaf.name] for values in found]
-                if leaf.kind == "variable"
-                else np.array([values[leaf.name] for values in found], self._layout.dtypes[leaf.name])
-                for leaf in self._layout.state
-            ]
         out = {leaf.name: self._empty(leaf, len(episodes)) for leaf in self._layout.state}
         numbers = np.empty(len(episodes), np.uint32)
-        names = [leaf.name for leaf in self._layout.state if leaf.size] + ["episode"]
-        for task in self._tasks(
-            final_runs(episodes, channel),
-            names,
-            {**out, "episode": numbers},
-            self._layout.final_message.dtype,
-            True,
-        ):
-            task()
+        stored = {leaf.name: out[leaf.name] for leaf in self._layout.state if leaf.size} | {
+            "episode": numbers
+        }
+        runs = final_runs(episodes, channel)
+        if self._decoder is not None:
+            tasks = self._decoding(runs, self._decoder.finals, stored, True)
+        else:
+            tasks = self._tasks(runs, list(stored), stored, self._layout.final_message.dtype, True)
+        do_all(tasks, 1)
         wrong = np.flatnonzero(numbers != episodes["episode"])
         if len(wrong):
             first = int(wrong[0])
@@ -210,9 +197,11 @@ class ColumnReader:
                 number = int(record["episode"])
                 values = {leaf.name: record[leaf.name] for leaf in self._layout.state if leaf.size}
             else:
-                data = memoryview(self._store.load(span.chunk))
-                start, end = self._store.messages(span.chunk)[span.begin]
-                number, values = self._decoder.final(data[start + BODY : end])
+                data, records = self._store.records(span.chunk)
+                names = [leaf.name for leaf in self._layout.state] + ["episode"]
+                columns = self._decoder.finals(data, records[span.begin : span.end], names)
+                values = {name: column[0] for name, column in columns.items()}
+                number = values.pop("episode")
             if number != row["episode"]:
                 raise FormatError(
                     f"expected the final state of episode {row['episode']}, found that of {number}"

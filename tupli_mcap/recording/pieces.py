@@ -12,7 +12,7 @@ import numpy as np
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.chunks import ChunkStore
 
-__all__ = ["Pieces", "Runs", "final_runs", "items", "items_dtype", "runs_of"]
+__all__ = ["Pieces", "Runs", "final_runs", "items", "items_dtype", "put", "runs_of"]
 
 Array = np.ndarray[Any, Any]
 _LITTLE = sys.byteorder == "little"  # as the rows are
@@ -104,6 +104,11 @@ class Pieces(NamedTuple):
             found += _by_chunk(located.chunk, located.begin, located.steps, out)
         return found
 
+    def indexes(self) -> tuple[slice | Array, slice | Array]:
+        """The rows of the chunk, and where they go."""
+        begins, steps, outs = (np.asarray(part) for part in (self.begin, self.steps, self.out))
+        return _indexes(begins, steps), _indexes(outs, steps)
+
     def copy(self, rows: Array, targets: Sequence[tuple[str, Array]]) -> None:
         """Copies fields of the chunk's rows to columns of the same shape."""
         if len(self.begin) <= _FEW:
@@ -111,8 +116,7 @@ class Pieces(NamedTuple):
                 for name, target in targets:
                     target[out : out + steps] = rows[name][begin : begin + steps]
             return
-        begins, steps, outs = (np.asarray(part) for part in (self.begin, self.steps, self.out))
-        source, places = _indexes(begins, steps), _indexes(outs, steps)
+        source, places = self.indexes()
         if isinstance(source, slice) or len(targets) == 1:
             for name, target in targets:
                 target[places] = rows[name][source]
@@ -151,6 +155,15 @@ def _indexes(begin: Array, steps: Array) -> slice | Array:
     before = np.cumsum(steps) - steps
     found: Array = np.repeat(begin - before, steps) + np.arange(int(steps.sum()))
     return found
+
+
+def put(column: Any, places: slice | Array, values: Any) -> None:
+    """Sets rows of a column, which is a list where values are of variable size."""
+    if isinstance(places, slice) or isinstance(column, np.ndarray):
+        column[places] = values
+        return
+    for place, value in zip(places.tolist(), values, strict=True):
+        column[place] = value
 
 
 def items_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:

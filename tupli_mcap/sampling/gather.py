@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.batches import LOG_TIME
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.pieces import items, items_dtype
+from tupli_mcap.recording.pieces import items, items_dtype, put
 from tupli_mcap.recording.together import do_all
 from tupli_mcap.sampling.segments import Piece, Segments
 from tupli_mcap.sampling.steps import following, pick, pick_runs, rows_of_runs
 
-__all__ = ["TIME", "Column", "ConstantRows", "DecodedRows", "RowFormat", "Rows"]
+__all__ = ["TIME", "Column", "ConstantRows", "Decode", "DecodedRows", "RowFormat", "Rows"]
 
-TIME = "#log_time"  # the column of times (uint64, ns), named as in the records
-_TIME_STRUCT, _TIME_OFFSET = struct.Struct("<Q"), 15
+TIME = LOG_TIME  # the column of times (uint64, ns)
 
 # Threads that decode small chunks take the interpreter from each other at every one: for so few, one thread is quicker.
 _FEW_CHUNKS = 128
 _LARGE_CHUNK = 1 << 20  # bytes
 
 Array = np.ndarray[Any, Any]
+Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]
 
 
 class Column(NamedTuple):
@@ -201,14 +200,14 @@ class DecodedRows:
 
     Args:
         stores: one a file.
-        decoders: one a file; gives the values in the body of a message, by name of the column.
+        decoders: one a file; gives columns of the messages whose records begin and end at places of a buffer.
     """
 
     def __init__(
         self,
         segments: Segments,
         stores: Sequence[ChunkStore],
-        decoders: Sequence[Callable[[memoryview], dict[str, Any]]],
+        decoders: Sequence[Decode],
         columns: dict[str, Column],
     ) -> None:
         self.segments = segments
@@ -219,24 +218,14 @@ class DecodedRows:
     def read(self, names: Sequence[str], rows: Array, threads: int) -> dict[str, Any]:
         out = {name: self.columns[name].empty(len(rows)) for name in names}
         for piece in self.segments.pieces(rows):
-            self._copy(piece, [name for name in names if name != TIME], out)
+            file, chunk = int(self.segments.file_of[piece.unit]), int(self.segments.chunk_of[piece.unit])
+            data, records = self._stores[file].records(chunk)
+            for name, values in self._decoders[file](data, records[piece.rows], names).items():
+                put(out[name], piece.out, values)
         return out
 
     def read_runs(self, names: Sequence[str], starts: Array, length: int, threads: int) -> dict[str, Any]:
         return self.read(names, rows_of_runs(starts, length), threads)
-
-    def _copy(self, piece: Piece, names: Sequence[str], out: dict[str, Any]) -> None:
-        file, chunk = int(self.segments.file_of[piece.unit]), int(self.segments.chunk_of[piece.unit])
-        data, spans = memoryview(self._stores[file].load(chunk)), self._stores[file].messages(chunk)
-        decode = self._decoders[file]
-        for row, place in zip(piece.rows.tolist(), piece.out.tolist(), strict=True):
-            start, end = spans[row]
-            if TIME in out:
-                (out[TIME][place],) = _TIME_STRUCT.unpack_from(data, start + _TIME_OFFSET)
-            values = decode(data[start + BODY : end]) if names else {}
-            for name in names:
-                if name in values:  # an array of no elements is not in the message
-                    out[name][place] = values[name]
 
 
 def _items_of(source: RowFormat, columns: Mapping[str, Column]) -> np.dtype[Any] | None:

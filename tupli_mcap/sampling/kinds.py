@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
 
+from tupli_mcap.messages.batches import BatchDecoder
 from tupli_mcap.messages.common import common_dtype
-from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.sampling.gather import TIME, Column, ConstantRows, DecodedRows, RowFormat, Rows
+from tupli_mcap.sampling.gather import TIME, Column, ConstantRows, Decode, DecodedRows, RowFormat, Rows
 from tupli_mcap.sampling.index import StepIndex
 from tupli_mcap.sampling.segments import Segments
 
@@ -19,7 +19,6 @@ __all__ = ["EPISODE", "final_rows", "image_rows", "step_rows"]
 
 EPISODE = "episode"  # the column of the number that a final state says its episode has
 _BOOL, _U32, _U64 = np.dtype(np.bool_), np.dtype(np.uint32), np.dtype(np.uint64)
-Decode = Callable[[memoryview], dict[str, Any]]
 _Format = tuple[Any, dict[str, str], Leaf | None]
 
 
@@ -29,7 +28,7 @@ def step_rows(index: StepIndex) -> Rows:
     columns = {name: column for name, column in columns.items() if name not in index.images}
     columns |= {"terminal": Column((), _BOOL), "timeout": Column((), _BOOL), TIME: Column((), _U64)}
     if not index.layouts[0].constant:
-        return _decoded(index, lambda layout: MessageDecoder(layout).step, columns, index.steps)
+        return _decoded(index, lambda layout: BatchDecoder(layout).steps, columns, index.steps)
     return _constant(
         index, lambda layout: (layout.step_message.dtype, _fields(index, layout), None), columns, index.steps
     )
@@ -52,20 +51,11 @@ def image_rows(index: StepIndex, name: str) -> Rows:
 def final_rows(index: StepIndex) -> Rows:
     """The leaves of final states, and `EPISODE`."""
 
-    def decode(layout: StepLayout) -> Decode:
-        final = MessageDecoder(layout).final
-
-        def values(body: memoryview) -> dict[str, Any]:
-            number, found = final(body)
-            return {**found, EPISODE: number}
-
-        return values
-
     columns = {leaf.name: _column(index, leaf) for leaf in index.layouts[0].state} | {
         EPISODE: Column((), _U32)
     }
     if not index.layouts[0].constant:
-        return _decoded(index, decode, columns, index.finals)
+        return _decoded(index, lambda layout: BatchDecoder(layout).finals, columns, index.finals)
     return _constant(
         index,
         lambda layout: (layout.final_message.dtype, _fields(index, layout), None),
@@ -109,19 +99,19 @@ def _decoded(
     columns: dict[str, Column],
     segments: Segments,
 ) -> Rows:
-    """Rows of variable size; `of_layout` gives what decodes the body of a message."""
+    """Rows of variable size; `of_layout` gives what decodes messages."""
 
     def renamed(layout: StepLayout) -> Decode:
         decode, fields = of_layout(layout), _fields(index, layout)
         if all(mine == own for mine, own in fields.items()):
             return decode
-        return lambda body: _renamed(decode(body), fields)
+        mine_of = {own: mine for mine, own in fields.items()}
+
+        def decode_renamed(data: Any, records: Any, names: Collection[str]) -> dict[str, Any]:
+            found = decode(data, records, [fields.get(name, name) for name in names])
+            return {mine_of.get(name, name): values for name, values in found.items()}
+
+        return decode_renamed
 
     found = [renamed(layout) for layout in index.layouts]
     return DecodedRows(segments, index.stores, [found[i] for i in index.layout_of], columns)
-
-
-def _renamed(values: dict[str, Any], fields: dict[str, str]) -> dict[str, Any]:
-    renamed = {mine: values[own] for mine, own in fields.items() if own in values}
-    others = {name: value for name, value in values.items() if name not in fields.values()}
-    return others | renamed

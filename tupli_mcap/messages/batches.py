@@ -1,0 +1,159 @@
+"""Many messages of a layout without a constant size at once: numbers by array operations, texts one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages import cdr
+from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
+
+__all__ = ["LOG_TIME", "BatchDecoder"]
+
+Array = np.ndarray[Any, Any]
+LOG_TIME = "#log_time"  # the name of the times (ns), as in the rows of constant size
+_LOG_TIME_AT = 15  # in a record
+_U1, _U4 = np.dtype(np.uint8), np.dtype("<u4")
+
+
+class BatchDecoder:
+    """Decodes Message records of `/step` and `/final_state` that lie in one buffer. Safe from several threads.
+
+    Every defect is a FormatError, the one that `MessageDecoder` has for the first message that is defective.
+    """
+
+    def __init__(self, layout: StepLayout) -> None:
+        self._layout = layout
+        self._single = MessageDecoder(layout)
+
+    def steps(self, data: Any, records: Array, names: Collection[str]) -> dict[str, Any]:
+        """Columns of steps: an array of a leaf of constant size, a list of one of variable size.
+
+        Args:
+            records: where each record begins and ends in `data`, int64 (messages, 2).
+            names: of the leaves (those without elements are left out), `terminal`, `timeout` and `LOG_TIME`.
+        """
+        if set(names) == {LOG_TIME}:  # it is no part of the messages
+            return {LOG_TIME: _log_times(data, records)}
+        try:
+            fields = _Fields(data, records)
+            found = self._leaves(fields, self._layout.step_leaves, names)
+            flags = {name: fields.take(_U1, 1) for name in ("terminal", "timeout")}
+            fields.end()
+        except FormatError:
+            self._explain(data, records, self._single.step)
+            raise
+        found |= {name: flag != 0 for name, flag in flags.items() if name in names}
+        return found | ({LOG_TIME: _log_times(data, records)} if LOG_TIME in names else {})
+
+    def finals(self, data: Any, records: Array, names: Collection[str]) -> dict[str, Any]:
+        """Columns of final states, as those of steps, and `episode` (uint32)."""
+        try:
+            fields = _Fields(data, records)
+            found = self._leaves(fields, self._layout.final_leaves, names)
+            fields.end()
+        except FormatError:
+            self._explain(data, records, self._single.final)
+            raise
+        if "episode" in names:
+            found["episode"] = fields.episodes
+        return found
+
+    def _leaves(self, fields: _Fields, leaves: Iterable[Leaf], names: Collection[str]) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for leaf in leaves:
+            wanted = leaf.name in names
+            values: Any
+            if leaf.kind == "variable":
+                field = self._layout.variable[leaf.name]
+                values = fields.texts(wanted) if field.field_type == "string" else fields.each(field.decode)
+            elif leaf.size:
+                values = fields.take(self._layout.dtypes[leaf.name], leaf.size, wanted)
+                values = values.reshape(-1, *leaf.shape)
+            else:
+                continue
+            if wanted:
+                found[leaf.name] = values
+        return found
+
+    def _explain(self, data: Any, records: Array, decode: Callable[[memoryview], object]) -> None:
+        """Raises the error that decoding one message after the other has."""
+        view = memoryview(data)
+        for start, end in records.tolist():
+            decode(view[start + BODY : end])
+
+
+def _log_times(data: Any, records: Array) -> Array:
+    """The `log_time` (uint64, ns) of each message record."""
+    if not len(records):
+        return np.empty(0, np.uint64)
+    times: Array = np.ndarray(len(data) - 7, "<u8", data, 0, (1,))[records[:, 0] + _LOG_TIME_AT]
+    return times
+
+
+class _Fields:
+    """The fields of messages, one after the other; FormatError where one of the messages has no such field."""
+
+    def __init__(self, data: Any, records: Array) -> None:
+        self._data = data
+        self._bodies = records[:, 0] + BODY
+        self._ends = records[:, 1]
+        self._at = self._bodies.copy()
+        self.episodes = self.take(_U4, 1)
+        self.take(_U4, 1, wanted=False)
+
+    def _skip(self, size: int | Array) -> None:
+        self._at += size
+        if (self._at > self._ends).any():
+            raise FormatError("expected longer messages")
+
+    def _align(self, size: int) -> None:
+        self._at += (self._bodies - self._at) & (size - 1)
+
+    def take(self, dtype: np.dtype[Any], count: int, wanted: bool = True) -> Array:
+        """`count` elements of each message, one after the other; none where they are not wanted."""
+        self._align(dtype.itemsize)
+        size, begin = count * dtype.itemsize, self._at.copy()
+        self._skip(size)
+        if not wanted or not len(begin):
+            return np.empty(0, dtype)
+        rows = np.ndarray(len(self._data) - size + 1, f"V{size}", self._data, 0, (1,))
+        found: Array = rows[begin].view(dtype)
+        return found
+
+    def texts(self, wanted: bool) -> list[str]:
+        """A string of each message."""
+        sizes = self.take(_U4, 1)
+        begin = self._at.tolist()
+        self._skip(sizes)
+        if not wanted:
+            return []
+        whole, known, found = bytes(self._data), {b"": ""}, []
+        for a, b in zip(begin, self._at.tolist(), strict=True):
+            stored = whole[a:b]
+            text = known.get(stored)
+            if text is None:
+                text = known[stored] = cdr.decode_string(stored, a)
+            found.append(text)
+        return found
+
+    def each(self, decode: Callable[[memoryview, int, int], tuple[Any, int]]) -> list[Any]:
+        """A value of each message, and where it ends, by a function of a body and an offset in it."""
+        view, found, places = memoryview(self._data), [], []
+        for body, at, end in zip(self._bodies.tolist(), self._at.tolist(), self._ends.tolist(), strict=True):
+            value, offset = decode(view[body:end], at - body, 0)
+            found.append(value)
+            places.append(body + offset)
+        self._at = np.array(places, np.int64)
+        return found
+
+    def end(self) -> None:
+        """FormatError if a message goes on."""
+        if (self._at != self._ends).any():
+            raise FormatError("expected shorter messages")
