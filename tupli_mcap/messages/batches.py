@@ -125,7 +125,7 @@ class _Fields:
             return np.empty(0, dtype)
         rows = np.ndarray(len(self._data) - size + 1, f"V{size}", self._data, 0, (1,))
         found: Array = rows[begin].view(dtype)
-        return found
+        return found.view(np.uint8) != 0 if dtype == np.bool_ else found
 
     def texts(self, wanted: bool) -> list[str]:
         """A string of each message."""

@@ -57,6 +57,8 @@ class MessageDecoder:
             if position + size > len(body):
                 raise FormatError(f"{leaf.path}: expected {size} bytes at byte {position} of {len(body)}")
             value = np.frombuffer(body[position : position + size], dtype).reshape(leaf.shape).copy()
+            if dtype == np.bool_:  # a byte that is neither 0 nor 1 is no bool that NumPy knows
+                value = np.asarray(value.view(np.uint8) != 0)
             values[leaf.name] = value[()] if leaf.is_scalar else value
             position += size
         return values, position

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -13,7 +13,7 @@ from gymnasium import spaces
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.leaves import ROS_TYPES, DType, Leaf
 
-__all__ = ["check_structure", "decide_dtype", "exact_array", "leaf_value", "shorten"]
+__all__ = ["check_structure", "decide_dtype", "exact_array", "leaf_value", "shorten", "structure_check"]
 
 _MANTISSA = {"float16": 11, "float32": 24, "float64": 53}
 
@@ -136,13 +136,55 @@ def check_structure(space: gym.Space[Any], value: Any, path: str) -> None:
             check_structure(sub, value[i], f"{path}[{i}]")
 
 
+def structure_check(space: gym.Space[Any], path: str) -> Callable[[Any], None]:
+    """`check_structure` of a space, quicker for plain dicts and tuples."""
+    fits = _fits(space)
+    if fits is None:
+        return lambda _: None
+
+    def check(value: Any) -> None:
+        if not fits(value):
+            check_structure(space, value, path)
+
+    return check
+
+
+def _fits(space: gym.Space[Any]) -> Callable[[Any], bool] | None:
+    """Tells that a value surely has the structure of a space; None where any value has."""
+    if type(space) is spaces.Dict:
+        keys = space.spaces.keys()
+        inside = [(key, fits) for key, sub in space.spaces.items() if (fits := _fits(sub)) is not None]
+        if not inside:
+            return lambda value: type(value) is dict and value.keys() == keys
+        return lambda value: (
+            type(value) is dict and value.keys() == keys and all(fits(value[key]) for key, fits in inside)
+        )
+    if type(space) is spaces.Tuple:
+        length = len(space.spaces)
+        places = [(i, fits) for i, sub in enumerate(space.spaces) if (fits := _fits(sub)) is not None]
+        return lambda value: (
+            type(value) is tuple and len(value) == length and all(fits(value[i]) for i, fits in places)
+        )
+    return None
+
+
 def leaf_value(value: Any, leaf: Leaf) -> Any:
     """A leaf's value inside `value`; StepError names the place where the structure differs."""
+    found = value
+    try:
+        for key in leaf.keys:
+            found = found[key]
+    except (KeyError, IndexError, TypeError) as err:
+        raise _misplaced(value, leaf) from err
+    return found
+
+
+def _misplaced(value: Any, leaf: Leaf) -> StepError:
     path = leaf.path.split("[", 1)[0]
     for key in leaf.keys:
         try:
             value = value[key]
-        except (KeyError, IndexError, TypeError) as err:
-            raise StepError(f"{path}: expected an entry {key!r}, found {shorten(value)}") from err
+        except (KeyError, IndexError, TypeError):
+            break
         path += f"[{key!r}]"
-    return value
+    return StepError(f"{path}: expected an entry {key!r}, found {shorten(value)}")

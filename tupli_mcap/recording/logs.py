@@ -16,7 +16,7 @@ from zlib import crc32
 import numpy as np
 
 from tupli_mcap.errors import FormatError, StepError
-from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value, shorten
+from tupli_mcap.messages.exact import exact_array, leaf_value, shorten, structure_check
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
@@ -42,6 +42,7 @@ _HEADER = 64
 _KEPT = 16  # times that a log has gone to the file
 FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
 _LOG_TIME = FRONT.size - 8
+_DOUBLE = struct.Struct("<d")
 
 
 def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
@@ -237,15 +238,38 @@ def leaf_encoders(layout: StepLayout, leaves: Sequence[Leaf]) -> list[tuple[Leaf
 def _encoder(layout: StepLayout, leaf: Leaf) -> Encoder:
     if leaf.kind == "variable":
         return layout.variable[leaf.name].encode
-    dtype = layout.dtypes[leaf.name]
+    to_bytes, itemsize = _to_bytes(leaf, layout.dtypes[leaf.name]), layout.dtypes[leaf.name].itemsize
 
     def encode(value: Any, out: bytearray, origin: int) -> None:
-        data = exact_array(value, dtype, leaf.shape, leaf.path).tobytes()
+        data = to_bytes(value)
         if data:
-            out += bytes(-(len(out) - origin) % dtype.itemsize)
+            out += bytes(-(len(out) - origin) % itemsize)
             out += data
 
     return encode
+
+
+def _to_bytes(leaf: Leaf, dtype: np.dtype[Any]) -> Callable[[Any], bytes]:
+    """The bytes of a leaf's values; StepError if one is not stored exactly."""
+    shape, itemsize, signed = leaf.shape, dtype.itemsize, dtype.kind == "i"
+    array, scalar = np.ndarray, dtype.type if shape == () else np.ndarray
+    integer = int if shape == () and dtype.kind in "iu" else None
+    double = float if shape == () and dtype == np.float64 else None
+
+    def convert(value: Any) -> bytes:
+        kind = value.__class__
+        if (kind is array or kind is scalar) and value.dtype == dtype and value.shape == shape:
+            return value.tobytes()  # type: ignore[no-any-return]
+        if kind is double:
+            return _DOUBLE.pack(value)
+        if kind is integer:
+            try:
+                return value.to_bytes(itemsize, "little", signed=signed)  # type: ignore[no-any-return]
+            except OverflowError:
+                pass  # said below
+        return exact_array(value, dtype, shape, leaf.path).tobytes()
+
+    return convert
 
 
 class PreparedState(NamedTuple):
@@ -288,6 +312,8 @@ class StepLog:
         self._step = 0
         self._time = time_ns
         self._pending = bytearray()
+        self._check_state = structure_check(layout.observation_space, "state")
+        self._check_action = structure_check(layout.action_space, "action")
         self._state = leaf_encoders(layout, [leaf for leaf in layout.state if not leaf.apart])
         self._action = leaf_encoders(layout, layout.action)
         self._reward = leaf_encoders(layout, layout.reward)
@@ -313,7 +339,7 @@ class StepLog:
 
     def prepare_state(self, state: Any) -> PreparedState:
         """A state as `commit_state` takes it; StepError if it cannot be stored exactly."""
-        check_structure(self._layout.observation_space, state, "state")
+        self._check_state(state)
         out = bytearray(BODY + 8)
         self._encode(out, self._state, state)
         images = [
@@ -333,7 +359,7 @@ class StepLog:
 
     def prepare(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> PreparedStep:
         """A step as `commit` takes it; StepError if it cannot be stored exactly."""
-        check_structure(self._layout.action_space, action, "action")
+        self._check_action(action)
         out = bytearray(self._pending)
         self._encode(out, self._action, action)
         self._encode(out, self._reward, reward)
