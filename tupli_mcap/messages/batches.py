@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
@@ -44,7 +45,7 @@ class BatchDecoder:
         try:
             fields = _Fields(data, records)
             found = self._leaves(fields, self._layout.step_leaves, names)
-            flags = {name: fields.take(_U1, 1) for name in ("terminal", "timeout")}
+            flags = {name: fields.take(_U1, 1, name in names) for name in ("terminal", "timeout")}
             fields.end()
         except FormatError:
             self._explain(data, records, self._single.step)
@@ -98,50 +99,53 @@ def _log_times(data: Any, records: Array) -> Array:
 
 
 class _Fields:
-    """The fields of messages, one after the other; FormatError where one of the messages has no such field."""
+    """The fields of messages, one after the other.
+
+    Whether the messages are long enough is looked at in the end, of all fields together: an error before says no more
+    than that something is wrong.
+    """
 
     def __init__(self, data: Any, records: Array) -> None:
         self._data = data
         self._bodies = records[:, 0] + BODY
         self._ends = records[:, 1]
         self._at = self._bodies.copy()
+        self._aligned = 8  # all the offsets from the bodies are multiples of it
         self.episodes = self.take(_U4, 1)
         self.take(_U4, 1, wanted=False)
 
-    def _skip(self, size: int | Array) -> None:
-        self._at += size
-        if (self._at > self._ends).any():
-            raise FormatError("expected longer messages")
-
-    def _align(self, size: int) -> None:
-        self._at += (self._bodies - self._at) & (size - 1)
-
     def take(self, dtype: np.dtype[Any], count: int, wanted: bool = True) -> Array:
         """`count` elements of each message, one after the other; none where they are not wanted."""
-        self._align(dtype.itemsize)
-        size, begin = count * dtype.itemsize, self._at.copy()
-        self._skip(size)
-        if not wanted or not len(begin):
-            return np.empty(0, dtype)
-        rows = np.ndarray(len(self._data) - size + 1, f"V{size}", self._data, 0, (1,))
-        found: Array = rows[begin].view(dtype)
-        return found.view(np.uint8) != 0 if dtype == np.bool_ else found
+        if dtype.itemsize > self._aligned:
+            self._at += (self._bodies - self._at) & (dtype.itemsize - 1)
+            self._aligned = dtype.itemsize
+        size, found = count * dtype.itemsize, np.empty(0, dtype)
+        if wanted and len(self._at):
+            if size > len(self._data):
+                raise FormatError("expected longer messages")
+            rows = np.ndarray(len(self._data) - size + 1, f"V{size}", self._data, 0, (1,))
+            try:
+                found = rows[self._at].view(dtype)
+            except IndexError as err:
+                raise FormatError("expected longer messages") from err
+            if dtype == np.bool_:
+                found = found.view(np.uint8) != 0
+        self._at += size
+        self._aligned = math.gcd(self._aligned, size)
+        return found
 
     def texts(self, wanted: bool) -> list[str]:
         """A string of each message."""
         sizes = self.take(_U4, 1)
-        begin = self._at.tolist()
-        self._skip(sizes)
+        begin = self._at.tolist() if wanted else []
+        self._at += sizes
+        self._aligned = 1
         if not wanted:
             return []
-        whole, known, found = bytes(self._data), {b"": ""}, []
-        for a, b in zip(begin, self._at.tolist(), strict=True):
-            stored = whole[a:b]
-            text = known.get(stored)
-            if text is None:
-                text = known[stored] = cdr.decode_string(stored, a)
-            found.append(text)
-        return found
+        whole = bytes(self._data)
+        stored = [whole[a:b] for a, b in zip(begin, self._at.tolist(), strict=True)]
+        known = {each: cdr.decode_string(each, 0) for each in set(stored)}  # many are alike
+        return [known[each] for each in stored]
 
     def each(self, decode: Callable[[memoryview, int, int], tuple[Any, int]]) -> list[Any]:
         """A value of each message, and where it ends, by a function of a body and an offset in it."""
@@ -151,9 +155,10 @@ class _Fields:
             found.append(value)
             places.append(body + offset)
         self._at = np.array(places, np.int64)
+        self._aligned = 1
         return found
 
     def end(self) -> None:
-        """FormatError if a message goes on."""
-        if (self._at != self._ends).any():
-            raise FormatError("expected shorter messages")
+        """FormatError if a message is shorter or longer than its fields."""
+        if not np.array_equal(self._at, self._ends):
+            raise FormatError("expected messages of another length")
