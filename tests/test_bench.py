@@ -61,6 +61,7 @@ class TestQuickRun:
         assert {operation: set(row) for operation, row in cells.items()} == {
             "record": set(SIDES),
             "size": set(SIDES),
+            "read": set(SIDES),
         }
         assert all(cell["values"] for row in cells.values() for cell in row.values())
         assert "## Recording 64 sub-environments" in (quick / "README.md").read_text()

@@ -77,9 +77,9 @@ class Workbench:
         return self._measure(work, STEPS[work], list(self.processes), list(OPERATIONS))
 
     def vectors(self) -> dict[str, Any]:
-        """The same of recording a vector environment, by those who can."""
+        """The same of a vector environment, by those who can record one."""
         names = [name for name in VECTORS if name in self.processes]
-        return self._measure(VECTOR, 400_000, names, ["record", "size"])
+        return self._measure(VECTOR, 400_000, names, ["record", "size", "read"])
 
     def _measure(self, work: str, steps: int, names: list[str], operations: list[str]) -> dict[str, Any]:
         started = time.perf_counter()

@@ -157,10 +157,10 @@ LEGEND = (
 
 VECTORS = (
     "A vector environment (next-step autoreset) of four random floats and two actions, episodes of 1,000 steps: what "
-    "an env-step costs over the same rollout without a recorder, and its bytes. By hand, in `.npz` and in `.npy` a row "
-    "is a vector step with a mask of who took it; nothing else tells episodes apart. `mcap` and foxglove-sdk write a "
-    "message an env-step. Minari's and PyTupli's recorders refuse a vector environment; LeRobot and d3rlpy are given "
-    "the steps of one episode at a time."
+    "an env-step costs over the same rollout without a recorder, its bytes, and opening and reading all of them. By "
+    "hand, in `.npz` and in `.npy` a row is a vector step with a mask of who took it; nothing else tells episodes "
+    "apart. `mcap` and foxglove-sdk write a message an env-step. Minari's and PyTupli's recorders refuse a vector "
+    "environment; LeRobot and d3rlpy are given the steps of one episode at a time."
 )
 
 

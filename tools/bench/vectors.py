@@ -109,6 +109,14 @@ def record(contender: Contender, path: Path, length: int, steps: int) -> tuple[f
     return (watch.seconds - (before + after) / 2) / env_steps * 1e6, env_steps
 
 
+def read(contender: Contender, path: Path, length: int, steps: int) -> float:
+    """Million env-steps a second, opening counted; all checked."""
+    wanted, found = _wanted(length, steps), list[dict[str, Any]]()
+    seconds = seconds_of(lambda: found.append(contender.read_vector(path)))
+    check_vector(found[0], wanted)
+    return int(wanted["is_step"].sum()) / seconds / 1e6
+
+
 def check_vector(found: dict[str, Any], wanted: dict[str, Array]) -> None:
     """Compares vector steps; or, where there is `env`, the steps of each sub-environment in their order."""
     if "env" in found:

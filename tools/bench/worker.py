@@ -43,6 +43,7 @@ class Worker:
         self._built: dict[tuple[str, str], Data] = {}
         self._sessions: dict[str, Any] = {}
         self._trials: list[float] = []
+        self._batches: dict[str, int] = {}  # of recordings of a vector environment
         self._random = np.random.default_rng()
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -80,21 +81,21 @@ class Worker:
         }
 
     def _build_vector(self, where: Path, steps: int, seconds: float | None) -> dict[str, Any]:
-        _, count = self._record_vector(where, steps, math.inf if seconds is None else seconds)
+        _, count, batches = self._record_vector(where, steps, math.inf if seconds is None else seconds)
+        self._batches[str(where)] = batches
         return {"steps": count, **_sizes(where, count)}
 
-    def _record_vector(self, where: Path, steps: int, seconds: float) -> tuple[float, int]:
-        """Microseconds an env-step, and how many: `steps`, or what takes about `seconds`."""
+    def _record_vector(self, where: Path, steps: int, seconds: float) -> tuple[float, int, int]:
+        """Microseconds an env-step, how many (`steps`, or what takes about `seconds`), and in how many batches."""
         from tools.bench.vectors import LENGTH, record  # not in every Gymnasium
-
-        def batches(count: float) -> tuple[float, int]:
-            return record(self._contender, where, LENGTH, max(1, int(count / NUM_ENVS)))
 
         trial = min(steps, TRIAL)
         while len(self._trials) < 2:  # the first one imports, and is not counted
-            self._trials.append(seconds_of(lambda: batches(trial)) / trial)
+            took = seconds_of(lambda: record(self._contender, where, LENGTH, trial // NUM_ENVS + 1))
+            self._trials.append(took / trial)
             _remove(where)
-        return batches(min(steps, seconds / self._trials[-1]))
+        batches = max(1, int(min(steps, seconds / self._trials[-1]) / NUM_ENVS))
+        return *record(self._contender, where, LENGTH, batches), batches
 
     def _affordable(self, workload: Workload, where: Path, data: Data, seconds: float) -> int:
         """How many episodes may be recorded and read in about `seconds`, at least two."""
@@ -140,7 +141,7 @@ class Worker:
         """Microseconds a step over the same rollout without a recorder, in turns with it."""
         where = Path(path)
         if work == VECTOR:
-            value, _ = self._record_vector(where, steps, seconds)
+            value, _, _ = self._record_vector(where, steps, seconds)
             _remove(where)
             return value
         workload = WORKLOADS[work]
@@ -195,6 +196,10 @@ class Worker:
 
     def do_read(self, work: str, path: str) -> float:
         """Million steps a second, opening counted."""
+        if work == VECTOR:
+            from tools.bench.vectors import LENGTH, read  # not in every Gymnasium
+
+            return read(self._contender, Path(path), LENGTH, self._batches[path])
         data = self._built[work, path]
         found: list[Any] = []
         seconds = seconds_of(lambda: found.append(self._contender.read(Path(path))))
