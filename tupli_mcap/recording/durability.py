@@ -58,7 +58,7 @@ def checksum(record: bytes | bytearray | memoryview) -> int:
     return zlib.crc32(view[_SEAL_END:], zlib.crc32(view[:_SEAL_START]))
 
 
-def seal(view: bytearray | memoryview, start: int, end: int, running: bytes | memoryview) -> None:
+def seal(view: bytearray | memoryview, start: int, end: int, running: bytes | bytearray | memoryview) -> None:
     """Writes the checksums of a record, and of the state that follows its step, in place of `publish_time`."""
     whole = checksum(memoryview(view)[start:end])
     _SEAL.pack_into(view, start + _SEAL_START, whole, zlib.crc32(running))

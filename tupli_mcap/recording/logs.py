@@ -43,6 +43,8 @@ _KEPT = 16  # times that a log has gone to the file
 FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
 _LOG_TIME = FRONT.size - 8
 _DOUBLE = struct.Struct("<d")
+_RUNNING = struct.Struct("<BQHIQQ4sII")  # a record up to its state
+_SEQUENCE, _SEQUENCE_AT = struct.Struct("<I"), 11
 
 
 def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
@@ -96,9 +98,12 @@ def _rows_of(channel: int, first: int, records: list[bytes], *, sealed: bool) ->
         [one.size if isinstance(one, EvenRecords) else len(one) for one in records],
         [_count(one) for one in records],
     )
+    return _as_rows(channel, first, bytearray().join(records), sizes, sealed=sealed)
+
+
+def _as_rows(channel: int, first: int, joined: bytearray, sizes: Any, *, sealed: bool) -> Rows:
     offsets = np.zeros(len(sizes), dtype=np.uint64)
     np.cumsum(sizes[:-1], out=offsets[1:])
-    joined = bytearray().join(records)
     log_times = offsets[:, None] + np.arange(_LOG_TIME, _LOG_TIME + 8, dtype=np.uint64)
     content = np.frombuffer(joined, np.uint8)
     times = content[log_times]
@@ -243,7 +248,8 @@ def _encoder(layout: StepLayout, leaf: Leaf) -> Encoder:
     def encode(value: Any, out: bytearray, origin: int) -> None:
         data = to_bytes(value)
         if data:
-            out += bytes(-(len(out) - origin) % itemsize)
+            if padding := -(len(out) - origin) % itemsize:
+                out += bytes(padding)
             out += data
 
     return encode
@@ -328,6 +334,7 @@ class StepLog:
         self._records = [buffer[h * area.half + _HEADER : (h + 1) * area.half] for h in range(2)]
         self._ends = [buffer[h * area.half : h * area.half + 8].cast("Q") for h in range(2)]
         self._half = self._position = self._emitted = 0
+        self._sizes: list[int] = []  # of the records that are not in the file yet
         self._write_pending(0)
 
     def begin_episode(self, episode: int) -> None:
@@ -377,10 +384,11 @@ class StepLog:
         self._reserve(len(out) + len(pending))
         self._time = max(time.time_ns(), self._time)
         out[BODY : BODY + 8] = self._pending[BODY : BODY + 8]  # a new episode may have begun in between
-        FRONT.pack_into(out, 0, 5, len(out) - 9, self._channel, self.count, self._time)
-        seal(out, 0, len(out), memoryview(pending)[STATE:])
+        size = len(out)
+        FRONT.pack_into(out, 0, 5, size - 9, self._channel, self.count, self._time)
+        seal(out, 0, size, pending[STATE:])
         records, start = self._records[self._half], self._position
-        end = start + len(out)
+        end = start + size
         records[start:end] = out
         self.count += 1
         self._step += 1
@@ -391,6 +399,7 @@ class StepLog:
             sink.put(image)
         self._ends[self._half][0] = end
         self._position = end
+        self._sizes.append(size)
         self.total += prepared.reward
 
     def put_state(self, state: Any) -> None:
@@ -403,9 +412,9 @@ class StepLog:
 
     def _number(self, pending: bytearray) -> None:
         """Says in a record that is not complete which one it will be; a length of 0 marks it as such."""
-        RECORD_HEADER.pack_into(pending, 0, 5, 0, self._channel, self.count, 0, 0)
-        pending[RECORD_HEADER.size : BODY] = CDR_HEADER
-        pending[BODY : BODY + 8] = self._episode.to_bytes(4, "little") + self._step.to_bytes(4, "little")
+        _RUNNING.pack_into(
+            pending, 0, 5, 0, self._channel, self.count, 0, 0, CDR_HEADER, self._episode, self._step
+        )
 
     def committed(self) -> tuple[int, memoryview]:
         """The running half and its committed records, for another thread to copy from."""
@@ -442,11 +451,18 @@ class StepLog:
         self._ends[other][0] = 0
         self._records[other][: len(self._pending)] = self._pending
         self._half, self._position, self._emitted = other, 0, 0
-        for rows in group_records(self._records[full][begin:end], sealed=True):
-            self._sink(rows)
+        self._emit(self._records[full][begin:end])
 
     def flush(self) -> None:
         """Writes the committed records that are not in the file yet."""
         begin, self._emitted = self._emitted, self._position
-        for rows in group_records(self._records[self._half][begin : self._position], sealed=True):
-            self._sink(rows)
+        self._emit(self._records[self._half][begin : self._position])
+
+    def _emit(self, records: memoryview) -> None:
+        sizes, self._sizes = self._sizes, []
+        if sum(sizes) != len(records):  # a step was interrupted: what the journal says counts
+            for rows in group_records(records, sealed=True):
+                self._sink(rows)
+        elif sizes:
+            (first,) = _SEQUENCE.unpack_from(records, _SEQUENCE_AT)
+            self._sink(_as_rows(self._channel, first, bytearray(records), sizes, sealed=True))
