@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import shutil
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.merge import merge_recordings
 from tupli_mcap.recording.options import WriterOptions
+from tupli_mcap.recording.pictures import decode_pixels
 from tupli_mcap.recording.pngcodec import PngCodec
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.rewrite import rewrite_recording
@@ -218,6 +221,42 @@ def test_a_chunk_of_other_stacks_is_a_format_error() -> None:
         except FormatError:
             continue
         assert len(found) == 6
+
+
+def png_of(depth: int, kind: int, size: tuple[int, int], row: bytes) -> bytes:
+    """A PNG of `depth` bits a channel; `kind` is 0 for grey, 2 for RGB, 6 for RGBA. All rows are the same."""
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+        )
+
+    head = struct.pack(">IIBBBBB", *size, depth, kind, 0, 0, 0)
+    pixels = zlib.compress((b"\0" + row) * size[1])
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(
+    ("kind", "channels", "depth"), [(0, 1, 2), (0, 1, 4), (0, 1, 16), (2, 3, 16), (6, 4, 16)]
+)
+def test_a_picture_of_another_depth_is_refused(kind: int, channels: int, depth: int) -> None:
+    """Pillow gives 8 bits of each: those that are lost must not be lost in silence."""
+    shape = 2, 4, channels
+    good = png_of(8, kind, (4, 2), bytes(4 * channels))
+    assert np.array_equal(decode_pixels(good, shape, "here"), np.zeros(shape, np.uint8))
+    other = png_of(depth, kind, (4, 2), bytes(4 * channels * depth // 8))
+    with pytest.raises(FormatError, match="here: expected a PNG of"):
+        decode_pixels(other, shape, "here")
+
+
+def test_a_stamp_comes_back_whatever_it_says() -> None:
+    layout = StepLayout(spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Discrete(2))
+    codec, rows, _ = encoded_rows(layout, np.zeros((2, 4, 5, 3), np.uint8))
+    rows["sec"], rows["nanosec"] = (1 << 31) - 1, (1 << 32) - 1  # more seconds together than 31 bits hold
+    encoded = codec.encode(even_rows(1, 0, rows.tobytes(), rows))
+    found = np.frombuffer(codec.decode(bytes(encoded.data), 2, "here"), rows.dtype)
+    for name in ("sec", "nanosec", "data"):
+        assert np.array_equal(found[name], rows[name])
 
 
 class Seen(gym.ObservationWrapper[Any, Any, Any]):

@@ -127,10 +127,11 @@ def decode_pixels(
     mode = {1: "L", 3: "RGB", 4: "RGBA"}[channels]
     try:
         with image_module.open(io.BytesIO(data), formats=("PNG",)) as image:
-            if image.size not in sizes or image.mode != mode:
+            kind = image.tile[0][3]  # as it is in the file; of 16 bits a channel, `mode` has 8
+            if image.size not in sizes or (kind, image.mode) != (mode, mode):
                 heights = f"{height}" if most == 1 else f"1 to {most} times {height}"
                 raise FormatError(
-                    f"{where}: expected a PNG of {mode}, {width} x {heights} pixels, found {image.mode}, "
+                    f"{where}: expected a PNG of {mode}, {width} x {heights} pixels, found {kind}, "
                     f"{image.width} x {image.height}"
                 )
             return np.asarray(image).reshape(-1, width, channels)

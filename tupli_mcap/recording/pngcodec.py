@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from tupli_mcap.recording.stackcodec import new_frames
 __all__ = ["PngCodec"]
 
 Array = np.ndarray[Any, Any]
+_STAMP = struct.Struct("<iI")  # kept bit for bit, also one that no clock says
 
 
 class PngCodec:
@@ -54,9 +56,9 @@ class PngCodec:
         images = np.frombuffer(rows.data, self._dtype)
         windows = self._windows(images)
         for row, window, new in zip(images, windows, new_frames(windows), strict=True):
-            time_ns = int(row["sec"]) * 10**9 + int(row["nanosec"])
+            stamp = _STAMP.pack(int(row["sec"]), int(row["nanosec"]))
             png = encode_pixels(window[-new:].reshape(new * self._height, self._width, self._channels))
-            body = encode_frame(self._leaf.name, EncodedFrame(time_ns, "png", png))
+            body = stamp + encode_frame(self._leaf.name, EncodedFrame(0, "png", png))[_STAMP.size :]
             times = int(row["#log_time"]), int(row["#publish_time"])
             head = RECORD_HEADER.pack(5, BODY - 9 + len(body), rows.channel, int(row["#sequence"]), *times)
             records.append(head + CDR_HEADER + body)
@@ -86,7 +88,7 @@ class PngCodec:
             row["#sequence"], row["#log_time"] = sequence, log_time
             row["#publish_time"] = RECORD_HEADER.unpack_from(view, start)[5]
             row["#cdr"] = int.from_bytes(view[start + BODY - 4 : start + BODY], "little")
-            row["sec"], row["nanosec"] = divmod(frame.time_ns, 10**9)
+            row["sec"], row["nanosec"] = _STAMP.unpack_from(view, start + BODY)
             shape = self._height, self._width, self._channels
             frames = decode_pixels(frame.data, shape, where, self._frames).reshape(-1, windows.shape[2])
             old = self._frames - len(frames)
