@@ -58,26 +58,13 @@ class StackCodec:
         shape, strides = (count, self._frames, size), (self._dtype.itemsize, size, 1)
         return np.ndarray(shape, np.uint8, data, self._start, strides)
 
-    def _new_frames(self, windows: Array) -> list[int]:
-        """How many frames of each row are not the newest ones of the row before, at least 1."""
-        k = self._frames
-        new = [k] * len(windows)
-        moved = (windows[1:, : k - 1] == windows[:-1, 1:]).all(axis=(1, 2))
-        for i in range(1, len(windows)):
-            if moved[i - 1]:
-                new[i] = 1
-                continue
-            same = (m for m in range(2, k) if np.array_equal(windows[i, : k - m], windows[i - 1, m:]))
-            new[i] = next(same, k)
-        return new
-
     def encode(self, rows: Rows) -> Rows:
         size, count, data = self._dtype.itemsize, len(rows.offsets), memoryview(rows.data).cast("B")
         if len(data) != size * count:
             return rows
         parts: list[Any] = []
         lengths = np.empty(count, np.uint64)
-        for i, new in enumerate(self._new_frames(self._windows(data, count))):
+        for i, new in enumerate(new_frames(self._windows(data, count))):
             end = (i + 1) * size
             pixels = new * self._frame_bytes
             head = bytearray(data[i * size : i * size + self._start])
