@@ -32,7 +32,11 @@ from tupli_mcap.recording.writer import RecordingWriter
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"
 NAMES = sorted(path.stem for path in GOLDEN.glob("*.mcap"))
-BEFORE_CRC = sorted(path.stem for path in (GOLDEN / "before_crc").glob("*.mcap"))
+EARLIER = sorted(  # of earlier writers
+    (folder, path.stem)
+    for folder in ("before_crc", "before_size")
+    for path in (GOLDEN / folder).glob("*.mcap")
+)
 UNFINISHED = [name for name in NAMES if name.startswith("unfinished")]
 UNCOMPRESSED = [name for name in NAMES if name not in ("constant_zstd", "constant_lz4")]
 COLUMNS = ("states", "actions", "rewards", "terminals", "timeouts")
@@ -118,12 +122,12 @@ def test_reads_what_the_environment_returned(name: str, tmp_path: Path) -> None:
         assert recording.num_steps == sum(len(episode["rewards"]) for episode in expected(name))
 
 
-@pytest.mark.parametrize("name", BEFORE_CRC)
-def test_reads_those_of_the_first_writer(name: str, tmp_path: Path) -> None:
-    """Their metadata has no checksum."""
-    directory = GOLDEN / "before_crc"
+@pytest.mark.parametrize(("folder", "name"), EARLIER)
+def test_reads_those_of_earlier_writers(folder: str, name: str, tmp_path: Path) -> None:
+    """Those of the first one have no checksum in their metadata; then journals did not say how long the file was."""
+    directory = GOLDEN / folder
     with Recording(place(name, tmp_path, directory)) as recording:
-        assert "crc" not in recording._contents.channels[1].metadata
+        assert ("crc" in recording._contents.channels[1].metadata) == (folder != "before_crc")
         assert_same(list(as_read(recording)), expected(name, directory))
     RecordingWriter(tmp_path / f"{name}.mcap", WriterOptions(mode="a")).close()
     with Recording(tmp_path / f"{name}.mcap") as recording:

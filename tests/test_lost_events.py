@@ -299,3 +299,49 @@ def test_images_of_final_states_are_not_made_up(tmp_path: Path, ticks: Callable[
             assert known == {lasts[1], lasts[2]}  # one goes on, one ended with the last batch
             for episode, other in zip(recording.episodes, whole.episodes, strict=True):
                 assert episode.final_state is None or same(episode.final_state, other.final_state)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [BOX, spaces.Box(0, 255, (6, 5, 1), np.uint8), spaces.Dict({"x": BOX, "note": spaces.Text(3)})],
+    ids=["box", "image", "text"],
+)
+@pytest.mark.parametrize("options", [{"flush_seconds": 0}, {"max_bytes": 1 << 30}, {}], ids=str)
+def test_a_file_that_was_copied_before_its_journal(
+    tmp_path: Path, space: Any, options: dict[str, Any]
+) -> None:
+    """No final state of another episode, and no word less than something is missing."""
+    path, old = tmp_path / "r.mcap", tmp_path / "old"
+    env = RecordEpisodes(Sampler(space, ACTIONS, length=3), path, attachments={}, **options)
+    finals: list[Any] = []
+    copies: list[Path] = []
+    for episode in range(4):
+        env.reset(seed=episode)
+        for step in range(2 if episode == 1 else 3):  # the second one is left
+            state = env.step(1)[0]
+            copies.append(Path(shutil.copy(path, f"{old}{len(copies)}.mcap")))
+            if step == 1 and episode % 2:
+                env._writer.flush()
+        finals.append(state)
+    env.reset()
+    copies.append(Path(shutil.copy(path, f"{old}{len(copies)}.mcap")))
+    told = 0
+    for each in copies:
+        shutil.copy(journal_path(path), journal_path(each))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            with Recording(each) as recording:
+                found = {e.number: (e.end, e.final_state) for e in recording.episodes}
+        behind = any("before what its journal has left to it" in str(warning.message) for warning in caught)
+        told += behind
+        recover_recording(each, tmp_path / "mended.mcap", overwrite=True)
+        with Recording(tmp_path / "mended.mcap") as mended:
+            assert {e.number for e in mended.episodes} == set(found)
+            both = [found, {e.number: (e.end, e.final_state) for e in mended.episodes}]
+        for episodes in both:
+            for number, (_, final) in episodes.items():
+                assert final is None or same(final, finals[number])
+        if not behind:
+            assert all(final is not None for number, (_, final) in found.items() if number != 1)
+    env.close()
+    assert 0 < told < len(copies)

@@ -91,11 +91,14 @@ class EpisodeLog(EventLog):
         counts: dict[int, int],
         index: IndexBuilder,
         time_ns: int,
+        file_size: Callable[[], int],
     ) -> None:
         self._start, self._final, self._end = ids = channels.start, channels.final_state, channels.end
         self._index = index
         self._running: dict[int, StartedEpisode] = {}  # started, and to be ended by what rows tell
-        super().__init__(area, buffer, sink, {channel: counts[channel] for channel in ids}, time_ns)
+        super().__init__(
+            area, buffer, sink, {channel: counts[channel] for channel in ids}, time_ns, file_size
+        )
 
     def start(self, number: int, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
         """Adds an `/episode_start`."""

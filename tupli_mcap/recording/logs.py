@@ -1,7 +1,7 @@
 """Message records of variable size in the journal: the events of all channels, and steps without a constant layout.
 
 A log half is a u64 end offset and the records before it. The end is stored after the bytes, in one machine word: it
-commits them.
+commits them. A log of events says, too, how long the file was when it took up what the log held before.
 """
 
 from __future__ import annotations
@@ -120,10 +120,17 @@ class EventLog:
     """
 
     def __init__(
-        self, area: LogArea, buffer: memoryview, sink: Sink, sequences: dict[int, int], time_ns: int
+        self,
+        area: LogArea,
+        buffer: memoryview,
+        sink: Sink,
+        sequences: dict[int, int],
+        time_ns: int,
+        file_size: Callable[[], int],
     ) -> None:
         self.sequences = sequences
         self._sink = sink
+        self._file_size = file_size
         self.latest_ns = time_ns
         # what the journal holds by channel, so that a flush need not take it apart
         self._whole: defaultdict[int, list[bytes]] = defaultdict(list)
@@ -137,9 +144,10 @@ class EventLog:
     def move(self, area: LogArea, buffer: memoryview) -> None:
         """Goes on in another journal; everything must have been flushed."""
         self._records = buffer[_HEADER : _HEADER + area.capacity]
-        self._commit = buffer[:8].cast("Q")
+        self._commit, self._behind = buffer[:8].cast("Q"), buffer[8:16].cast("Q")
         self._capacity = area.capacity
         self._position = 0
+        self._behind[0] = self._file_size()
         self._commit[0] = 0
 
     def append(self, time_ns: int, *messages: tuple[int, bytes]) -> int:
@@ -233,6 +241,7 @@ class EventLog:
             if records:
                 before = sum(map(_count, records)) + (kept if channel == self._last_channel else 0)
                 self._sink(_rows_of(channel, self.sequences[channel] - before, records, sealed=True))
+        self._behind[0] = self._file_size()
 
 
 def leaf_encoders(layout: StepLayout, leaves: Sequence[Leaf]) -> list[tuple[Leaf, Encoder]]:

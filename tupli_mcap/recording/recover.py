@@ -35,6 +35,7 @@ from tupli_mcap.recording.salvage import (
     image_rows,
     log_records,
     running_record,
+    size_behind,
     to_rows,
 )
 from tupli_mcap.recording.scan import Scan, is_ours, scan
@@ -105,6 +106,10 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
             # under same-step autoreset; and it is not known what else of that step was lost
             tail.final_lost = journal.torn and bool(journal.info.get("vector"))
             _salvage(source, found, journal, layout, [c.id for c in steps], tail)
+            missing = size_behind(journal, _log_area(journal, "events")) - found.end
+            if missing > 0:  # with ends and final states: what runs may be the episode after them
+                warnings.warn(_older(source, missing), UserWarning, stacklevel=6)
+                tail.pending.clear()
         complete(source, found, layout, [c.id for c in steps], tail, contents)
         if tail.left_out and journal is not None and journal.torn:
             warnings.warn(_torn(source, tail.left_out), UserWarning, stacklevel=6)
@@ -205,6 +210,13 @@ def _foreign_journal(source: Source, metadata: Mapping[str, str]) -> str:
     return (
         f"{source.name} was not finished, and {found} is the journal of another recording: it is left alone, and "
         "steps not yet in a chunk cannot be recovered"
+    )
+
+
+def _older(source: Source, missing: int) -> str:
+    return (
+        f"{source.name} ends {missing} bytes before what its journal has left to it: ends of episodes and final states "
+        "are missing. A copy of a recording that is being made needs the journal first, and then the file"
     )
 
 

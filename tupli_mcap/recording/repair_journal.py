@@ -17,7 +17,7 @@ from tupli_mcap.recording.recover import belongs, define, misplaced_journal
 from tupli_mcap.recording.repair_gather import Gathered, Piece
 from tupli_mcap.recording.repair_segments import Channels, messages
 from tupli_mcap.recording.rows import RowDeriver
-from tupli_mcap.recording.salvage import Salvage, log_records, running_record
+from tupli_mcap.recording.salvage import Salvage, log_records, running_record, size_behind
 
 __all__ = ["add_journal"]
 
@@ -111,6 +111,9 @@ def _merge(gathered: Gathered, journal: JournalContents) -> None:
             state = None if state is None or pending is None else state + pending
         if state is not None:
             gathered.states[env] = state
+    events = journal.areas.get("events")
+    if isinstance(events, LogArea) and size_behind(journal, events) > gathered.source.size:
+        gathered.states.clear()  # an end may be missing, and what runs be the episode after it
 
 
 def _stop(gathered: Gathered, channel: int) -> int:

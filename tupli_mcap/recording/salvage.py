@@ -19,7 +19,16 @@ from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.rows import RowDeriver, even_rows
 from tupli_mcap.recording.vector_rows import HOLE
 
-__all__ = ["FinalHole", "Salvage", "committed_rows", "image_rows", "log_records", "running_record", "to_rows"]
+__all__ = [
+    "FinalHole",
+    "Salvage",
+    "committed_rows",
+    "image_rows",
+    "log_records",
+    "running_record",
+    "size_behind",
+    "to_rows",
+]
 
 Array = np.ndarray[Any, Any]
 SEQUENCE_END = 15  # of `sequence` in a Message record
@@ -245,6 +254,11 @@ def _whole_records(contents: JournalContents, data: memoryview) -> Iterator[tupl
             yield start, end, channel, sequence, log_time
     except FormatError:  # torn
         return
+
+
+def size_behind(contents: JournalContents, area: LogArea) -> int:
+    """Bytes the file had when it took up what a log of one half held before; 0 where the journal does not say."""
+    return int(contents.data[area.name][8:16].view("<u8")[0])
 
 
 def _half(contents: JournalContents, area: LogArea, half: int) -> memoryview:

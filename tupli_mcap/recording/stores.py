@@ -61,6 +61,10 @@ class Stores:
         grow: Callable[[int], None],
     ) -> None:
         counts, before_ns = container.counts, container.end_time
+
+        def file_size() -> int:
+            return container.position
+
         rows_area, log_area, buffer = journal.row_area, journal.log_area, journal.buffer
         self.rows: SingleRows | StepLog | None = None
         self.vector: VectorRows | list[StepLog] | None = None
@@ -112,17 +116,17 @@ class Stores:
                 [sinks[0] for sinks in self.images], counts[channel], RowDeriver(time_ns=before_ns), sealed=sealed,
             )  # fmt: skip
         self.events = EpisodeLog(
-            log_area("events"), buffer("events"), add_chunk, channels, counts, index, before_ns
+            log_area("events"), buffer("events"), add_chunk, channels, counts, index, before_ns, file_size
         )
         self.infos: EventLog | None = None
         if channels.info is not None:
             info = {channels.info: counts[channels.info]}
-            self.infos = EventLog(log_area("info"), buffer("info"), add_chunk, info, before_ns)
+            self.infos = EventLog(log_area("info"), buffer("info"), add_chunk, info, before_ns, file_size)
         self.frames: list[EventLog] = []
         for i, pair in enumerate(channels.cameras):
             name = f"{FRAMES_AREA}{i}"
             known = {c: counts[c] for c in pair}
-            self.frames.append(EventLog(log_area(name), buffer(name), add_chunk, known, before_ns))
+            self.frames.append(EventLog(log_area(name), buffer(name), add_chunk, known, before_ns, file_size))
 
     def flush(self, *, keep_last: bool) -> None:
         """Writes everything that is committed; with `keep_last` not the last event."""
