@@ -112,9 +112,7 @@ def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
     return out.getvalue()
 
 
-def decode_pixels(
-    data: bytes, shape: tuple[int, int, int], where: str, most: int = 1
-) -> np.ndarray[Any, Any]:
+def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> np.ndarray[Any, Any]:
     """The pixels of a PNG of 1 to `most` pictures of this shape (height, width, channels), one below the other.
 
     Raises:
@@ -131,14 +129,14 @@ def decode_pixels(
             if image.size not in sizes or (kind, image.mode) != (mode, mode):
                 heights = f"{height}" if most == 1 else f"1 to {most} times {height}"
                 raise FormatError(
-                    f"{where}: expected a PNG of {mode}, {width} x {heights} pixels, found {kind}, "
+                    f"expected a PNG of {mode}, {width} x {heights} pixels, found {kind}, "
                     f"{image.width} x {image.height}"
                 )
             return np.asarray(image).reshape(-1, width, channels)
     except FormatError:
         raise
     except Exception as err:  # Pillow's decoders raise many kinds
-        raise FormatError(f"{where}: expected a PNG, found {bytes(data[:16])!r}: {err}") from err
+        raise FormatError(f"expected a PNG, found {bytes(data[:16])!r}: {err}") from err
 
 
 def check_image_format(name: str) -> ImageFormat:

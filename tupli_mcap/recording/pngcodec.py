@@ -72,17 +72,23 @@ class PngCodec:
             raise FormatError(f"{where}: expected at most {MAX_CHUNK} bytes of images, found {size}")
         if self._is_raw(data, count):
             return data
+        try:
+            return self._decode(data, count)
+        except FormatError as err:
+            raise FormatError(f"{where}: {err}") from err
+
+    def _decode(self, data: Any, count: int) -> Any:
         out = np.zeros(count, self._dtype)
         out["fixed"] = self._fixed
         view, windows, found = memoryview(data), self._windows(out), 0
         for start, end, channel, sequence, log_time in iter_records(view):
             if found == count:
-                raise FormatError(f"{where}: expected {count} images, found more")
+                raise FormatError(f"expected {count} images, found more")
             row = out[found]
             frame, name = decode_frame(view[start + BODY : end])
             if (name, frame.form) != (self._leaf.name, "png"):
                 raise FormatError(
-                    f"{where}: expected a png of {self._leaf.name!r}, found {frame.form!r:.20} of {name!r:.40}"
+                    f"expected a png of {self._leaf.name!r}, found {frame.form!r:.20} of {name!r:.40}"
                 )
             row["#opcode"], row["#length"], row["#channel"] = 5, self._dtype.itemsize - 9, channel
             row["#sequence"], row["#log_time"] = sequence, log_time
@@ -90,16 +96,14 @@ class PngCodec:
             row["#cdr"] = int.from_bytes(view[start + BODY - 4 : start + BODY], "little")
             row["sec"], row["nanosec"] = _STAMP.unpack_from(view, start + BODY)
             shape = self._height, self._width, self._channels
-            frames = decode_pixels(frame.data, shape, where, self._frames).reshape(-1, windows.shape[2])
+            frames = decode_pixels(frame.data, shape, self._frames).reshape(-1, windows.shape[2])
             old = self._frames - len(frames)
             if old and not found:
-                raise FormatError(
-                    f"{where}: expected {self._frames} frames in the first picture, found {len(frames)}"
-                )
+                raise FormatError(f"expected {self._frames} frames in the first picture, found {len(frames)}")
             if old:
                 windows[found, :old] = windows[found - 1, -old:]
             windows[found, old:] = frames
             found += 1
         if found != count:
-            raise FormatError(f"{where}: expected {count} images, found {found}")
+            raise FormatError(f"expected {count} images, found {found}")
         return out.view(np.uint8)
