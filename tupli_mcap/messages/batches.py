@@ -15,9 +15,10 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 
-__all__ = ["LOG_TIME", "BatchDecoder"]
+__all__ = ["LOG_TIME", "BatchDecoder", "Decode"]
 
 Array = np.ndarray[Any, Any]
+Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]  # `steps` or `finals` of a `BatchDecoder`
 LOG_TIME = "#log_time"  # the name of the times (ns), as in the rows of constant size
 _LOG_TIME_AT = 15  # in a record
 _U1, _U4 = np.dtype(np.uint8), np.dtype("<u4")
@@ -26,7 +27,8 @@ _U1, _U4 = np.dtype(np.uint8), np.dtype("<u4")
 class BatchDecoder:
     """Decodes Message records of `/step` and `/final_state` that lie in one buffer. Safe from several threads.
 
-    Every defect is a FormatError, the one that `MessageDecoder` has for the first message that is defective.
+    Every defect is a FormatError, the one that `MessageDecoder` has for the first message that is defective. A text that
+    nobody asks for is skipped, whatever it holds.
     """
 
     def __init__(self, layout: StepLayout) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.messages.batches import LOG_TIME, BatchDecoder
+from tupli_mcap.messages.batches import LOG_TIME, BatchDecoder, Decode
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
@@ -21,7 +21,6 @@ __all__ = ["FIELDS", "ColumnReader", "Columns"]
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
 Array = np.ndarray[Any, Any]
-Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]
 _MANY_ROWS = 1000  # fewer are copied before they have been looked at in another way
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from tupli_mcap.messages.batches import LOG_TIME
+from tupli_mcap.messages.batches import LOG_TIME, Decode
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.pieces import items, items_dtype, put
@@ -16,7 +16,7 @@ from tupli_mcap.recording.together import do_all
 from tupli_mcap.sampling.segments import Piece, Segments
 from tupli_mcap.sampling.steps import following, pick, pick_runs, rows_of_runs
 
-__all__ = ["TIME", "Column", "ConstantRows", "Decode", "DecodedRows", "RowFormat", "Rows"]
+__all__ = ["TIME", "Column", "ConstantRows", "DecodedRows", "RowFormat", "Rows"]
 
 TIME = LOG_TIME  # the column of times (uint64, ns)
 
@@ -25,7 +25,6 @@ _FEW_CHUNKS = 128
 _LARGE_CHUNK = 1 << 20  # bytes
 
 Array = np.ndarray[Any, Any]
-Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]
 
 
 class Column(NamedTuple):
