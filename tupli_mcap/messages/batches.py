@@ -27,8 +27,8 @@ _U1, _U4 = np.dtype(np.uint8), np.dtype("<u4")
 class BatchDecoder:
     """Decodes Message records of `/step` and `/final_state` that lie in one buffer. Safe from several threads.
 
-    Every defect is a FormatError, the one that `MessageDecoder` has for the first message that is defective. A text that
-    nobody asks for is skipped, whatever it holds.
+    Every defect is a FormatError, the one that `MessageDecoder` has for the first message that is defective. A text
+    that nobody asks for is skipped, whatever it holds.
     """
 
     def __init__(self, layout: StepLayout) -> None:
