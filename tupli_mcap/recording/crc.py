@@ -1,8 +1,28 @@
-"""CRC-32 by ISA-L, which takes a third of zlib's time; by zlib on the machines that it is not made for."""
+"""CRC-32 by ISA-L, which takes a third of zlib's time; by zlib on the machines that it is not made for.
+
+ISA-L leaves the upper halves of the vector registers in use. On Intel processors all that follows in the thread is
+slower then, the environment included (recording CartPole took 2.6 µs a step instead of 1.5), until something clears
+them: NumPy's loops do so as they end.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
 
 try:
-    from isal.isal_zlib import crc32
+    from isal.isal_zlib import crc32 as _crc32
 except ImportError:
-    from zlib import crc32
+    from zlib import crc32 as _crc32
 
 __all__ = ["crc32"]
+
+_ZEROS = np.zeros(256)
+
+
+def crc32(data: Any, value: int = 0, /) -> int:
+    """The checksum of `data`, behind bytes whose checksum is `value`."""
+    found: int = _crc32(data, value)
+    np.add(_ZEROS, _ZEROS, out=_ZEROS)  # long enough for a loop of vectors
+    return found
