@@ -502,3 +502,31 @@ def test_a_journal_of_fewer_channels_is_refused() -> None:
     contents = JournalContents({}, {"steps": area}, {"steps": np.empty(0, np.uint8)})
     with pytest.raises(FormatError, match="'steps' has rows of 0 channels, none of number 0"):
         Salvage(contents, area, 0, dtype, 1)
+
+
+@pytest.mark.parametrize(
+    "space", [BOX, spaces.Dict({"x": BOX, "see": spaces.Box(0, 255, (4, 5, 3), np.uint8)})]
+)
+def test_definitions_that_only_the_journal_has_left_are_written_again(
+    tmp_path: Path, space: gym.Space[Any]
+) -> None:
+    """After a power loss the file may end before its channels, which are written before anything else."""
+    path, place = tmp_path / "r.mcap", tmp_path / "cut.mcap"
+    env = RecordEpisodes(Sampler(space, spaces.Discrete(3), length=4), path, attachments={})
+    env.reset(seed=1)
+    env.step(0)
+    file, journal = path.read_bytes(), journal_path(path).read_bytes()
+    env.close()
+    first = file.index(b"tupli_mcap/msg/Step") - 15  # the first Schema record
+    for end in range(first, len(file), 41):
+        place.write_bytes(file[:end])
+        journal_path(place).write_bytes(journal)
+        with RecordEpisodes(
+            Sampler(space, spaces.Discrete(3), length=4), place, mode="a", attachments={}
+        ) as again:
+            again.reset(seed=2)
+            again.step(1)
+        report = verify_recording(place)
+        assert report.ok, (end, report.problems)
+        with Recording(place) as recording:
+            assert recording.num_steps == 2

@@ -72,6 +72,8 @@ def resume(writer: RecordingWriter) -> None:
     if contents.complete and not new:
         return
     writer.cut()
+    for channel in contents.undefined:  # the file was shorter after a power loss
+        writer.container.write(writer.container.definitions(channel))
     for rows in contents.tail:
         writer.container.add_chunk(rows)
     for name, (media_type, data) in new.items():

@@ -81,6 +81,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         if found.channels:
             warnings.warn(_foreign_journal(source, metadata), UserWarning, stacklevel=6)
         journal = None  # a stale journal of another recording with this name is not ours to merge
+    defined = set(found.channels)
     if journal is not None:
         define(found.schemas, found.channels, journal, source.name)
     tail = Unwritten()
@@ -98,6 +99,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         found.metadata_indexes,
         complete=False,
         data_end=end,
+        undefined=sorted(set(found.channels) - defined),
     )
     steps = step_channels(found.channels, source.name)
     if steps:
