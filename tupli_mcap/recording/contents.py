@@ -46,9 +46,9 @@ _VALUES = (
 
 @dataclass
 class Contents:
-    """`table` is a CHUNK_ROWS array; `memory` holds the rows of chunks that are only in the journal (`tail`, as the writer
-    would take them); `data_end` is the offset where the episode index (or what is to be cut) begins; `undefined` are
-    the channels that only the journal defines."""
+    """`table` is a CHUNK_ROWS array; `memory` holds the rows of chunks that are only in the journal (`tail`, as the
+    writer would take them); `data_end` is the offset where the episode index (or what is to be cut) begins; `undefined`
+    are the channels that only the journal defines."""
 
     metadata: dict[str, str]
     schemas: dict[int, Schema] = field(default_factory=dict)
