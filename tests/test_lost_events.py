@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from environments import Sampler, Scripted, same
@@ -345,3 +346,85 @@ def test_a_file_that_was_copied_before_its_journal(
             assert all(final is not None for number, (_, final) in found.items() if number != 1)
     env.close()
     assert 0 < told < len(copies)
+
+
+class Numbered(gym.Env[Any, Any]):
+    """Observations that say which they are; episodes of three steps."""
+
+    observation_space = spaces.Dict(
+        {"n": spaces.Discrete(1 << 20), "see": spaces.Box(0, 255, (8, 8, 3), np.uint8)}
+    )
+    action_space = spaces.Discrete(2)
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def observe(self) -> dict[str, Any]:
+        self.number += 1
+        return {"n": self.number, "see": np.full((8, 8, 3), self.number % 256, np.uint8)}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.left = 3
+        return self.observe(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.left -= 1
+        return self.observe(), 1.0, self.left == 0, False, {}
+
+
+@pytest.mark.parametrize("form", ["raw", "png"])
+def test_images_that_a_reset_has_written_over(
+    tmp_path: Path, form: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The journal is copied after the last step of an episode, the file in the middle of a later flush."""
+    path, old = tmp_path / "r.mcap", tmp_path / "old.mcap"
+    env = RecordEpisodes(Numbered(), path, attachments={}, image_format=form)
+    env.reset()
+    for _ in range(3):
+        env.step(1)
+    shutil.copy(journal_path(path), journal_path(old))
+    env.reset()
+    for _ in range(2):
+        env.step(1)
+    files: list[bytes] = []
+    place = Container._place
+
+    def spy(self: Container, *args: Any) -> None:
+        place(self, *args)
+        files.append(path.read_bytes())
+
+    monkeypatch.setattr(Container, "_place", spy)
+    env._writer.flush()
+    monkeypatch.undo()
+    assert len(files) > 2
+    for file in files:
+        old.write_bytes(file)
+        recover_recording(old, tmp_path / "mended.mcap", overwrite=True)
+        for one in (old, tmp_path / "mended.mcap"):
+            with Recording(one) as recording:
+                states = recording.read().states
+            assert len(states["n"]) >= 3
+            assert (states["see"] == (states["n"] % 256)[:, None, None, None]).all()
+    env.close()
+
+
+@pytest.mark.parametrize("space", [BOX, spaces.Dict({"x": BOX, "note": spaces.Text(3)})], ids=["box", "text"])
+def test_steps_between_a_file_and_its_journal_are_missed(tmp_path: Path, space: Any) -> None:
+    path, old = tmp_path / "r.mcap", tmp_path / "old.mcap"
+    env = RecordEpisodes(Sampler(space, ACTIONS, length=10), path, attachments={}, chunk_size=700)
+    for episode in range(60):
+        env.reset(seed=episode)
+        for _ in range(10):
+            env.step(1)
+        if episode == 20:
+            shutil.copy(path, old)
+    shutil.copy(journal_path(path), journal_path(old))
+    with pytest.warns(
+        UserWarning,
+        match="the first are missing, and all are left out: the file is damaged, or was copied before",
+    ):
+        Recording(old).close()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Recording(path).close()
+    env.close()

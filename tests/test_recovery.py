@@ -316,8 +316,13 @@ def test_appending_cuts_nothing_good_off_behind_damage(tmp_path: Path) -> None:
     first = Recording(path)._contents.table[0]
     at = int(first["offset"]) + int(first["length"]) - 20
     path.write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
-    with pytest.raises(
-        RecordingError, match=r"damaged at offset \d+: appending would lose \d+ message\(s\) of /step"
+    with (
+        pytest.warns(
+            UserWarning, match="of /step the first are missing, and all are left out: the file is damaged"
+        ),
+        pytest.raises(
+            RecordingError, match=r"damaged at offset \d+: appending would lose \d+ message\(s\) of /step"
+        ),
     ):
         cart_pole(path, mode="a")
     assert len(path.read_bytes()) == len(data)

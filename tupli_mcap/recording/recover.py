@@ -222,6 +222,13 @@ def _older(source: Source, missing: int) -> str:
     )
 
 
+def _gap(source: Source, topic: str, steps: int) -> str:
+    return (
+        f"{source.name}: of the last {steps} step(s) of {topic} the first are missing, and all are left out: the file "
+        "is damaged, or was copied before its journal (of a recording that is being made, copy the journal first)"
+    )
+
+
 def _torn(source: Source, steps: int) -> str:
     return (
         f"{source.name}: the machine that recorded it has been started anew since, or this is another one: {steps} "
@@ -274,6 +281,7 @@ def _salvage(
                 last = store.rows(span.chunk, layout.step_message.dtype)[span.begin]
             rows, _ = committed_rows(salvage, first, channel, last)
             total = first + (0 if rows is None else len(rows.offsets))
+            known = salvage.end
             tail.left_out += salvage.left_out
             holes = {(env, hole.row): hole for hole in salvage.finals(layout.state_end) if hole.row <= total}
             tail.finals |= holes
@@ -286,12 +294,17 @@ def _salvage(
             entries = [e for e in log_records(journal, log, {channel: first}) if e[0] == channel]
             rows = to_rows(entries)[0] if entries else None
             total = first + len(entries)
+            known = max((e[1] + 1 for e in log_records(journal, log, None) if e[0] == channel), default=0)
             state = running_record(journal, log, total, layout)
             if state is not None:
-                tail.pending[env] = state
+                tail.pending[env], known = state, max(known, total)
         if rows is not None:
             tail.rows.append(rows)
-        _salvage_images(found, journal, layout, env, total, tail)
+        if known > total and not journal.torn:
+            warnings.warn(
+                _gap(source, found.channels[channel].topic, known - total), UserWarning, stacklevel=7
+            )
+        _salvage_images(found, journal, layout, env, total, known, tail)
     for name in journal.areas:
         if name in _EVENTS or name.startswith(FRAMES_AREA):
             tail.rows += to_rows(log_records(journal, _log_area(journal, name), counts))
@@ -312,8 +325,19 @@ def _log_area(journal: JournalContents, name: str) -> LogArea:
 
 
 def _salvage_images(
-    found: Scan, journal: JournalContents, layout: StepLayout, env: int, steps: int, tail: Unwritten
+    found: Scan,
+    journal: JournalContents,
+    layout: StepLayout,
+    env: int,
+    steps: int,
+    known: int,
+    tail: Unwritten,
 ) -> None:
+    """Takes the images of the rows before `steps`.
+
+    Where the journal does not know a step as committed (`known` is the row after those), its image may be another one:
+    in a journal that was read or copied before the file, a reset has written over it since.
+    """
     for leaf in layout.images:
         (step,) = (
             c.topic
@@ -327,12 +351,12 @@ def _salvage_images(
         dtype = layout.image_messages[leaf.name].dtype
         area = _rows_area(journal, f"{leaf.name}/{env}")
         salvage = Salvage(journal, area, 0, dtype, channel, rewritten=True)  # by resets
-        rows = image_rows(salvage, found.counts.get(channel, 0), steps, channel)
+        rows = image_rows(salvage, found.counts.get(channel, 0), min(steps, known), channel)
         if rows is not None:
             tail.rows.append(rows)
         pending = salvage.row(steps)
         # where the file is ahead, a live writer may have been writing over that row while it was read
-        if pending is None or found.counts.get(channel, 0) > steps:
+        if pending is None or known < steps or found.counts.get(channel, 0) > steps:
             tail.pending.pop(env, None)
         elif env in tail.pending:
             tail.pending[env] += leaf.as_values(pending["data"]).tobytes()

@@ -90,13 +90,14 @@ def _merge(gathered: Gathered, journal: JournalContents) -> None:
     gathered.final_lost = journal.torn and bool(journal.info.get("vector"))
     for env, channel in enumerate(channels.steps):
         if layout.constant:
-            state = _add_rows(gathered, journal, layout, env, channel, starts)
+            state, known = _add_rows(gathered, journal, layout, env, channel, starts)
         else:
             steps_log = journal.areas.get(f"steps/{env}")
             if not isinstance(steps_log, LogArea):
                 raise FormatError(f"the journal has no records 'steps/{env}'")
-            _add_log(gathered, journal, steps_log)
+            known = _add_log(gathered, journal, steps_log).get(channel, 0)
             state = running_record(journal, steps_log, _stop(gathered, channel), layout)
+            known = known if state is None else max(known, _stop(gathered, channel))
         stop = _stop(gathered, channel)
         for leaf in layout.images:
             image = channels.images[leaf.name][env]
@@ -107,7 +108,8 @@ def _merge(gathered: Gathered, journal: JournalContents) -> None:
                 if not isinstance(area, RowArea):
                     raise FormatError(f"the journal has no rows '{leaf.name}/{env}'")
                 salvage = Salvage(journal, area, 0, dtype, image, rewritten=True)
-                pending = _add_images(gathered, salvage, leaf, image, stop)
+                pending = _add_images(gathered, salvage, leaf, image, min(stop, known))
+                pending = pending if known >= stop else None
             state = None if state is None or pending is None else state + pending
         if state is not None:
             gathered.states[env] = state
@@ -137,7 +139,8 @@ def _add(gathered: Gathered, channel: int, first: int, count: int, data: bytes) 
         gathered.add(channel, Piece(first, count, len(data), gathered.loaded.add(data)))
 
 
-def _add_log(gathered: Gathered, journal: JournalContents, area: LogArea) -> None:
+def _add_log(gathered: Gathered, journal: JournalContents, area: LogArea) -> dict[int, int]:
+    """Takes the records of a log; returns the row after its last one, by channel."""
     everything = log_records(journal, area, None)
     for channel in {entry[0] for entry in everything}:
         mine = {entry[1]: entry[3] for entry in everything if entry[0] == channel}
@@ -149,6 +152,7 @@ def _add_log(gathered: Gathered, journal: JournalContents, area: LogArea) -> Non
                 if i + 1 == len(numbers) or numbers[i + 1] != number + 1:
                     _add(gathered, channel, number + 1 - len(run), len(run), b"".join(run))
                     run = []
+    return {channel: sequence + 1 for channel, sequence, _, _ in everything}
 
 
 def _starts(gathered: Gathered, channels: Channels) -> dict[tuple[int, int], int]:
@@ -171,8 +175,8 @@ def _add_rows(
     env: int,
     channel: int,
     starts: dict[tuple[int, int], int],
-) -> bytes | None:
-    """Takes the steps of a sub-environment; returns its running state."""
+) -> tuple[bytes | None, int]:
+    """Takes the steps of a sub-environment; returns its running state, and the row after the last one committed."""
     area = journal.areas.get("steps")
     if not isinstance(area, RowArea):
         raise FormatError("the journal has no rows 'steps'")
@@ -192,8 +196,8 @@ def _add_rows(
     finals = {(env, hole.row): hole for hole in salvage.finals(layout.state_end) if hole.row <= stop}
     gathered.finals |= finals
     if layout.images and (env, stop) in finals:  # the image that is running is the next state's
-        return None
-    return salvage.following(stop - 1, layout.state_end)
+        return None, salvage.end
+    return salvage.following(stop - 1, layout.state_end), salvage.end
 
 
 def _row_before(gathered: Gathered, channel: int, first: int, dtype: np.dtype[Any]) -> tuple[int, int, int]:

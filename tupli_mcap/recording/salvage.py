@@ -114,6 +114,11 @@ class Salvage:
             if len(part)
         ]
 
+    @property
+    def end(self) -> int:
+        """The sequence after the last committed one here; 0 if there is none."""
+        return int(self._sequences[-1]) + 1 if len(self._sequences) else 0
+
     def row(self, sequence: int) -> Array | None:
         """The committed row with `sequence`; None if it is not here."""
         found = self._find(sequence)
