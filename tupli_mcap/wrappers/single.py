@@ -70,7 +70,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         frame_format: "png" (exact) or "jpeg" (faster; smaller for photographs, not for drawings).
         image_format: of the images in states, both exact. "raw": pixels, which the chunk's compression makes small;
             "png": each image, and each frame of a stack, as a PNG (extra `frames`): smaller for photographs, larger for
-            drawn screens, and 5 to 30 times slower to record.
+            drawn screens, and 4 to 35 times slower to record.
         live: shows the rollout while it is recorded: "rerun" (starts the viewer if none listens at 127.0.0.1:9876),
             "rerun+http://host:port/proxy" (one that is running), "foxglove" or "foxglove://127.0.0.1:8765" (a server
             to connect Foxglove to). A viewer that is missing, slow or closed changes nothing about the recording.
