@@ -12,8 +12,9 @@ from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.episode_log import EpisodeLog
 from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.journal import Journal
-from tupli_mcap.recording.logs import EventLog, StepLog
+from tupli_mcap.recording.logs import EventLog
 from tupli_mcap.recording.rows import ImageRows, RowDeriver, SingleRows
+from tupli_mcap.recording.step_log import StepLog
 from tupli_mcap.recording.vector_rows import VectorRows
 
 __all__ = ["Stores"]

@@ -22,8 +22,8 @@ from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder
-from tupli_mcap.recording.logs import Encoder, StepLog, leaf_encoders
 from tupli_mcap.recording.single import decide_layout
+from tupli_mcap.recording.step_log import Encoder, StepLog, leaf_encoders
 from tupli_mcap.recording.vector_infos import info_of
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode

@@ -21,8 +21,9 @@ from tupli_mcap.recording.cameras import EncodedFrame, decode_frame
 from tupli_mcap.recording.episode_log import Foretold
 from tupli_mcap.recording.index import EPISODE_ROWS
 from tupli_mcap.recording.infos import InfoDecoder
-from tupli_mcap.recording.logs import EventLog, StepLog, iter_records
+from tupli_mcap.recording.logs import EventLog, iter_records
 from tupli_mcap.recording.rows import HOLE, SingleRows
+from tupli_mcap.recording.step_log import StepLog
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter
 

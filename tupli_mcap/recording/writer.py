@@ -30,11 +30,12 @@ from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilde
 from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_path, owner_among
 from tupli_mcap.recording.library import library
 from tupli_mcap.recording.lock import FileLock
-from tupli_mcap.recording.logs import EventLog, StepLog
+from tupli_mcap.recording.logs import EventLog
 from tupli_mcap.recording.options import WriterOptions, check_options
 from tupli_mcap.recording.recover import head
 from tupli_mcap.recording.rows import ImageRows, SingleRows
 from tupli_mcap.recording.source import PathSource
+from tupli_mcap.recording.step_log import StepLog
 from tupli_mcap.recording.stores import Stores
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.worker import ChunkWorker
