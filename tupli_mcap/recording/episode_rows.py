@@ -101,30 +101,28 @@ class EpisodeRows:
 
         `pending`: final states of episodes that the last rows have ended, by sub-environment.
         """
-        flags = rows["terminal"] | rows["timeout"]
-        found = _Segments(rows["#sequence"], flags)
+        found = _Segments(rows["#sequence"], rows["terminal"] | rows["timeout"])
         going_on = found.is_first & (self.running[found.env] >= 0)
-        rewards = rows["reward"].reshape(-1)[found.places]
-        lengths, first_rows = found.lengths, rows["#sequence"].reshape(-1)[found.first].astype(np.int64)
+        rewards = np.where(found.hole, 0.0, rows["reward"]).reshape(-1)
+        lengths, first_rows = found.lengths, rows["#sequence"][found.env, found.begin].astype(np.int64)
         env = found.env[going_on]
         with np.errstate(over="ignore", invalid="ignore"):  # of infinite rewards
-            rewards[found.at[going_on]] += self.totals[env]
-            totals = _sums(rewards, found.at)
+            rewards[found.first[going_on]] += self.totals[env]
+            totals = _sums(rewards, found.first)
         lengths[going_on] += self._lengths[env]
         first_rows[going_on] = self._first_rows[env]
-        episodes = rows["episode"].reshape(-1)
         starts = np.zeros(len(found.env), _START)
-        starts["episode"], starts["env"], starts["first_row"] = episodes[found.first], found.env, first_rows
+        starts["episode"] = numbers = rows["episode"][found.env, found.begin]
+        starts["env"], starts["first_row"] = found.env, first_rows
         starts["time"] = self._reset_times(rows, found)
         ends = np.zeros(len(found.env), _END)
         for name in ("episode", "env", "first_row"):
             ends[name] = starts[name]
         ends["length"], ends["return"] = lengths, totals
-        ends["end"] = np.where(rows["terminal"].reshape(-1)[found.last], TERMINAL, TIMEOUT)
-        ends["time"] = rows["#log_time"].reshape(-1)[found.last]
+        ends["end"] = np.where(rows["terminal"][found.env, found.last], TERMINAL, TIMEOUT)
+        ends["time"] = rows["#log_time"][found.env, found.last]
         final = found.is_final
-        numbers = starts["episode"].astype(np.int64)
-        self.running[found.env[final]] = np.where(found.ended, -1, numbers)[final]
+        self.running[found.env[final]] = np.where(found.ended, -1, numbers.astype(np.int64))[final]
         self._first_rows[found.env[final]] = first_rows[final]
         self._lengths[found.env[final]] = lengths[final]
         self.totals[found.env[final]] = totals[final]
@@ -132,11 +130,11 @@ class EpisodeRows:
 
     def _reset_times(self, rows: Array, found: _Segments) -> Array:
         """The times of the holes before each segment."""
-        times, width = rows["#log_time"], rows.shape[1]
-        before = times.reshape(-1)[found.first - 1]
-        before[found.first % max(1, width) == 0] = self._began[found.env[found.first % max(1, width) == 0]]
-        if width:
-            is_hole = rows["#sequence"][:, -1] == HOLE
+        times, at_once = rows["#log_time"], found.begin == 0
+        before = times[found.env, found.begin - 1]
+        before[at_once] = self._began[found.env[at_once]]
+        if found.hole.size:
+            is_hole = found.hole[:, -1]
             self._began[is_hole] = times[is_hole, -1]
         return before
 
@@ -148,7 +146,7 @@ class EpisodeRows:
         before = np.flatnonzero(self._waits)
         if not width:
             before = before[np.isin(before, list(pending))]
-        column = last % max(1, width) + 1
+        column = last + 1
         ends = np.concatenate([self._waiting[before], ends])
         column = np.concatenate([np.zeros(len(before), np.int64), column])
         self._waits[before] = False
@@ -173,25 +171,26 @@ class _Segments:
     """The parts of rows (a line a sub-environment) between holes, flags, and the ends of the lines.
 
     Attributes:
-        places: of all rows that are no holes, in the flattened rows.
-        at: of each part's first row, in `places`.
-        env, first, last, lengths: each part's sub-environment, the places of its first and last row, and its rows.
+        hole: which rows are holes.
+        env, begin, last, lengths: each part's sub-environment, the places of its first and last row there, and its
+            rows.
+        first: the place of each part's first row in the flattened rows.
         ended: its last row has a flag set.
         is_first, is_final: it is the first, the last one of its sub-environment.
     """
 
     def __init__(self, sequences: Array, flags: Array) -> None:
-        width = max(1, sequences.shape[1])
-        self.places = np.flatnonzero(sequences.reshape(-1) != HOLE)
-        done = flags.reshape(-1)[self.places]
-        line = self.places // width
-        begins = np.ones(len(self.places), np.bool_)
-        begins[1:] = (line[1:] != line[:-1]) | done[:-1]
-        self.at = np.flatnonzero(begins)
-        stops = np.append(self.at[1:], len(self.places))[: len(self.at)]
-        self.lengths = stops - self.at
-        self.env, self.first = line[self.at], self.places[self.at]
-        self.last, self.ended = self.places[stops - 1], done[stops - 1]
+        self.hole = hole = sequences == HOLE
+        begins = ~hole
+        stops = begins.copy()
+        begins[:, 1:] &= hole[:, :-1] | flags[:, :-1]
+        stops[:, :-1] &= hole[:, 1:] | flags[:, :-1]
+        self.first, width = np.flatnonzero(begins), max(1, hole.shape[1])
+        self.env = self.first // width
+        self.begin = self.first - self.env * width
+        self.last = np.flatnonzero(stops) - self.env * width
+        self.lengths = self.last - self.begin + 1
+        self.ended = flags[self.env, self.last]
         self.is_first = np.diff(self.env, prepend=-1) != 0
         self.is_final = np.diff(self.env, append=-1) != 0
 
@@ -202,4 +201,4 @@ def _sums(values: Array, firsts: Array) -> Array:
         return np.zeros(0)
     if (values == np.rint(values)).all() and np.abs(values).sum() < 2**53:
         return np.add.reduceat(values, firsts) + 0.0  # exact in any order
-    return np.array([np.add.accumulate(part)[-1] for part in np.split(values, firsts[1:])]) + 0.0
+    return np.array([np.add.accumulate(part)[-1] for part in np.split(values, firsts)[1:]]) + 0.0
