@@ -130,6 +130,7 @@ class Faults:
         replace(os, "close", self._os_close)
         replace(os, "write", self._os_write)
         replace(os, "pwrite", self._os_write)
+        replace(os, "pwritev", self._os_writev)
         replace(mmap, "mmap", self._checked("map"))
         replace(fcntl, "flock", self._checked("lock"))
         replace(io, "open", self._io_open)
@@ -181,6 +182,15 @@ class Faults:
                 written: int = real(fd, data, *where)
                 return written
             return self.written(path, data, lambda part: real(fd, part, *where))
+
+        return call
+
+    def _os_writev(self, real: Any) -> Any:
+        write = self._os_write(lambda fd, data, *where: real(fd, [data], *where))
+
+        def call(fd: int, parts: Any, *where: int) -> int:
+            written: int = write(fd, b"".join(parts), *where)
+            return written
 
         return call
 

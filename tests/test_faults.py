@@ -58,7 +58,7 @@ def test_the_harness_notices_a_step_that_is_lost(tmp_path: Path, monkeypatch: py
 
     write = Container.write
     monkeypatch.setattr(
-        Container, "write", lambda self, data: write(self, data) if self.position < 4000 else None
+        Container, "write", lambda self, *data: write(self, *data) if self.position < 4000 else None
     )
     with pytest.raises((AssertionError, UserWarning), match="steps"):
         run_case("box", tmp_path, Case(-1, errno.EIO, False))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 from mcap.reader import make_reader
 
-from tupli_mcap import Recording, RecordingError, SpaceError, StepError
+from tupli_mcap import Recording, RecordingError, SpaceError, StepError, verify_recording
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes
@@ -127,6 +128,25 @@ def test_long_enough_to_fill_halves(tmp_path: Path, mode: Any) -> None:
     expected = np.concatenate([episode.next_states for episode in recording.episodes])
     assert np.array_equal(columns.next_states, expected)
     assert np.array_equal(columns.states, np.concatenate([episode.states for episode in recording.episodes]))
+
+
+@pytest.mark.parametrize("most", [1, 100, None])
+def test_a_system_that_writes_less_than_it_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int | None
+) -> None:
+    """Or, as some do, knows no writes of several buffers."""
+    write = os.pwritev
+    if most is None:
+        monkeypatch.delattr(os, "pwritev")
+    else:
+        monkeypatch.setattr(
+            os, "pwritev", lambda fd, parts, at: write(fd, [memoryview(b"".join(parts))[:most]], at)
+        )
+    with RecordEpisodes(make(SPACES["box"], None), tmp_path / "r.mcap", chunk_size=1000) as env:
+        taken = run(env, None, 60)
+    monkeypatch.undo()
+    check(tmp_path / "r.mcap", taken)
+    assert verify_recording(tmp_path / "r.mcap").ok
 
 
 def test_asynchronous_environments(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from tupli_mcap.recording.worker import WORTH_A_THREAD, ChunkWorker
+from tupli_mcap.recording.worker import LARGE, WORTH_A_THREAD, ChunkWorker
 
 
 @pytest.fixture
@@ -23,14 +23,23 @@ def busy() -> threading.Thread:
 
 
 def test_short_jobs_need_no_thread(worker: ChunkWorker) -> None:
-    assert [worker.submit(threading.current_thread)() for _ in range(3)] == [threading.current_thread()] * 3
+    assert [worker.submit(threading.current_thread, 0)() for _ in range(3)] == [
+        threading.current_thread()
+    ] * 3
     worker.close()
 
 
 def test_after_a_long_job_the_next_is_handed_over(worker: ChunkWorker) -> None:
-    assert worker.submit(busy)() is threading.current_thread()
-    assert worker.submit(threading.current_thread)() is not threading.current_thread()
-    assert worker.submit(threading.current_thread)() is threading.current_thread(), "the one before was short"
+    assert worker.submit(busy, 0)() is threading.current_thread()
+    assert worker.submit(threading.current_thread, 0)() is not threading.current_thread()
+    assert worker.submit(threading.current_thread, 0)() is threading.current_thread(), (
+        "the one before was short"
+    )
+    worker.close()
+
+
+def test_a_large_job_is_handed_over_at_once(worker: ChunkWorker) -> None:
+    assert worker.submit(threading.current_thread, LARGE)() is not threading.current_thread()
     worker.close()
 
 
@@ -39,8 +48,8 @@ def test_what_a_job_raises_comes_with_its_result(worker: ChunkWorker) -> None:
         busy()
         raise ValueError("full")
 
-    worker.submit(busy)()
-    result = worker.submit(fail)
+    worker.submit(busy, 0)()
+    result = worker.submit(fail, 0)
     with pytest.raises(ValueError, match="full"):
         result()
     worker.close()

@@ -228,6 +228,7 @@ def _trap_write(moment: Moment, occurrence: int, rng: random.Random) -> None:
         return pwrite(fd, data, offset)
 
     os.pwrite = write
+    os.pwritev = lambda fd, parts, offset: write(fd, b"".join(parts), offset)
 
 
 def _trap_call(name: str, occurrence: int, rng: random.Random) -> None:

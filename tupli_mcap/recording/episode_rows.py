@@ -131,7 +131,7 @@ class EpisodeRows:
     def _reset_times(self, rows: Array, found: _Segments) -> Array:
         """The times of the holes before each segment."""
         times, at_once = rows["#log_time"], found.begin == 0
-        before = times[found.env, found.begin - 1]
+        before: Array = times[found.env, found.begin - 1]
         before[at_once] = self._began[found.env[at_once]]
         if found.hole.size:
             is_hole = found.hole[:, -1]

@@ -12,24 +12,25 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-__all__ = ["WORTH_A_THREAD", "ChunkWorker"]
+__all__ = ["LARGE", "WORTH_A_THREAD", "ChunkWorker"]
 
 T = TypeVar("T")
 # Seconds of work: handing a chunk over costs the recording thread some 0.05 ms, on virtual machines ten times as much.
 WORTH_A_THREAD = 0.001
+LARGE = 1 << 20  # bytes that take so long
 
 
 class ChunkWorker:
-    """Runs jobs one after another: on a thread of its own if the one before took long, else at once."""
+    """Runs jobs one after another: on a thread of its own if the one before took long, or it is large, else at once."""
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
         self._seconds = 0.0  # of processor time, of the last job
 
-    def submit(self, job: Callable[[], T]) -> Callable[[], T]:
+    def submit(self, job: Callable[[], T], size: int) -> Callable[[], T]:
         """Does a job, or hands it over and returns once the thread has taken it up; what it returns waits for it.
 
-        The job's memory must stay until then.
+        The job's memory, `size` bytes, must stay until then.
         """
 
         def timed() -> T:
@@ -38,7 +39,7 @@ class ChunkWorker:
             self._seconds = time.thread_time() - begun
             return result
 
-        if self._seconds < WORTH_A_THREAD:
+        if self._seconds < WORTH_A_THREAD and size < LARGE:
             done = timed()
             return lambda: done
         if self._pool is None:

@@ -324,7 +324,8 @@ class RecordingWriter:
             pack = container.start_chunks(chunks)
             # a thread that needs the interpreter lock for every chunk would wait for it again and again
             in_thread = len(chunks) == 1 or container.packs_together
-            packed = self.worker.submit(pack) if in_thread else pack
+            size = sum(len(rows.data) for rows in chunks)
+            packed = self.worker.submit(pack, size) if in_thread else pack
 
         def finish() -> None:
             if self.failed is not None:
