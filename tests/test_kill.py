@@ -151,7 +151,7 @@ def test_a_final_state_of_a_step_that_was_not_finished_is_not_taken(tmp_path: Pa
         env.reset(seed=1)
         for _ in range(2):
             env.step(env.action_space.sample())
-        VectorRows.put = lambda *_: die()  # type: ignore[method-assign]
+        VectorRows.put = lambda *_, **__: die()  # type: ignore[method-assign]
         env.step(env.action_space.sample())
 
     in_a_process_that_dies(record)

@@ -105,7 +105,7 @@ class Stores:
             else:
                 self.rows = logs[0]
         elif vector:
-            before = np.array([counts[c] for c in channels.steps], dtype=np.int64)
+            before = np.array([counts[c] for c in channels.steps], dtype=np.uint32)
             self.vector = VectorRows(
                 layout, rows_area("steps"), buffer("steps"), channels.steps, start_chunks, before, before_ns,
                 durable=durable, sealed=sealed,

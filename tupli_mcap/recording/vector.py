@@ -63,10 +63,10 @@ class VectorRecorder:
         self._fresh = False  # some sub-environments have no episode:
         self._waiting = set(range(num_envs))
         self._episodes: list[StartedEpisode | None] = [None] * num_envs
-        self._numbers = np.zeros(
-            (num_envs, 2), dtype=np.uint32
-        )  # of the running episodes: number, steps so far
-        self._episode_numbers, self._lengths = self._numbers[:, 0], self._numbers[:, 1]
+        numbers = np.zeros((num_envs, 2), "<u4")  # of the running episodes: number, steps so far
+        self._episode_numbers, self._lengths = numbers[:, 0], numbers[:, 1]
+        self._numbers = numbers.view("<u8")[:, 0]  # both
+        self._ones = np.ones(num_envs, "<u4")
         self._totals: Array = np.zeros(num_envs)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._any_ended = False
@@ -179,7 +179,7 @@ class VectorRecorder:
             holes = self._ended if self._any_ended and self._autoreset == "NextStep" else None
             active = None if holes is None else ~holes
             finals = self._finals(done, infos) if any_done and self._autoreset == "SameStep" else {}
-            self._store(actions, states, rewards, terminals, timeouts, active, finals)
+            self._store(actions, states, rewards, terminals, timeouts, active, finals, any_done)
         except StepError:
             self.refuse()
             raise
@@ -189,7 +189,7 @@ class VectorRecorder:
             )
             self._totals += totals if active is None else totals * active
         if active is None:
-            self._lengths += 1
+            self._lengths += self._ones
             self._ended, self._any_ended = done, any_done
             return self._everybody
         self._lengths += active
@@ -378,23 +378,25 @@ class VectorRecorder:
         timeouts: Array,
         active: Array | None,
         finals: dict[int, Any],
+        ends: bool,
     ) -> None:
         """Checks the whole batch, then starts episodes, then writes: a batch is recorded or refused as one."""
         store = self._writer.vector
-        ends = {i: self._encode_final(state) for i, state in finals.items()}
+        final_states = {i: self._encode_final(state) for i, state in finals.items()} if finals else None
         if isinstance(store, VectorRows):
             images = self._check_images(states) if self._writer.images else []
             batch = store.check(actions, states, rewards)
             if self._fresh:
                 self._start(active)
-            self._put_finals(ends)
+            if final_states:
+                self._put_finals(final_states)
             for sinks, column in images:
                 for i in range(self._n):
                     if active is None or active[i]:
                         sinks[i].put(column[i])
                     else:
                         sinks[i].put_first(column[i])
-            store.put(batch, terminals, timeouts, self._numbers, active)
+            store.put(batch, terminals, timeouts, self._numbers, active, ends=ends)
             return
         logs: list[StepLog] = store  # type: ignore[assignment]
         resets, steps = {}, {}
@@ -406,7 +408,8 @@ class VectorRecorder:
                 steps[i] = logs[i].prepare(action, state, rewards[i], terminals[i], timeouts[i])
         if self._fresh:
             self._start(active)
-        self._put_finals(ends)
+        if final_states:
+            self._put_finals(final_states)
         for i, reset in resets.items():
             logs[i].commit_state(reset)
         for i, step in steps.items():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,18 @@ from tupli_mcap.recording.journal import RowArea
 from tupli_mcap.recording.rows import HOLE, Array, StartChunks
 
 __all__ = ["HOLE", "VectorRows"]
+
+_ACTION, _REWARD, _STATE = range(3)
+
+
+class _Field(NamedTuple):
+    """A leaf in the rows of all sub-environments; None if it takes no bytes. `ahead`: it is of the next row."""
+
+    leaf: Leaf
+    view: Array | None
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    ahead: int
 
 
 class VectorRows:
@@ -58,7 +70,8 @@ class VectorRows:
             {"names": ["head"], "formats": [f"V{BODY}"], "offsets": [0], "itemsize": area.row_size}
         )
         self._rows.view(heads)["head"] = np.frombuffer(headers, f"V{BODY}")[None, :, None]
-        self.counts = counts  # rows of each channel so far
+        self.counts = counts  # rows of each channel so far (uint32)
+        self._ones = np.ones_like(counts)
         self._half = 0
         self._row = 0
         self._flushed = 0
@@ -72,15 +85,19 @@ class VectorRows:
         self._asked = False  # for what is told at the next reset
         self._changes = 0  # of what was told; odd while it changes
         self._episodes = EpisodeRows(n, layout.state_end)
-        self._state = [self._writer(leaf) for leaf in layout.state if not leaf.apart]
-        self._action = [self._writer(leaf) for leaf in layout.action]
-        self._reward = [self._writer(leaf) for leaf in layout.reward]
+        self._state = [self._writer(leaf, 1) for leaf in layout.state if not leaf.apart]
+        others = [*((leaf, _ACTION) for leaf in layout.action), *((leaf, _REWARD) for leaf in layout.reward)]
+        self._fields = [
+            *((root, self._writer(leaf, 0)) for leaf, root in others),
+            *((_STATE, field) for field in self._state),
+        ]
         self._nested = any(leaf.keys for leaf in layout.leaves)
         self._flags = (self._rows["terminal"], self._rows["timeout"])
+        self._flagged = bytearray(2 * area.rows)  # where a flag may be set: a new journal is zeros
         pairs = np.dtype(
             {
                 "names": ["times", "numbers"],
-                "formats": [("<u8", 2), ("<u4", 2)],  # log_time and publish_time, episode and step
+                "formats": [("<u8", 2), "<u8"],  # log_time and publish_time, episode and step
                 "offsets": [15, BODY],
                 "itemsize": area.row_size,
             }
@@ -90,33 +107,27 @@ class VectorRows:
         self._state_bytes: Array = np.frombuffer(buffer, np.uint8).reshape(2, n, area.rows + 1, area.row_size)
         self._state_end = layout.state_end
 
-    def _writer(self, leaf: Leaf) -> tuple[Leaf, Array | None, np.dtype[Any], tuple[int, ...]]:
+    def _writer(self, leaf: Leaf, ahead: int) -> _Field:
         view = None if leaf.size == 0 else self._rows[leaf.name]
-        return leaf, view, self._layout.dtypes[leaf.name], (len(self._channels), *leaf.shape)
+        return _Field(leaf, view, self._layout.dtypes[leaf.name], (len(self._channels), *leaf.shape), ahead)
 
-    def _checked(self, fields: Sequence[Any], root: Any) -> list[Any]:
-        values = []
-        for leaf, view, dtype, shape in fields:
-            value = leaf_value(root, leaf) if leaf.keys else root
-            if not (value.__class__ is np.ndarray and value.dtype is dtype and value.shape == shape):
-                value = exact_array(value, dtype, shape, leaf.path)
-            values.append((view, value))
-        return values
-
-    def check(self, action: Any, state: Any, reward: Any) -> Any:
+    def check(self, action: Any, state: Any, reward: Any) -> list[tuple[Array, Any, int]]:
         """A batch as `put` takes it; StepError if it cannot be stored."""
         if self._nested:
             check_structure(self._layout.action_space, action, "action")
             check_structure(self._layout.observation_space, state, "state")
-        return (
-            self._checked(self._action, action),
-            self._checked(self._reward, reward),
-            self._checked(self._state, state),
-        )
+        values, roots = [], (action, reward, state)
+        for root, (leaf, view, dtype, shape, ahead) in self._fields:
+            value = leaf_value(roots[root], leaf) if leaf.keys else roots[root]
+            if not (value.__class__ is np.ndarray and value.dtype is dtype and value.shape == shape):
+                value = exact_array(value, dtype, shape, leaf.path)
+            if view is not None:
+                values.append((view, value, ahead))
+        return values
 
     def put_state(self, state: Any, mask: Array | None = None) -> None:
         """The states of a reset: of all sub-environments, or of those in `mask`."""
-        for leaf, view, dtype, shape in self._state:
+        for leaf, view, dtype, shape, _ in self._state:
             value = exact_array(leaf_value(state, leaf), dtype, shape, leaf.path)
             if view is None:
                 continue
@@ -125,28 +136,38 @@ class VectorRows:
             else:
                 view[self._half, mask, self._row] = value[mask]
 
-    def put(self, batch: Any, terminal: Array, timeout: Array, numbers: Array, active: Array | None) -> None:
-        """Writes a checked batch; `active` None: every sub-environment took a step.
+    def put(
+        self,
+        batch: Sequence[tuple[Array, Any, int]],
+        terminal: Array,
+        timeout: Array,
+        numbers: Array,
+        active: Array | None,
+        *,
+        ends: bool,
+    ) -> None:
+        """Writes a checked batch.
 
-        `numbers` are the episode and the step (uint32, `(channels, 2)`).
+        Args:
+            numbers: of each sub-environment's episode, plus 2**32 times the step (uint64).
+            active: which sub-environments took a step; None: all of them.
+            ends: a flag is set.
         """
         half, row = self._half, self._row
-        actions, rewards, states = batch
-        for view, value in (*actions, *rewards):
-            if view is not None:
-                view[half, :, row] = value
-        self._flags[0][half, :, row] = terminal
-        self._flags[1][half, :, row] = timeout
-        for view, value in states:
-            if view is not None:
-                view[half, :, row + 1] = value
+        for view, value, ahead in batch:
+            view[half, :, row + ahead] = value
+        place = half * self._area.rows + row
+        if ends or self._flagged[place]:
+            self._flags[0][half, :, row] = terminal
+            self._flags[1][half, :, row] = timeout
+            self._flagged[place] = ends
         self._numbers[half, :, row] = numbers
         self._now = now = max(time.time_ns(), self._now)
         self._times[half, row] = now
         self._pair[half, :, row] = now
         if active is None:
             self._sequence[half, :, row] = self.counts
-            self.counts += 1
+            self.counts += self._ones
         else:
             self._sequence[half, :, row] = np.where(active, self.counts, HOLE)
             self.counts += active
