@@ -50,13 +50,17 @@ def check_episodes(rows: Array, steps: Sequence[int], others: Mapping[str, int],
     """
     if not len(rows):
         return
-    limits = np.array([*steps, 0], np.uint64)
-    env = np.minimum(rows["env"], len(steps))
-    first, length, limit = rows["first_row"], rows["length"], limits[env]
-    good = (rows["env"] < len(steps)) & (length >= 1) & (length <= limit) & (first <= limit)
+    env, first, length, start, end, final, how, numbers = (
+        np.ascontiguousarray(rows[name])  # each is looked at several times
+        for name in ("env", "first_row", "length", "start_row", "end_row", "final_row", "end", "episode")
+    )
+    good = env < len(steps)
+    env = np.minimum(env, len(steps))
+    limit = np.array([*steps, 0], np.uint64)[env]
+    good &= (length >= 1) & (length <= limit) & (first <= limit)
     good &= length <= limit - np.minimum(first, limit)
-    good &= (rows["start_row"] < others["/episode_start"]) & (rows["end_row"] < others["/episode_end"])
-    good &= (rows["final_row"] >= -1) & (rows["final_row"] < others["/final_state"]) & (rows["end"] <= 2)
+    good &= (start < others["/episode_start"]) & (end < others["/episode_end"])
+    good &= (final >= -1) & (final < others["/final_state"]) & (how <= 2)
     if not good.all():
         row = rows[int(np.argmin(good))]
         raise FormatError(
@@ -64,7 +68,6 @@ def check_episodes(rows: Array, steps: Sequence[int], others: Mapping[str, int],
             f"{int(row['first_row']) + int(row['length'])} of sub-environment {row['env']}, with messages that are not "
             "all there; recover it into a new file"
         )
-    numbers = rows["episode"]
     if (numbers[1:] <= numbers[:-1]).any():
         raise FormatError(
             f"{name}: expected episodes in the order of their numbers, each once, in the episode index"
