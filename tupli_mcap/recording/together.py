@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,21 +20,26 @@ def do_all(tasks: Sequence[Callable[[], None]], threads: int) -> None:
     # Not a future for each task: who waits for them wakes up at every one, and takes the interpreter from the workers.
     left = deque(tasks)
     if threads < 2 or len(left) <= _FEW:
-        _work(left)
+        _work(left, left.popleft)
         return
+    # From both ends: neighbouring tasks write to neighbouring pages, and threads that need a new one at once wait for
+    # each other.
+    ends = itertools.cycle((left.pop, left.popleft))
     with ThreadPoolExecutor(threads - 1) as pool:
-        others = [pool.submit(_work, left) for _ in range(min(threads, len(left)) - 1)]
-        _work(left)
+        others = [
+            pool.submit(_work, left, take) for take in itertools.islice(ends, min(threads, len(left)) - 1)
+        ]
+        _work(left, left.popleft)
     for other in others:
         other.result()
 
 
-def _work(left: deque[Callable[[], None]]) -> None:
+def _work(left: deque[Callable[[], None]], take: Callable[[], Callable[[], None]]) -> None:
     """Takes one task after the other, as long as there are some."""
     try:
         while True:
             try:
-                task = left.popleft()
+                task = take()
             except IndexError:
                 return
             task()
