@@ -38,8 +38,9 @@ def test_after_a_long_job_the_next_is_handed_over(worker: ChunkWorker) -> None:
     worker.close()
 
 
-def test_a_large_job_is_handed_over_at_once(worker: ChunkWorker) -> None:
+def test_a_large_first_job_is_handed_over_the_next_if_it_took_long(worker: ChunkWorker) -> None:
     assert worker.submit(threading.current_thread, LARGE)() is not threading.current_thread()
+    assert worker.submit(threading.current_thread, LARGE)() is threading.current_thread()
     worker.close()
 
 

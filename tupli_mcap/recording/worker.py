@@ -17,15 +17,15 @@ __all__ = ["LARGE", "WORTH_A_THREAD", "ChunkWorker"]
 T = TypeVar("T")
 # Seconds of work: handing a chunk over costs the recording thread some 0.05 ms, on virtual machines ten times as much.
 WORTH_A_THREAD = 0.001
-LARGE = 1 << 20  # bytes that take so long
+LARGE = 1 << 20  # bytes that may take so long; how long they do is known from the second job on
 
 
 class ChunkWorker:
-    """Runs jobs one after another: on a thread of its own if the one before took long, or it is large, else at once."""
+    """Runs jobs one after another: on a thread of its own if the one before took long, else at once."""
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
-        self._seconds = 0.0  # of processor time, of the last job
+        self._seconds: float | None = None  # of processor time, of the last job
 
     def submit(self, job: Callable[[], T], size: int) -> Callable[[], T]:
         """Does a job, or hands it over and returns once the thread has taken it up; what it returns waits for it.
@@ -39,7 +39,8 @@ class ChunkWorker:
             self._seconds = time.thread_time() - begun
             return result
 
-        if self._seconds < WORTH_A_THREAD and size < LARGE:
+        worth_a_thread = size >= LARGE if self._seconds is None else self._seconds >= WORTH_A_THREAD
+        if not worth_a_thread:
             done = timed()
             return lambda: done
         if self._pool is None:
