@@ -17,7 +17,7 @@ __all__ = ["LARGE", "WORTH_A_THREAD", "ChunkWorker"]
 T = TypeVar("T")
 # Seconds of work: handing a chunk over costs the recording thread some 0.05 ms, on virtual machines ten times as much.
 WORTH_A_THREAD = 0.001
-LARGE = 1 << 20  # bytes that may take so long; how long they do is known from the second job on
+LARGE = 3 << 20  # bytes that take as long at 3 GB/s; how long they do is known from the second job on
 
 
 class ChunkWorker:
