@@ -89,7 +89,7 @@ def from_matrix(found: dict[str, Any]) -> Iterator[Target]:
     """The targets that are ratios of cells."""
     m = Matrix(found)
     yield from _recording(m)
-    for name, least in (("PyTupli", 100), ("mcap", 50), ("Minari HDF5", 10)):
+    for name, least in (("PyTupli", 100), ("Minari HDF5", 10)):
         yield at_least(
             f"CartPole to NumPy, over {name}", least, m.ratio("cartpole", "read", OURS, name), unit="x"
         )

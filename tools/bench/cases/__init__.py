@@ -23,6 +23,7 @@ __all__ = ["CASES", "MORE"]
 
 CASES: dict[str, Callable[[Run], Iterator[Target]]] = {
     "floor": reading.floor_speed,
+    "over mcap": reading.over_mcap,
     "cold": reading.cold_windows,
     "windows": columns.windows,
     "materialized": columns.materialized,

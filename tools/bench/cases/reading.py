@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from tools.bench import floor
+from tools.bench.contenders.mcap import Mcap
 from tools.bench.contenders.ours import Ours, leaves
 from tools.bench.data import Data, check_same
 from tools.bench.epochs import places_of
@@ -52,7 +53,28 @@ def floor_speed(run: Run) -> Iterator[Target]:
         yield at_least(what, 0.7, ratio(mine, under), note, "x")
 
 
-def _ours(path: Path, data: Data, threads: int) -> float:
+def over_mcap(run: Run) -> Iterator[Target]:
+    """All steps with as many threads as it takes by itself, over `iter_messages` of a file of the `mcap` package."""
+    path, data = _recorded(run, "cartpole", run.part(1_000_000))
+    package, other = Mcap(), run.fresh("mcap.mcap")
+    package.write(other, data)
+
+    def theirs() -> float:
+        found: list[Any] = []
+        seconds = seconds_of(lambda: found.append(package.read(other)))
+        check_same(found[0][0], data.leaves)
+        return data.steps / seconds / 1e6
+
+    sides: dict[str, Callable[[], float]] = {"ours": partial(_ours, path, data, None), "mcap": theirs}
+    alternate(sides, 1)
+    values = alternate(sides, max(run.rounds, 3))
+    mine, package_speed = statistics.median(values["ours"]), statistics.median(values["mcap"])
+    note = f"{mine:.1f} of {package_speed:.3f} M steps/s"
+    what = f"CartPole to NumPy, {data.steps / 1e6:.1g} M steps, over mcap"
+    yield at_least(what, 50, ratio(values["ours"], values["mcap"]), note, "x")
+
+
+def _ours(path: Path, data: Data, threads: int | None) -> float:
     from tupli_mcap import Recording
 
     found: list[Any] = []

@@ -97,6 +97,15 @@ class Mcap(Contender):
             recorder.close()
         return watch.seconds, steps
 
+    def write(self, path: Path, data: Data) -> None:
+        """The file that recording these steps makes."""
+        rows = packed(data)
+        self._dtype = rows.dtype
+        add, finish = self._writer(path)
+        for number, message in enumerate(_each(rows)):
+            add(message, number)
+        finish()
+
     def prepare_vector(self, leaves: dict[str, Array]) -> None:
         there = leaves["is_step"]
         steps = {name: leaf[there] for name, leaf in leaves.items() if name != "is_step"}
