@@ -21,7 +21,10 @@ LARGE = 3 << 20  # bytes that take as long at 3 GB/s; how long they do is known 
 
 
 class ChunkWorker:
-    """Runs jobs one after another: on a thread of its own if the one before took long, else at once."""
+    """Runs jobs one after another: on a thread of its own if the one before took long, else at once.
+
+    Of the first one its size decides.
+    """
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
