@@ -806,7 +806,7 @@ def test_a_thread_compresses_large_images(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("tupli_mcap.recording.worker.WORTH_A_THREAD", 0.0)
     space = spaces.Box(0, 255, (90, 80, 3), np.uint8)
     with RecordEpisodes(Sampler(space, spaces.Discrete(3)), tmp_path / "r.mcap", chunk_size=1000) as env:
-        taken = roll(env, 60)
+        taken = roll(env, 100)
         assert any(thread.name.startswith("tupli-mcap-chunks") for thread in threading.enumerate())
         env.flush()
         taken += roll(env, 5)

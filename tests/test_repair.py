@@ -311,7 +311,7 @@ def test_a_step_without_its_image_is_lost(tmp_path: Path) -> None:
     report, recording = recovered(path)
     with recording:
         assert_true(steps_of(recording), wanted, report)
-    assert 0 < report.steps_lost < 20
+    assert 0 < report.steps_lost <= 32  # images of a chunk
 
 
 def test_what_else_is_damaged_is_said(tmp_path: Path) -> None:
