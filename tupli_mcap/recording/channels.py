@@ -138,7 +138,8 @@ def plan_areas(
         row = layout.image_messages[leaf.name].dtype.itemsize
         # of a stack, most rows store one frame
         stored = row // leaf.stored_shape[0] if leaf.kind == "stack" else row
-        # some images a chunk: what is done once a chunk takes as long for few of them as for many
+        # some images a chunk: what is done once a chunk takes as long for few of them as for many; of many
+        # sub-environments fewer, for the room that their journals take
         some, within = (32, 3 << 20) if n == 1 else (16, 2 << 20)
         rows = rows_per_half(stored, max(size, min(some * stored, within)))
         rows = max(1, min(rows, _HALF // row))
