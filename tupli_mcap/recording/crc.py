@@ -7,6 +7,7 @@ them: NumPy's loops do so as they end.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ try:
 except ImportError:
     from zlib import crc32 as _crc32
 
-__all__ = ["crc32"]
+__all__ = ["crc32", "crc32_each"]
 
 _ZEROS = np.zeros(256)
 
@@ -25,4 +26,11 @@ def crc32(data: Any, value: int = 0, /) -> int:
     """The checksum of `data`, behind bytes whose checksum is `value`."""
     found: int = _crc32(data, value)
     np.add(_ZEROS, _ZEROS, out=_ZEROS)  # long enough for a loop of vectors
+    return found
+
+
+def crc32_each(parts: Iterable[bytes]) -> list[int]:
+    """The checksum of each part."""
+    found = list(map(_crc32, parts))
+    np.add(_ZEROS, _ZEROS, out=_ZEROS)
     return found

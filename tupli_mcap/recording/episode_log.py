@@ -14,6 +14,7 @@ from zlib import crc32
 import numpy as np
 
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS
+from tupli_mcap.recording.crc import crc32_each
 from tupli_mcap.recording.episode_rows import EpisodeBatch, StartedEpisode
 from tupli_mcap.recording.events import (
     END_FIELDS,
@@ -284,6 +285,5 @@ def _sealed(table: Array) -> bytes:
     bare = np.empty((len(table), size), np.uint8)
     whole = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
     bare[:, : FRONT.size], bare[:, FRONT.size :] = whole[:, : FRONT.size], whole[:, FRONT.size + 8 :]
-    data = bare.tobytes()
-    table["#publish_time"] = [crc32(data[i : i + size]) for i in range(0, len(data), size)]
+    table["#publish_time"] = crc32_each(bare.view(f"V{size}")[:, 0].tolist())
     return table.tobytes()
