@@ -18,13 +18,16 @@ def _commit_before_the_data() -> None:
 
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
         begin(self, *args, **kwargs)
-        put, cursor, buffer = self.put, self.cursor, self._buffer
+        buffer, offset, count = self._buffer, self._encoder.offset, self._encoder.count
 
-        def hasty(*step: Any) -> None:
-            COMMIT.pack_into(buffer, cursor.offset + SEQUENCE_OFFSET, cursor.sequence, time.time_ns())
-            put(*step)
+        def hasty(put: Callable[..., None]) -> Callable[..., None]:
+            def hastily(*step: Any) -> None:
+                COMMIT.pack_into(buffer, offset() + SEQUENCE_OFFSET, count(), time.time_ns())
+                put(*step)
 
-        self.put = hasty
+            return hastily
+
+        self.put, self.put_plain = hasty(self.put), hasty(self.put_plain)
 
     rows.SingleRows.__init__ = init  # type: ignore[method-assign]
 
@@ -33,9 +36,8 @@ def _forget_the_pending_state() -> None:
     def switch(self: Any) -> None:
         area, half = self._area, self._half
         self._half = 1 - half
-        start = self._half * area.half
         flushed, self._flushed = self._flushed, 0
-        self.cursor.offset, self.cursor.end = start, start + area.rows * area.row_size
+        self._go_to(self._half)
         self._emit(half * area.half, flushed, area.rows)
 
     rows.SingleRows._switch = switch  # type: ignore[method-assign]

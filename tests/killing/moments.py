@@ -59,7 +59,16 @@ MOMENTS = {
         Moment("any time"),
         Moment("any line"),
         Moment("step", ("RecordEpisodes.step",), times=40),
-        Moment("stores", ("put", "StepLog.commit", "VectorRows.put", "ImageRows.put"), times=60),
+        Moment(
+            "stores",
+            (
+                *(f"encoder.<locals>.{name}" for name in ("put", "put_plain", "put_next")),
+                "StepLog.commit",
+                "VectorRows.put",
+                "ImageRows.put",
+            ),
+            times=60,
+        ),
         Moment(
             "reset", ("SingleRecorder.reset", "SingleRecorder.begin_next", "VectorRecorder.reset"), times=6
         ),
@@ -170,8 +179,7 @@ class _Instructions:
         """(is it ours, does its call start the count)."""
         if code not in self._codes:
             ours = "/tupli_mcap/" in code.co_filename or code.co_filename == ENCODER
-            named = ours and code.co_qualname in self._names
-            self._codes[code] = ours, named and (code.co_qualname != "put" or code.co_filename == ENCODER)
+            self._codes[code] = ours, ours and code.co_qualname in self._names
         return self._codes[code]
 
     def _called(self, frame: FrameType, event: str, arg: Any) -> Any:

@@ -24,29 +24,18 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import DType, Leaf
 from tupli_mcap.messages.step import StepLayout
 
-__all__ = ["COMMIT", "HOLE", "SEQUENCE_OFFSET", "Cursor", "RowEncoder", "make_row_encoder"]
+__all__ = ["COMMIT", "EPISODE_AND_STEP", "HOLE", "SEQUENCE_OFFSET", "RowEncoder", "make_row_encoder"]
 
 SEQUENCE_OFFSET = 11  # of `sequence` in a Message record; log_time follows it
 COMMIT = Struct("<IQ")
+EPISODE_AND_STEP = Struct("<II")
+_TIME = Struct("<Q")
 HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 PREFIX = BODY + 8  # record header, CDR header, episode, step: the same for a whole episode
 _LARGE = 2048  # bytes from which a leaf is copied as an array instead of through `bytes`
 _INT_FORMATS = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
 }  # fmt: skip
-
-
-class Cursor:
-    """Where the next row goes. `offset` is of the running row in the buffer, `end` that of the spare row."""
-
-    __slots__ = ("end", "offset", "prefix", "sequence", "total")
-
-    def __init__(self) -> None:
-        self.offset = 0
-        self.end = 0
-        self.sequence = 0
-        self.prefix = b""
-        self.total: Any = 0.0
 
 
 class ImageSink(Protocol):
@@ -67,15 +56,29 @@ class ImageSink(Protocol):
 
 @dataclass
 class RowEncoder:
-    """`put(action, state, reward, terminal, timeout)` writes and commits a step; `put_state(state)` starts a row.
+    """Writes rows into a buffer, and knows where the next one goes.
 
-    `put_next(prefix, state, time_ns)` leaves the running row as a hole of that time that keeps the final state, and
-    starts the one after it.
+    `put(action, state, reward, terminal, timeout)` writes and commits a step; `put_state(state)` starts a row.
+    `put_plain` is `put` for episodes whose return nobody asks for while they run: `total` leaves it out.
+    `put_next(episode, state)` leaves the running row, which holds the final state, as a hole, and starts the row after
+    it, the first one of `episode`; the hole's time is now, but not before the last step's. All of them raise StepError
+    for what cannot be stored exactly, and nothing has changed then.
+
+    `offset()` is where the running row is in the buffer, `count()` the sequence of the next step, `total()` the return
+    so far; any thread may ask. `move(start, last, end)` makes the row at `start` the running one, behind the row at
+    `last`; when the one at `end` has been started, `switch` is called. `begin(prefix, total)`: what the rows to come
+    hold before their state, and the return before them.
     """
 
     put: Callable[[Any, Any, Any, Any, Any], None]
+    put_plain: Callable[[Any, Any, Any, Any, Any], None]
     put_state: Callable[[Any], None]
-    put_next: Callable[[bytes, Any, int], None]
+    put_next: Callable[[int, Any], None]
+    offset: Callable[[], int]
+    count: Callable[[], int]
+    total: Callable[[], Any]
+    move: Callable[[int, int, int], None]
+    begin: Callable[[bytes, Any], None]
     state_end: int  # bytes of a row up to the end of its state
     source: str
 
@@ -113,15 +116,16 @@ class _Packed:
 def make_row_encoder(
     layout: StepLayout,
     buffer: Any,
-    cursor: Cursor,
+    channel: int,
+    first: int,
     images: Sequence[ImageSink],
     switch: Callable[[], None],
     seal: Callable[[int], None] | None = None,
 ) -> RowEncoder:
-    """Generates the encoder of a constant layout that writes into `buffer` at `cursor`.
+    """Generates the encoder of a constant layout for the messages of `channel`, from sequence `first`, into `buffer`.
 
     `images` has a sink for each image leaf; `switch` is called when the row after the last one has been started;
-    `seal`, if given, with the offset of each committed row.
+    `seal`, if given, with the offset of each committed row. `move` and `begin` come before the first step.
     """
     message = layout.step_message
     size = message.record_size
@@ -135,10 +139,10 @@ def make_row_encoder(
     _fields(source, layout, layout.reward, "reward", tail, stores)
     tail.add(BODY + message.offset("terminal"), "?", 1, "terminal")
     tail.add(BODY + message.offset("timeout"), "?", 1, "timeout")
-    tail.add(size, f"{PREFIX}s", PREFIX, "cursor.prefix")
+    tail.add(size, f"{PREFIX}s", PREFIX, "prefix")
     state = _Source(source.names)
     head = _Packed(0, 0)
-    head.add(0, f"{PREFIX}s", PREFIX, "cursor.prefix")
+    head.add(0, f"{PREFIX}s", PREFIX, "prefix")
     _structure_checks(state, layout.observation_space, "state")
     state_stores: list[str] = []
     _fields(state, layout, layout.state, "state", head, state_stores)
@@ -166,7 +170,7 @@ def make_row_encoder(
     ]
     next_lines = [
         *state.lines,
-        f"pack_state(buffer, offset + {size}, {', '.join(['prefix', *head.args[1:]])})",
+        f"pack_state(buffer, offset + {size}, {', '.join(['started', *head.args[1:]])})",
         *next_state,
     ]
     amount = "reward"
@@ -174,12 +178,15 @@ def make_row_encoder(
         put_lines.append(f"amount = {source.bind('total', layout.reward_total)}(reward)")
         amount = "amount"
     text = _render(
-        put_lines, first_lines, next_lines, size, amount, "" if seal is None else "    seal(offset)\n"
+        put_lines, first_lines, next_lines, size, amount, "" if seal is None else "        seal(offset)\n"
     )
     namespace = dict(
         source.names,
         buffer=buffer,
-        cursor=cursor,
+        first=first,
+        header=message.header(channel),
+        numbers=EPISODE_AND_STEP.pack,
+        time_at=_TIME.unpack_from,
         switch=switch,
         seal=seal,
         pack=Struct(shifted.format).pack_into,
@@ -191,8 +198,7 @@ def make_row_encoder(
         view=np.frombuffer(buffer, np.uint8),
     )
     exec(compile(text, "<tupli_mcap row encoder>", "exec"), namespace)
-    put, put_state, put_next = (namespace[name] for name in ("put", "put_state", "put_next"))
-    return RowEncoder(put, put_state, put_next, layout.state_end, text)
+    return RowEncoder(**namespace["encoder"](), state_end=layout.state_end, source=text)
 
 
 def _shift(head: _Packed, size: int, tail: _Packed) -> _Packed:
@@ -212,38 +218,60 @@ def _render(
     amount: str,
     committed: str,
 ) -> str:
+    """The source. What changes from row to row is in cells of a closure: attributes take twice the bytecode."""
+
     def block(lines: Sequence[str]) -> str:
-        return "".join(f"        {line}\n" for line in lines)
+        return "".join(f"            {line}\n" for line in lines)
+
+    def put(name: str, counted: str) -> str:
+        return (
+            f"    def {name}(action, state, reward, terminal, timeout):\n"
+            f"        nonlocal offset, sequence{', total' if counted else ''}\n"
+            "        try:\n" + block(put_lines) + "        except refusals:\n"
+            "            raise\n"
+            "        except Exception as err:\n"
+            "            raise diagnose(action, state, reward, err) from err\n"
+            f"        commit(buffer, offset + {SEQUENCE_OFFSET}, sequence, time_ns())\n"
+            f"{committed}"
+            "        sequence += 1\n"
+            f"{counted}"
+            f"        offset += {size}\n"
+            "        if offset == end:\n"
+            "            switch()\n\n"
+        )
 
     return (
-        "def put(action, state, reward, terminal, timeout):\n"
-        "    offset = cursor.offset\n"
-        "    try:\n" + block(put_lines) + "    except refusals:\n"
-        "        raise\n"
-        "    except Exception as err:\n"
-        "        raise diagnose(action, state, reward, err) from err\n"
-        "    sequence = cursor.sequence\n"
-        f"    commit(buffer, offset + {SEQUENCE_OFFSET}, sequence, time_ns())\n"
-        f"{committed}"
-        "    cursor.sequence = sequence + 1\n"
-        f"    cursor.total += {amount}\n"
-        f"    cursor.offset = offset = offset + {size}\n"
-        "    if offset == cursor.end:\n"
-        "        switch()\n\n"
-        "def put_state(state):\n"
-        "    offset = cursor.offset\n"
-        "    try:\n" + block(first_lines) + "    except Exception as err:\n"
-        "        raise diagnose(None, state, None, err) from err\n\n"
-        "def put_next(prefix, state, now):\n"
-        "    offset = cursor.offset\n"
-        "    try:\n" + block(next_lines) + "    except Exception as err:\n"
-        "        raise diagnose(None, state, None, err) from err\n"
-        f"    commit(buffer, offset + {SEQUENCE_OFFSET}, {HOLE}, now)\n"
-        "    cursor.prefix = prefix\n"
-        "    cursor.total = 0.0\n"
-        f"    cursor.offset = offset = offset + {size}\n"
-        "    if offset == cursor.end:\n"
-        "        switch()\n"
+        "def encoder():\n"
+        "    offset = start = last = end = 0\n"
+        "    sequence, prefix, total = first, b'', 0.0\n\n"
+        + put("put", f"        total += {amount}\n")
+        + put("put_plain", "")
+        + "    def put_state(state):\n"
+        "        try:\n" + block(first_lines) + "        except Exception as err:\n"
+        "            raise diagnose(None, state, None, err) from err\n\n"
+        "    def put_next(episode, state):\n"
+        "        nonlocal offset, prefix\n"
+        "        started = header + numbers(episode, 0)\n"
+        "        try:\n" + block(next_lines) + "        except Exception as err:\n"
+        "            raise diagnose(None, state, None, err) from err\n"
+        f"        before, = time_at(buffer, (last if offset == start else offset - {size}) + {SEQUENCE_OFFSET + 4})\n"
+        "        now = time_ns()\n"
+        f"        commit(buffer, offset + {SEQUENCE_OFFSET}, {HOLE}, now if now > before else before)\n"
+        "        prefix = started\n"
+        f"        offset += {size}\n"
+        "        if offset == end:\n"
+        "            switch()\n\n"
+        "    def move(new_start, new_last, new_end):\n"
+        "        nonlocal offset, start, last, end\n"
+        "        offset = start = new_start\n"
+        "        last, end = new_last, new_end\n\n"
+        "    def begin(new_prefix, new_total):\n"
+        "        nonlocal prefix, total\n"
+        "        prefix, total = new_prefix, new_total\n\n"
+        "    return dict(\n"
+        "        put=put, put_plain=put_plain, put_state=put_state, put_next=put_next, move=move, begin=begin,\n"
+        "        offset=lambda: offset, count=lambda: sequence, total=lambda: total,\n"
+        "    )\n"
     )
 
 
@@ -282,8 +310,8 @@ def _fields(
             source.lines.append(f"{check}({access})")
             continue
         offset = BODY + layout.step_message.offset(leaf.name)
-        value = f"{root[0]}{i}" if leaf.keys or root != "reward" else "reward"
-        if value != access:
+        value = f"{root[0]}{i}" if leaf.keys else root
+        if leaf.keys:
             source.lines.append(f"{value} = {access}")
         _leaf(source, leaf, dtype, value, offset, packed, stores)
 
@@ -296,7 +324,7 @@ def _leaf(
         exact = source.bind("exact", _exact_int(leaf, dtype))
         kind = source.bind("kind", dtype.type)
         source.lines.append(
-            f"if {value}.__class__ is not int and {value}.__class__ is not {kind}: {value} = {exact}({value})"
+            f"if {value}.__class__ is not {kind} and {value}.__class__ is not int: {value} = {exact}({value})"
         )
         packed.add(offset, _INT_FORMATS[dtype.name], nbytes, value)
     elif value == "reward" and leaf.shape == () and dtype == np.float64:

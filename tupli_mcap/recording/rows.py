@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.messages.encoder import HOLE, SEQUENCE_OFFSET, Cursor, ImageSink, make_row_encoder
+from tupli_mcap.messages.encoder import EPISODE_AND_STEP, HOLE, SEQUENCE_OFFSET, ImageSink, make_row_encoder
 from tupli_mcap.messages.exact import exact_array
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
 from tupli_mcap.messages.leaves import Leaf
@@ -29,8 +29,6 @@ __all__ = ["CHUNKS_PER_HALF", "HOLE", "ImageRows", "RowDeriver", "SingleRows", "
 # sequence, log_time, publish_time, the CDR header, and the stamp of an image: they follow each other, and one call
 # takes a fraction of the time that fields of a structured row do
 _IMAGE_HEAD = struct.Struct(f"<IQQ{len(CDR_HEADER)}siI")
-_EPISODE_AND_STEP = struct.Struct("<II")
-_TIME = struct.Struct("<Q")
 # of a single environment: what is done once a half finds cold caches, and takes as long for few rows as for many
 CHUNKS_PER_HALF = 2
 Array = np.ndarray[Any, Any]
@@ -114,41 +112,43 @@ class SingleRows:
         self._chunk = -(-area.rows // CHUNKS_PER_HALF)  # rows
         self._flushed = 0  # rows of the running half that are in the file
         self._deriver = deriver or RowDeriver()
-        self.cursor = Cursor()
-        self.cursor.sequence = first
-        self.cursor.end = area.rows * area.row_size
         self._header = layout.step_message.header(channel)
-        encoder = make_row_encoder(
-            layout, buffer, self.cursor, images, self._switch, self._seal if sealed else None
+        encoder = self._encoder = make_row_encoder(
+            layout, buffer, channel, first, images, self._switch, self._seal if sealed else None
         )
         self.put = encoder.put
+        self.put_plain = encoder.put_plain  # while rows tell
         self.put_state = encoder.put_state
-        self._put_next = encoder.put_next
+        self.put_next = encoder.put_next
+        self._offset = encoder.offset
         # what rows tell of their episodes goes there; None while they tell nothing
         self._events: EpisodeLog | None = None
         self._told = 0  # rows of the running half that have told it
-        self._asked = False  # for what is told at the next reset
+        self.asked = False  # for what is told at the next reset
         self._changes = 0  # of what was told; odd while it changes
         self._episodes = EpisodeRows(1, encoder.state_end)
         self._state_end = encoder.state_end
+        self._go_to(0)
         self.begin_episode(0)
 
     @property
     def count(self) -> int:
         """Rows of the channel so far, those of earlier sessions included."""
-        return self.cursor.sequence
+        return self._encoder.count()
 
     @property
     def total(self) -> Any:
         """The running episode's return so far."""
-        return self.cursor.total
+        return self._encoder.total()
 
     def begin_episode(self, episode: int) -> None:
         """The rows that follow belong to `episode`."""
-        cursor, start = self.cursor, self.cursor.offset
-        cursor.prefix = prefix = self._header + _EPISODE_AND_STEP.pack(episode, 0)
-        cursor.total = 0.0
+        start, prefix = self._offset(), self._prefix(episode)
+        self._encoder.begin(prefix, 0.0)
         self._buffer[start : start + len(prefix)] = prefix
+
+    def _prefix(self, episode: int) -> bytes:
+        return self._header + EPISODE_AND_STEP.pack(episode, 0)
 
     # ---- episodes told by rows
 
@@ -163,36 +163,24 @@ class SingleRows:
         """True while rows tell of their episodes."""
         return self._events is not None
 
-    def begin_next(self, episode: int, state: Any) -> None:
-        """The last row has ended its episode: `episode` begins at `state`, and rows will tell of both.
-
-        Raises:
-            StepError: the state cannot be stored exactly; nothing has changed.
-        """
-        area, offset, now = self._area, self.cursor.offset, time.time_ns()
-        start = self._half * area.half
-        last = (offset if offset > start else area.half - start + area.rows * area.row_size) - area.row_size
-        # no hole is older than its episode
-        (before,) = _TIME.unpack_from(self._buffer, last + SEQUENCE_OFFSET + 4)
-        prefix = self._header + _EPISODE_AND_STEP.pack(episode, 0)
-        self._put_next(prefix, state, now if now > before else before)
-        if self._asked:
-            self._asked = False
-            start = self._half * area.half
-            self._changes += 1
-            self._tell(start, (self.cursor.offset - start) // area.row_size)
-            self._changes += 1
+    def tell_now(self) -> None:
+        """What has been asked for: `put_next` has just begun an episode."""
+        self.asked = False
+        start = self._half * self._area.half
+        self._changes += 1
+        self._tell(start, (self._offset() - start) // self._area.row_size)
+        self._changes += 1
 
     def ask(self) -> None:
         """Rows tell what they have to tell at the next reset, and not only when they go to the file. For any thread."""
-        self._asked = True
+        self.asked = True
 
     def tell(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
         """The rows from here on will tell `events` of their episodes, and of the final state of the one that has
         ended just now."""
         self._changes += 1
         self._events = events
-        self._told = (self.cursor.offset - self._half * self._area.half) // self._area.row_size
+        self._told = (self._offset() - self._half * self._area.half) // self._area.row_size
         self._episodes.begin([None])
         self._episodes.wait_for(ended, time.time_ns())
         events.leave_to_rows(started)
@@ -219,13 +207,16 @@ class SingleRows:
         if events is None:
             return None
         half = self._half * self._area.half
-        row = (self.cursor.offset - half) // self._area.row_size
+        row = (self._offset() - half) // self._area.row_size
         self._changes += 1
         self._tell(half, row, {0: self.pending_state()} if over else None)
         self._events = None
         self._changes += 1
         number = int(self._episodes.running[0])
-        return None if number < 0 else events.take_back(number)
+        if number < 0:
+            return None
+        self._encoder.begin(self._prefix(number), self._episodes.totals.item(0))  # `put_plain` did not count
+        return events.take_back(number)
 
     def _tell(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
         """What the rows of a half before `end` tell, and have not told yet."""
@@ -238,13 +229,13 @@ class SingleRows:
 
     def committed(self) -> tuple[int, int, Array]:
         """The running half, its committed rows, and the rows of both halves; for another thread to copy from."""
-        half, offset = divmod(self.cursor.offset, self._area.half)
+        half, offset = divmod(self._offset(), self._area.half)
         table: Array = np.frombuffer(self._buffer, self._dtype).reshape(2, self._area.rows + 1)
         return half, offset // self._area.row_size, table
 
     def pending_state(self) -> bytes:
         """The CDR bytes of the running row's state, as they follow `episode` and `env` in `/final_state`."""
-        start = self.cursor.offset
+        start = self._offset()
         return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
 
     def _seal(self, offset: int) -> None:
@@ -264,15 +255,21 @@ class SingleRows:
         start = self._half * area.half
         self._buffer[start : start + self._state_end] = self._buffer[spare : spare + self._state_end]
         flushed, self._flushed = self._flushed, 0
-        self.cursor.offset, self.cursor.end = start, start + area.rows * area.row_size
+        self._go_to(self._half)
         self._told = 0
         self._changes += 1
         self._emit(half * area.half, flushed, area.rows)
 
+    def _go_to(self, half: int) -> None:
+        """The next row is the first one of a half, behind the last one of the other."""
+        area = self._area
+        start, spare = half * area.half, area.rows * area.row_size
+        self._encoder.move(start, area.half - start + spare - area.row_size, start + spare)
+
     def flush(self) -> None:
         """Writes the rows of the running half that are not in the file yet."""
         start = self._half * self._area.half
-        rows = (self.cursor.offset - start) // self._area.row_size
+        rows = (self._offset() - start) // self._area.row_size
         flushed, self._flushed = self._flushed, rows
         self._changes += 1
         self._tell(start, rows)

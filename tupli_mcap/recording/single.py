@@ -67,10 +67,8 @@ class SingleRecorder:
         self._earlier: list[ResetFacts] = []  # resets before it that no step followed
         self._episode: StartedEpisode | None = None
         self._over: int | None = None  # how the last step has ended its episode, if that is not written yet
-        self._is_plain = False  # rows can tell of episodes
+        self._rows: SingleRows | None = None  # those that can tell of episodes
         self._began_plain = False  # the running episode's reset had no seed, options and info
-        self._begin_next: Callable[[int, Any], None] = lambda *_: None
-        self._put: Put = self._unreset
         self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset
         writer.on_abandon = self._abandon
@@ -114,14 +112,14 @@ class SingleRecorder:
 
     def leave_end(self, end: int) -> None:
         """As `end`, after a step with a flag set and without metadata; it is written later, with many others."""
-        if not self._is_plain:
+        if self._rows is None:
             self.end(end)
             return
         if self._episode is not None and self._writer.is_watched:
             if self.resets_itself or not self._began_plain:
                 self.end(end)
                 return
-            self._leave_to_rows(self._episode, end)
+            self._leave_to_rows(self._rows, self._episode, end)
         self._over = end
         self.put = self._continue
 
@@ -131,24 +129,26 @@ class SingleRecorder:
         Raises:
             StepError: the state cannot be stored exactly.
         """
-        over, writer = self._over, self._writer
-        if over is None or writer.lost_streams:
+        over, writer, rows = self._over, self._writer, self._rows
+        if over is None or rows is None or writer.lost_streams:
             return False
         try:  # as `writer.whole`, which costs a call more
             if self._episode is not None:
-                self._leave_to_rows(self._episode, over)
-            self._begin_next(writer.next_episode, state)
+                self._leave_to_rows(rows, self._episode, over)
+            rows.put_next(writer.next_episode, state)
+            if rows.asked:
+                rows.tell_now()
             writer.next_episode += 1
             self._over = None
-            self.put = self._put
+            self.put = rows.put_plain
         except BaseException as err:
             writer.stop(err)
             raise
         return True
 
-    def _leave_to_rows(self, episode: StartedEpisode, end: int) -> None:
-        rows, events = self._writer.rows, self._writer.events
-        if isinstance(rows, SingleRows) and events is not None:
+    def _leave_to_rows(self, rows: SingleRows, episode: StartedEpisode, end: int) -> None:
+        events = self._writer.events
+        if events is not None:
             number, env, first_row = episode[:3]
             length = rows.count - first_row
             rows.tell(
@@ -158,18 +158,19 @@ class SingleRecorder:
 
     def _settle(self) -> None:
         """Writes what was left for later, so that everything is as if it had been written at once."""
-        writer = self._writer
-        if not self._is_plain or writer.failed is not None:
+        writer, rows = self._writer, self._rows
+        if rows is None or writer.failed is not None:
             return
         with writer.whole:
             over, self._over = self._over, None
-            rows = writer.rows
             if self._episode is not None:
                 if over is not None:
                     self.end(over)
-            elif isinstance(rows, SingleRows) and rows.tells:
+            elif rows.tells:
                 self._episode = rows.settle(over=over is not None)
-                if self._episode is None and over is None:  # begun, and no step yet
+                if self._episode is not None:
+                    self.put = rows.put
+                elif over is None:  # begun, and no step yet
                     writer.next_episode -= 1
                     facts = ResetFacts(None, None, "", "{}", time.time_ns())
                     self._episode = writer.start_episode(0, rows.count, facts)
@@ -250,7 +251,7 @@ class SingleRecorder:
         self._reset = None
         rows = writer.rows
         if self.leaves_to_rows and isinstance(rows, SingleRows) and rows.can_tell and not writer.images:
-            self._is_plain, self._begin_next, self._put = True, rows.begin_next, rows.put
+            self._rows = rows
         self._start_earlier()
         self.reset(first, facts)
         self.put(action, state, reward, terminal, timeout)
