@@ -147,20 +147,24 @@ class EpisodeRows:
         if not width:
             before = before[np.isin(before, list(pending))]
         column = last + 1
-        ends = np.concatenate([self._waiting[before], ends])
-        column = np.concatenate([np.zeros(len(before), np.int64), column])
-        self._waits[before] = False
+        if len(before):  # seldom, and NumPy takes its time to join structured arrays
+            ends = np.concatenate([self._waiting[before], ends])
+            column = np.concatenate([np.zeros(len(before), np.int64), column])
+            self._waits[before] = False
         inside = column < width
-        states = np.zeros((len(ends), size), np.uint8)
-        states[inside] = data[ends["env"][inside], column[inside]]
-        for i in np.flatnonzero(~inside).tolist():
-            env = int(ends["env"][i])
-            if env in pending:
-                states[i] = np.frombuffer(pending[env], np.uint8)
-                inside[i] = True
-            else:
-                self._waiting[env], self._waits[env] = ends[i], True
-        ends, states = ends[inside], states[inside]
+        if inside.all():
+            states = data[ends["env"], column]
+        else:
+            states = np.zeros((len(ends), size), np.uint8)
+            states[inside] = data[ends["env"][inside], column[inside]]
+            for i in np.flatnonzero(~inside).tolist():
+                env = int(ends["env"][i])
+                if env in pending:
+                    states[i] = np.frombuffer(pending[env], np.uint8)
+                    inside[i] = True
+                else:
+                    self._waiting[env], self._waits[env] = ends[i], True
+            ends, states = ends[inside], states[inside]
         if self._n == 1:  # in their order, also where the clock was set back
             return EpisodeBatch(starts, ends, states)
         order = np.argsort(ends["time"], kind="stable")
@@ -191,8 +195,9 @@ class _Segments:
         self.last = np.flatnonzero(stops) - self.env * width
         self.lengths = self.last - self.begin + 1
         self.ended = flags[self.env, self.last]
-        self.is_first = np.diff(self.env, prepend=-1) != 0
-        self.is_final = np.diff(self.env, append=-1) != 0
+        self.is_first = np.ones(len(self.env), np.bool_)
+        self.is_final = self.is_first.copy()
+        self.is_first[1:] = self.is_final[:-1] = self.env[1:] != self.env[:-1]
 
 
 def _sums(values: Array, firsts: Array) -> Array:
