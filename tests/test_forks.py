@@ -277,6 +277,33 @@ class TestForkedChildren:
             assert all(same(step.state, before) for step, (before, *_) in zip(steps, seen, strict=False))
         assert Recording(tmp_path / "b.mcap").num_steps == 9
 
+    @pytest.mark.parametrize("ends", [False, True])
+    def test_cannot_begin_the_parents_next_episode(self, tmp_path: Path, ends: bool) -> None:
+        path = tmp_path / "a.mcap"
+        env = cart_pole(path)
+        count = 0
+        for episode in range(3):
+            env.reset(seed=None if episode else 1)
+            over = False
+            while not over:
+                _, _, terminal, timeout, _ = env.step(1)
+                over, count = terminal or timeout, count + 1
+        if not ends:
+            env.reset()
+
+        def child() -> None:
+            for act in (env.reset, lambda: env.step(0), env.reset):
+                with pytest.raises(RecordingError, match="not by a forked child"):
+                    act()
+
+        assert in_child(child) == 0
+        with Recording(path) as recording:
+            assert recording.num_steps == count
+        env.reset()
+        env.step(1)
+        env.close()
+        assert Recording(path).num_steps == count + 1
+
     @pytest.mark.parametrize("method", ["fork", "program"])
     def test_that_outlive_a_killed_writer_hold_nothing(self, tmp_path: Path, method: str) -> None:
         path, told = tmp_path / "a.mcap", tmp_path / "told"

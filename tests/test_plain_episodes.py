@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import random
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -299,3 +300,33 @@ def test_broken_off_as_an_episode_ends(tmp_path: Path, monkeypatch: pytest.Monke
         assert recording.episodes[-1].end in ("terminal", "timeout")
         assert same(recording.episodes[-1].final_state, state)
     assert verify_recording(path).ok
+
+
+def test_a_flush_that_failed_after_an_end(tmp_path: Path) -> None:
+    """Nothing more is accepted, a reset neither, and every step before is there."""
+    path = tmp_path / "r.mcap"
+    env = RecordEpisodes(Uneven(), path)
+    env.reset(seed=1)
+    steps, ends = 0, 0
+    while ends < 5:
+        steps += 1
+        _, _, terminal, timeout, _ = env.step(0)
+        if terminal or timeout:
+            ends += 1
+            if ends < 5:
+                env.reset()
+    state = env.unwrapped.newest
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size, hard))
+    try:
+        with pytest.raises(RecordingError, match="could not write"):
+            env.flush()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    for go_on in (env.reset, lambda: env.step(0), env.close):
+        with pytest.raises(RecordingError, match="could not write"):
+            go_on()
+    with Recording(path) as recording:
+        assert (recording.num_steps, len(recording.episodes)) == (steps, 5)
+        assert recording.episodes[-1].end in ("terminal", "timeout")
+        assert same(recording.episodes[-1].final_state, state)

@@ -65,9 +65,9 @@ class RowEncoder:
     for what cannot be stored exactly, and nothing has changed then.
 
     `offset()` is where the running row is in the buffer, `count()` the sequence of the next step, `total()` the return
-    so far; any thread may ask. `move(start, last, end)` makes the row at `start` the running one, behind the row at
-    `last`; when the one at `end` has been started, `switch` is called. `begin(prefix, total)`: what the rows to come
-    hold before their state, and the return before them.
+    so far; any thread may ask for one of them, but two need not be of the same moment. `move(start, last, end)` makes
+    the row at `start` the running one, behind the row at `last`; when the one at `end` has been started, `switch` is
+    called. `begin(prefix, total)`: what the rows to come hold before their state, and the return before them.
     """
 
     put: Callable[[Any, Any, Any, Any, Any], None]
@@ -250,14 +250,14 @@ def _render(
         "        try:\n" + block(first_lines) + "        except Exception as err:\n"
         "            raise diagnose(None, state, None, err) from err\n\n"
         "    def put_next(episode, state):\n"
-        "        nonlocal offset, prefix\n"
+        "        nonlocal offset, prefix, total\n"
         "        started = header + numbers(episode, 0)\n"
         "        try:\n" + block(next_lines) + "        except Exception as err:\n"
         "            raise diagnose(None, state, None, err) from err\n"
         f"        before, = time_at(buffer, (last if offset == start else offset - {size}) + {SEQUENCE_OFFSET + 4})\n"
         "        now = time_ns()\n"
         f"        commit(buffer, offset + {SEQUENCE_OFFSET}, {HOLE}, now if now > before else before)\n"
-        "        prefix = started\n"
+        "        prefix, total = started, 0.0\n"
         f"        offset += {size}\n"
         "        if offset == end:\n"
         "            switch()\n\n"

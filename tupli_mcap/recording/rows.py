@@ -138,7 +138,7 @@ class SingleRows:
 
     @property
     def total(self) -> Any:
-        """The running episode's return so far."""
+        """The running episode's return so far; 0 while rows tell of it."""
         return self._encoder.total()
 
     def begin_episode(self, episode: int) -> None:

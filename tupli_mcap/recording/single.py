@@ -76,6 +76,7 @@ class SingleRecorder:
 
     def _abandon(self) -> None:
         self.put = self._closed
+        self._over = None  # or `begin_next` would go on
 
     def reset(self, state: Any, facts: ResetFacts, metadata: str = "{}") -> None:
         """Starts an episode at `state`; a running one ends as interrupted, with `metadata`.
@@ -168,12 +169,12 @@ class SingleRecorder:
                     self.end(over)
             elif rows.tells:
                 self._episode = rows.settle(over=over is not None)
-                if self._episode is not None:
-                    self.put = rows.put
-                elif over is None:  # begun, and no step yet
+                if self._episode is None and over is None:  # begun, and no step yet
                     writer.next_episode -= 1
                     facts = ResetFacts(None, None, "", "{}", time.time_ns())
                     self._episode = writer.start_episode(0, rows.count, facts)
+                if over is None:
+                    self.put = rows.put
 
     def _keep_start_for(self, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""
