@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import re
 import subprocess
 import sys
@@ -17,10 +18,12 @@ import pytest
 from environments import Sampler, Scripted, roll, same
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
+from interruptions import Counting
 from sample_spaces import SPACES, space_id
 
 from tupli_mcap import RecordEpisodes, Recording, RecordingError, SpaceError, StepError
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
@@ -812,3 +815,70 @@ def test_a_thread_compresses_large_images(tmp_path: Path, monkeypatch: pytest.Mo
         taken += roll(env, 5)
     assert not any(thread.name.startswith("tupli-mcap-chunks") for thread in threading.enumerate())
     check_against(tmp_path / "r.mcap", taken)
+
+
+def test_a_closed_recorder_lets_go_of_its_journal_at_once(tmp_path: Path) -> None:
+    def held() -> int:
+        maps = Path("/proc/self/maps").read_text().count(".journal")
+        return maps + sum(
+            ".journal" in os.readlink(fd) for fd in Path("/proc/self/fd").iterdir() if fd.is_symlink()
+        )
+
+    gc.collect()
+    gc.disable()  # as rollouts do
+    try:
+        for kind in ("box", "text", "image"):
+            path = tmp_path / f"{kind}.mcap"
+            with RecordEpisodes(Counting(kind), path, record_info=True, frames=kind == "image") as env:
+                env.reset()
+                env.step(0)
+                assert held()
+            assert not held()
+        envs = gym.vector.SyncVectorEnv([lambda: Counting()] * 2)
+        with RecordVector(envs, tmp_path / "vector.mcap") as vector:
+            vector.reset()
+            vector.step([0, 0])
+            assert held()
+        assert not held()
+    finally:
+        gc.enable()
+
+
+class TestReplacing:
+    @pytest.fixture
+    def old(self, tmp_path: Path) -> Path:
+        with RecordEpisodes(Counting(), tmp_path / "r.mcap") as env:
+            env.reset()
+            for _ in range(3):
+                env.step(0)
+        return tmp_path / "r.mcap"
+
+    def test_without_a_step_leaves_the_old_recording(self, old: Path) -> None:
+        before = old.read_bytes()
+        env = RecordEpisodes(Counting(), old, mode="w")
+        env.reset()
+        assert old.read_bytes() == before
+        with pytest.raises(RecordingError, match="being recorded by another writer"):
+            RecordEpisodes(Counting(), old, mode="a")
+        env.close()
+        assert old.read_bytes() == before
+        assert list(old.parent.iterdir()) == [old]
+
+    def test_where_no_journal_can_be_made_leaves_the_old_recording(self, old: Path) -> None:
+        before = old.read_bytes()
+        with (
+            RecordEpisodes(Counting(), old, mode="w", chunk_size=1 << 50) as env,
+            pytest.raises(RecordingError, match="could not make the journal"),
+        ):
+            env.reset()
+            env.step(0)
+        assert old.read_bytes() == before
+        assert list(old.parent.iterdir()) == [old]
+
+    def test_happens_at_the_first_step(self, old: Path) -> None:
+        with RecordEpisodes(Counting(), old, mode="w") as env:
+            env.reset()
+            env.step(0)
+            assert Recording(old).num_steps == 1
+        assert Recording(old).num_steps == 1
+        assert list(old.parent.iterdir()) == [old]

@@ -198,7 +198,10 @@ def make_row_encoder(
         view=np.frombuffer(buffer, np.uint8),
     )
     exec(compile(text, "<tupli_mcap row encoder>", "exec"), namespace)
-    return RowEncoder(**namespace["encoder"](), state_end=layout.state_end, source=text)
+    encoder = namespace.pop(
+        "encoder"
+    )  # a name in its own globals would keep the buffer until garbage is collected
+    return RowEncoder(**encoder(), state_end=layout.state_end, source=text)
 
 
 def _shift(head: _Packed, size: int, tail: _Packed) -> _Packed:

@@ -26,6 +26,7 @@ __all__ = [
 ]
 
 Array = np.ndarray[Any, Any]
+Ask = Callable[..., Any]
 CAMERA: Final = "render"
 """The camera that `env.render()` is."""
 
@@ -54,19 +55,22 @@ class FrameRecorder:
     """Puts the frames of one camera into a recording: of an episode's first state, of the state after every `every`-th
     step, and of its last one if it ends by itself.
 
-    A frame is in the journal, or in the file, when `step` returns.
+    A frame is in the journal, or in the file, when `step` returns. `ask` calls what renders (`Work.ask`).
     """
 
-    def __init__(self, writer: RecordingWriter, num_envs: int, every: int, form: FrameFormat) -> None:
+    def __init__(
+        self, writer: RecordingWriter, num_envs: int, every: int, form: FrameFormat, ask: Ask
+    ) -> None:
         self._writer = writer
+        self._ask = ask
         self._every = every
         self._form: FrameFormat = form
         # of the state the next episode starts at: it has no number before its first step
         self._first: list[EncodedFrame | None] = [None] * num_envs
 
-    def start(self, env: int, picture: Any) -> None:
+    def start(self, env: int, render: Callable[[], Any]) -> None:
         """The picture of a reset's state; it is recorded if a step follows."""
-        self._first[env] = self._encoded(picture)
+        self._first[env] = self._ask(self._rendered, render)
 
     def go_on(self, writer: RecordingWriter) -> None:
         """The next frames go to another file."""
@@ -88,13 +92,13 @@ class FrameRecorder:
             put_frame(self._writer, env, episode, 0, first)
         if render is None or (not ended and step % self._every):
             return
-        frame = self._encoded(render())
+        frame = self._ask(self._rendered, render)
         put_frame(self._writer, env, episode, step, frame)
         if ended:  # where no reset follows, the next episode starts here
             self._first[env] = frame
 
-    def _encoded(self, picture: Any) -> EncodedFrame:
-        now = time.time_ns()
+    def _rendered(self, render: Callable[[], Any]) -> EncodedFrame:
+        picture, now = render(), time.time_ns()
         return EncodedFrame(now, self._form, encode_picture(check_picture(picture, "frames"), self._form))
 
 
@@ -103,16 +107,17 @@ def put_frame(writer: RecordingWriter, env: int, episode: int, step: int, frame:
     camera, pairs = writer.channels.cameras[env]
     log = writer.frames[env]
     frame = frame._replace(time_ns=max(frame.time_ns, log.latest_ns))
-    with writer.whole:
-        pair = (pairs, encode_pair(episode, step))
-        log.append(frame.time_ns, pair, (camera, encode_frame(CAMERA, frame)))
+    log.append(frame.time_ns, (pairs, encode_pair(episode, step)), (camera, encode_frame(CAMERA, frame)))
 
 
 class VectorFrames:
     """The frames of a vector environment's cameras, of which `render()` gives one a sub-environment."""
 
-    def __init__(self, writer: RecordingWriter, num_envs: int, every: int, form: FrameFormat) -> None:
-        self._frames = FrameRecorder(writer, num_envs, every, form)
+    def __init__(
+        self, writer: RecordingWriter, num_envs: int, every: int, form: FrameFormat, ask: Ask
+    ) -> None:
+        self._frames = FrameRecorder(writer, num_envs, every, form, ask)
+        self._ask = ask
         self._n = num_envs
 
     def go_on(self, writer: RecordingWriter) -> None:
@@ -121,9 +126,9 @@ class VectorFrames:
 
     def start(self, chosen: Array, render: Callable[[], Any]) -> None:
         """After a reset of the `chosen` sub-environments (bool)."""
-        pictures = self._rendered(render)
+        pictures = self._ask(self._rendered, render)
         for i in np.flatnonzero(chosen).tolist():
-            self._frames.start(i, pictures[i])
+            self._frames.start(i, partial(pictures.__getitem__, i))
 
     def step(
         self,
@@ -151,7 +156,7 @@ class VectorFrames:
                 number, step = recorder.running(i)
                 self._frames.step(i, number, step, bool(ended[i]), None if reset else partial(picture, i))
             if reset:
-                self._frames.start(i, picture(i))
+                self._frames.start(i, partial(picture, i))
 
     def _rendered(self, render: Callable[[], Any]) -> Sequence[Any]:
         found = render()

@@ -19,6 +19,7 @@ from tupli_mcap.recording.framing import CAMERA, put_frame
 from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.single import SingleRecorder
+from tupli_mcap.recording.work import BEGUN, DONE, Work
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 
 __all__ = ["EpisodeData", "write_recording"]
@@ -71,12 +72,20 @@ def write_recording(
     options = WriterOptions(compression, mode, benchmark_id, attachments, keep_empty=True, cameras=cameras)
     writer = RecordingWriter(path, options)
     recorder = SingleRecorder(writer, spaces, InfoRecorder(True))
+    work = Work()
+    work.recorders.append(recorder)
     try:
         writer.check_spaces(spaces, 1, vector=False)
         for episode in episodes:
-            _write(writer, recorder, episode)
+            work.state = BEGUN
+            try:
+                _write(writer, recorder, episode)
+            except StepError:  # what was recorded before stays
+                work.state = DONE
+                raise
+            work.state = DONE
     finally:
-        recorder.close()
+        work.close()
 
 
 def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeData) -> None:
@@ -104,5 +113,5 @@ def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeDa
                 put_frame(writer, 0, recorder.running[0], step, frame)
     flags = TERMINAL if episode.terminals[n - 1] else TIMEOUT if episode.timeouts[n - 1] else INTERRUPTED
     end = flags if episode.end is None else END_NAMES.index(episode.end)
-    metadata = jsonvalue.dumps_plain(dict(episode.metadata)) if episode.metadata else "{}"
-    recorder.end(end, metadata, has_final_state=episode.final_state is not None)
+    recorder.metadata = jsonvalue.dumps_plain(dict(episode.metadata)) if episode.metadata else "{}"
+    recorder.end(end, has_final_state=episode.final_state is not None)

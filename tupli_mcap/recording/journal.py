@@ -35,6 +35,7 @@ __all__ = [
     "Journal",
     "LogArea",
     "RowArea",
+    "journal_aside",
     "journal_in",
     "journal_info",
     "journal_name",
@@ -158,16 +159,17 @@ class Journal:
                 f"{path}: could not make the journal of {size} bytes: {refused(err)} (journal_dir=)"
             ) from err
 
-    def publish(self, *, durable: bool = False) -> None:
+    def publish(self, *, durable: bool = False, replaced: str = "") -> None:
         """Puts the journal in its place, instead of one that may be there; until then it is not found.
 
         With `durable` it is on the disk before its name is. The journal of another recording is kept, and a warning
-        says where: that recording may have been renamed without it.
+        says where: that recording may have been renamed without it. `replaced` is a recording that will be replaced,
+        and needs no warning.
         """
         if durable:
             self.sync()
         try:
-            _set_aside(self.path, self.info.get("uuid"))
+            _set_aside(self.path, self.info.get("uuid"), replaced)
             self._temporary.replace(self.path)
         except OSError as err:
             with contextlib.suppress(OSError):
@@ -208,14 +210,17 @@ class Journal:
                 f"{self.path}: the journal could not be synced to the disk: {refused(err)}"
             ) from err
 
-    def close(self, *, unlink: bool) -> None:
-        """Lets go of the map (freed with its last view) and, with `unlink`, removes the file, if it is still this one.
+    def close(self) -> None:
+        """Lets go of the map, and so of its descriptor and of the space of a file that was removed.
 
-        Warns if it cannot be removed: the recording is finished, and the file of no use.
+        Where somebody still has a view of it, that happens when the view goes.
         """
-        if not unlink:
-            return
-        for place in (self.path, _aside(self.path, str(self.info.get("uuid")))):
+        with contextlib.suppress(BufferError):
+            self._map.close()
+
+    def remove(self) -> None:
+        """Removes the file, if it is still this one. Warns if it cannot be removed: it is of no use any more."""
+        for place in (self.path, journal_aside(self.path, str(self.info.get("uuid")))):
             try:
                 if os.path.samestat(place.stat(), self._status):
                     place.unlink()
@@ -229,21 +234,23 @@ class Journal:
                 )
 
 
-def _aside(path: Path, uuid: str) -> Path:
+def journal_aside(path: Path, uuid: str) -> Path:
     """Where the journal of a recording goes if another one needs its name."""
     return journal_in(path.parent, path.with_name(path.name.removesuffix(".journal")), uuid)
 
 
-def _set_aside(path: Path, uuid: Any) -> None:
-    """Renames the journal of another recording than that of `uuid`."""
+def _set_aside(path: Path, uuid: Any, replaced: str) -> None:
+    """Renames the journal of another recording than that of `uuid`; warns unless it is that of `replaced`."""
     try:
         found = str(journal_info(path).get("uuid"))
     except (OSError, FormatError):  # none, or none that can be read
         return
     if found == uuid or not _UUID.fullmatch(found):
         return
-    kept = _aside(path, found)
+    kept = journal_aside(path, found)
     path.rename(kept)
+    if found == replaced:
+        return
     warnings.warn(
         f"{path} was the journal of another recording and is kept as {kept.name}: if that recording was renamed, "
         "rename its journal accordingly; if it was deleted, delete this too",

@@ -10,11 +10,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import io
 import os
 import secrets
 import stat
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +29,7 @@ _BUSY = (errno.EAGAIN, errno.EACCES)
 _PATIENCE = 2.0  # seconds to wait for those who only ask whether the writer lives
 _guard = threading.RLock()  # no fork between opening a descriptor and noting it
 _private: set[int] = set()
+_files: weakref.WeakSet[io.FileIO] = weakref.WeakSet()
 
 
 def open_private(path: str | os.PathLike[str], flags: int, mode: int = 0o666) -> int:
@@ -56,6 +59,31 @@ def drop_private(fd: int) -> None:
         _close_private(fd)
 
 
+def _open_file(path: Path, mode: str) -> io.FileIO:
+    """As `open_private`; a file that is interrupted on its way to its owner is closed with its last reference."""
+    with _guard:
+        file = io.FileIO(path, mode)
+        _files.add(file)
+    return file
+
+
+def _close_file(file: io.FileIO) -> None:
+    """Unlocks and closes; in a child, where it is closed already, nothing happens."""
+    with _guard:
+        if not file.closed:
+            try:
+                fcntl.flock(file, fcntl.LOCK_UN)  # see `_close_private`
+            finally:
+                file.close()
+
+
+def _drop_file(file: io.FileIO | None) -> None:
+    """As `drop_private`."""
+    if file is not None:
+        with contextlib.suppress(OSError):
+            _close_file(file)
+
+
 def _drop_in_child() -> None:
     global _guard
     _guard = threading.RLock()
@@ -63,6 +91,9 @@ def _drop_in_child() -> None:
         with contextlib.suppress(OSError):
             os.close(fd)
     _private.clear()
+    for file in list(_files):
+        with contextlib.suppress(OSError):
+            file.close()
 
 
 if hasattr(os, "register_at_fork"):
@@ -77,7 +108,8 @@ class FileLock:
     """A recording opened for writing and locked; `fd` is the descriptor to write with.
 
     A new file is made under another name, and is at its path, locked, from `publish` on: nobody finds a file without
-    its first records. Readers of a file that is replaced keep the old one.
+    its first records. Until then a file that it will replace stays, locked too. Readers of a file that is replaced keep
+    the old one.
 
     Raises:
         RecordingError: the file exists (mode "x"), is missing (mode "a"), is being written, or cannot be opened.
@@ -89,39 +121,44 @@ class FileLock:
         self._shown, self._path = path, Path(os.path.realpath(path))
         self._process = os.getpid()
         self._temporary: Path | None = None
-        self._old = -1
+        self._file: io.FileIO | None = None
+        self._old: io.FileIO | None = None
+        try:
+            self._open(path, mode)
+        except BaseException:
+            self.release()
+            raise
+
+    def _open(self, path: Path, mode: str) -> None:
         if mode == "x" and os.path.lexists(path):
             raise _exists(path)
         if mode == "a" or (mode == "w" and path.exists()):
             self._old = _open_locked(path, hint='use mode="x" to create it')
-        if mode == "a" or (self._old >= 0 and not stat.S_ISREG(os.fstat(self._old).st_mode)):
-            self.fd, self._old = self._old, -1
-        else:
-            self.fd = self._make()
-
-    def _make(self) -> int:
-        temporary = self._path.with_name(f".{secrets.token_hex(8)}.tmp")
+        if self._old is not None and (mode == "a" or not stat.S_ISREG(os.fstat(self._old.fileno()).st_mode)):
+            self._file, self._old = self._old, None
+            return
+        self._temporary = self._path.with_name(f".{secrets.token_hex(8)}.tmp")
         try:
-            fd = open_private(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+            self._file = _open_file(self._temporary, "x+")
         except OSError as err:
-            if self._old >= 0 and isinstance(err, PermissionError):
-                fd, self._old = self._old, -1  # a file that may be written, in a directory that may not
-                return fd
-            self._close_old()
+            self._temporary = None
             reason = refused(err)
             if isinstance(err, FileNotFoundError):
                 reason = "its directory does not exist; make it"
+            elif self._old is not None:
+                reason = f"{reason}; a new file is made beside the one that it replaces"
             raise RecordingError(f"{self._shown} cannot be recorded to: {reason}") from err
-        try:
-            _lock(fd, self._shown)
-        except BaseException:
-            self._close_old()
-            drop_private(fd)
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise
-        self._temporary = temporary
-        return fd
+        _lock(self._file.fileno(), self._shown)
+
+    @property
+    def fd(self) -> int:
+        """The descriptor to write with; -1 once it is released."""
+        return -1 if self._file is None or self._file.closed else self._file.fileno()
+
+    @property
+    def replaces(self) -> bool:
+        """True while the file that `publish` will replace is still there."""
+        return self._old is not None
 
     def publish(self) -> None:
         """Puts a new file at its path.
@@ -132,7 +169,7 @@ class FileLock:
         if self._temporary is None:
             return
         try:
-            if self._old >= 0:
+            if self._old is not None:
                 self._temporary.replace(self._path)
             else:
                 _link(self._temporary, self._path)
@@ -141,7 +178,8 @@ class FileLock:
         except OSError as err:
             raise RecordingError(f"{self._shown} cannot be recorded to: {refused(err)}") from err
         self._temporary = None
-        self._close_old()
+        _drop_file(self._old)
+        self._old = None
 
     @property
     def is_deleted(self) -> bool:
@@ -149,6 +187,13 @@ class FileLock:
         with contextlib.suppress(OSError):
             return self._temporary is None and os.fstat(self.fd).st_nlink == 0
         return False
+
+    def unlink(self) -> None:
+        """Removes the file from its path, if it was published and is there still."""
+        if self._temporary is None and self.fd >= 0:
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(self.fd), self._path.stat()):
+                    self._path.unlink()
 
     def release(self) -> None:
         """Unlocks and closes, and removes a file that was not published; in a forked child, where the descriptors are
@@ -159,20 +204,18 @@ class FileLock:
         """
         if self._process != os.getpid():
             return
-        temporary, self._temporary = self._temporary, None
-        if temporary is not None:
+        if self._temporary is not None:
             with contextlib.suppress(OSError):
-                temporary.unlink()
-        fd, self.fd = self.fd, -1
-        self._close_old()
+                self._temporary.unlink()
+            self._temporary = None
+        _drop_file(self._old)
+        self._old = None
+        if self._file is None:
+            return
         try:
-            _close_private(fd)
+            _close_file(self._file)
         except OSError as err:
             raise RecordingError(f"{self._shown} could not be closed: {refused(err)}") from err
-
-    def _close_old(self) -> None:
-        fd, self._old = self._old, -1
-        drop_private(fd)
 
 
 def _exists(path: Path) -> RecordingError:
@@ -203,32 +246,32 @@ def writers_kept_out(path: Path) -> Iterator[None]:
     Raises:
         RecordingError: somebody does, or it is gone.
     """
-    fd = _open_locked(path, flags=os.O_RDONLY, hint="it was deleted")
+    file = _open_locked(path, mode="r", hint="it was deleted")
     try:
         yield
     finally:
-        drop_private(fd)
+        _drop_file(file)
 
 
-def _open_locked(path: Path, *, flags: int = os.O_RDWR, hint: str) -> int:
+def _open_locked(path: Path, *, mode: str = "r+", hint: str) -> io.FileIO:
     while True:
         try:
-            fd = open_private(path, flags)
+            file = _open_file(path, mode)
         except FileNotFoundError as err:
             raise RecordingError(f"{path} cannot be recorded to: it does not exist; {hint}") from err
         except OSError as err:
             raise RecordingError(f"{path} cannot be recorded to: {refused(err)}") from err
         try:
-            _lock(fd, path)
-            if _is_at(fd, path):
-                return fd
+            _lock(file.fileno(), path)
+            if _is_at(file.fileno(), path):
+                return file
         except BaseException as err:
-            drop_private(fd)
+            _drop_file(file)
             if isinstance(err, OSError):
                 raise RecordingError(f"{path} cannot be recorded to: {refused(err)}") from err
             raise
         # it was deleted or replaced between opening and locking: what is written to it would be lost
-        drop_private(fd)
+        _drop_file(file)
 
 
 def _lock(fd: int, path: Path) -> None:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.errors import StepError
 from tupli_mcap.messages.exact import check_structure, decide_dtype, exact_array, leaf_value
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.widening import variable_dtypes
@@ -49,7 +49,12 @@ def decide_layout(
 
 
 class SingleRecorder:
-    """Records one environment's episodes. `put` takes each step; what it is changes as episodes go by."""
+    """Records one environment's episodes, for a `Work` that is marked while any of this runs.
+
+    `put` records a step. It is re-bound by state: `_unreset`, `_first`, that of the rows, `_continue`, `_refused`,
+    `_closed`.
+    `metadata` is the running episode's (a JSON text), written when it ends.
+    """
 
     def __init__(
         self,
@@ -60,6 +65,7 @@ class SingleRecorder:
         leaves_to_rows: bool = False,
     ) -> None:
         self.leaves_to_rows = leaves_to_rows  # plain episodes
+        self.metadata = "{}"
         self._writer = writer
         self._spaces = spaces
         self._infos = infos
@@ -74,22 +80,27 @@ class SingleRecorder:
         writer.on_abandon = self._abandon
         writer.start_is_droppable = lambda: self._episode is not None and self.step_index == 0
 
+    @property
+    def writer(self) -> RecordingWriter:
+        """Writes the file."""
+        return self._writer
+
     def _abandon(self) -> None:
         self.put = self._closed
         self._over = None  # or `begin_next` would go on
 
-    def reset(self, state: Any, facts: ResetFacts, metadata: str = "{}") -> None:
-        """Starts an episode at `state`; a running one ends as interrupted, with `metadata`.
+    def reset(self, state: Any, facts: ResetFacts) -> None:
+        """Starts an episode at `state`; a running one ends as interrupted.
 
         Raises:
             StepError: the state cannot be stored exactly.
         """
-        if self._writer.closed or self._writer.failed is not None:
+        if self._writer.closed:
             self._closed()
         self._settle()
         if self._reset is not None or self._episode is not None:
             self._keep_start_for(facts)
-            self.end(INTERRUPTED, metadata)
+            self.end(INTERRUPTED)
             self._writer.sync_step()  # before the running state is written over
         rows = self._writer.rows
         self.put = self._unreset
@@ -99,15 +110,11 @@ class SingleRecorder:
             self.put = self._first
             return
         writer = self._writer
-        try:  # as `writer.whole`, which costs a call more
-            rows.begin_episode(writer.next_episode)
-            rows.put_state(state)
-            self._episode = writer.start_episode(0, rows.count, facts)
-            self._began_plain = facts.goes_on and not facts.options and facts.info == "{}"
-            self.put = rows.put
-        except BaseException as err:
-            writer.stop(err)
-            raise
+        rows.begin_episode(writer.next_episode)
+        rows.put_state(state)
+        self._episode = writer.start_episode(0, rows.count, facts)
+        self._began_plain = facts.goes_on and not facts.options and facts.info == "{}"
+        self.put = rows.put
         if writer.syncs_steps:
             writer.sync_step()
 
@@ -133,18 +140,14 @@ class SingleRecorder:
         over, writer, rows = self._over, self._writer, self._rows
         if over is None or rows is None or writer.lost_streams:
             return False
-        try:  # as `writer.whole`, which costs a call more
-            if self._episode is not None:
-                self._leave_to_rows(rows, self._episode, over)
-            rows.put_next(writer.next_episode, state)
-            if rows.asked:
-                rows.tell_now()
-            writer.next_episode += 1
-            self._over = None
-            self.put = rows.put_plain
-        except BaseException as err:
-            writer.stop(err)
-            raise
+        if self._episode is not None:
+            self._leave_to_rows(rows, self._episode, over)
+        rows.put_next(writer.next_episode, state)
+        if rows.asked:
+            rows.tell_now()
+        writer.next_episode += 1
+        self._over = None
+        self.put = rows.put_plain
         return True
 
     def _leave_to_rows(self, rows: SingleRows, episode: StartedEpisode, end: int) -> None:
@@ -160,21 +163,20 @@ class SingleRecorder:
     def _settle(self) -> None:
         """Writes what was left for later, so that everything is as if it had been written at once."""
         writer, rows = self._writer, self._rows
-        if rows is None or writer.failed is not None:
+        if rows is None or writer.closed:
             return
-        with writer.whole:
-            over, self._over = self._over, None
-            if self._episode is not None:
-                if over is not None:
-                    self.end(over)
-            elif rows.tells:
-                self._episode = rows.settle(over=over is not None)
-                if self._episode is None and over is None:  # begun, and no step yet
-                    writer.next_episode -= 1
-                    facts = ResetFacts(None, None, "", "{}", time.time_ns())
-                    self._episode = writer.start_episode(0, rows.count, facts)
-                if over is None:
-                    self.put = rows.put
+        over, self._over = self._over, None
+        if self._episode is not None:
+            if over is not None:
+                self.end(over)
+        elif rows.tells:
+            self._episode = rows.settle(over=over is not None)
+            if self._episode is None and over is None:  # begun, and no step yet
+                writer.next_episode -= 1
+                facts = ResetFacts(None, None, "", "{}", time.time_ns())
+                self._episode = writer.start_episode(0, rows.count, facts)
+            if over is None:
+                self.put = rows.put
 
     def _keep_start_for(self, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""
@@ -184,43 +186,40 @@ class SingleRecorder:
             self._writer.keep_start()
             self._episode = None
 
-    def end(self, end: int, metadata: str = "{}", *, has_final_state: bool = True) -> None:
+    def end(self, end: int, *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
         if self._over is not None or self._episode is None:
             self._settle()
         episode, writer = self._episode, self._writer
+        metadata, self.metadata = self.metadata, "{}"
         rows = writer.rows
-        if episode is None or rows is None or writer.failed is not None:
+        if episode is None or rows is None or writer.closed:
             return
-        try:  # as `writer.whole`, which costs a call more
-            self._episode = None
-            length = rows.count - episode.first_row
-            if length == 0:
-                writer.drop_start()
-                return
-            final = rows.pending_state() if has_final_state else None
-            if final is not None:
-                for sinks in writer.images:
-                    final += sinks[0].pending()
-            writer.end_episode(episode, end, length, rows.total, final, metadata)
-            self.put = self._continue
-        except BaseException as err:
-            writer.stop(err)
-            raise
+        self._episode = None
+        length = rows.count - episode.first_row
+        if length == 0:
+            writer.drop_start()
+            return
+        final = rows.pending_state() if has_final_state else None
+        if final is not None:
+            for sinks in writer.images:
+                final += sinks[0].pending()
+        writer.end_episode(episode, end, length, rows.total, final, metadata)
+        self.put = self._continue
 
-    def refuse(self, metadata: str = "{}") -> None:
+    def refuse(self) -> None:
         """After a step that could not be stored: the episode ends before it, and a reset must follow."""
-        self.end(INTERRUPTED, metadata)
+        self.end(INTERRUPTED)
         self._writer.lost_streams.add(0)
-        if self._writer.failed is None and not self._writer.closed:
+        if not self._writer.closed:
             self.put = self._refused
 
-    def forget_reset(self, metadata: str = "{}") -> None:
+    def forget_reset(self) -> None:
         """After a reset that failed, wherever it left the environment: the episode ends, and a reset must follow."""
-        self.end(INTERRUPTED, metadata)
+        self.end(INTERRUPTED)
         self._reset, self._earlier = None, []
         self._writer.lost_streams.add(0)
-        if self._writer.failed is None and not self._writer.closed:
+        if not self._writer.closed:
             self.put = self._unreset
 
     @property
@@ -238,8 +237,7 @@ class SingleRecorder:
     def put_info(self, info: Mapping[str, Any]) -> None:
         """Records the info of the step just put."""
         if self._infos is not None and self._episode is not None:
-            with self._writer.whole:
-                self._infos.put(self._writer, self._episode.number, self.step_index - 1, info)
+            self._infos.put(self._writer, self._episode.number, self.step_index - 1, info)
 
     def _first(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         if self._reset is None:
@@ -261,11 +259,10 @@ class SingleRecorder:
         rows = self._writer.rows
         if rows is None or not self._earlier:
             return
-        with self._writer.whole:
-            for facts in self._earlier:
-                self._writer.start_episode(0, rows.count, facts)
-                self._writer.keep_start()
-            self._earlier = []
+        for facts in self._earlier:
+            self._writer.start_episode(0, rows.count, facts)
+            self._writer.keep_start()
+        self._earlier = []
 
     def _continue(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """A step after an end, without a reset: another episode, which starts at the last one's final state."""
@@ -307,18 +304,14 @@ class SingleRecorder:
             "the step before this one could not be recorded; call env.reset() to go on with a new episode"
         )
 
-    def close(self, metadata: str = "{}") -> None:
+    def close(self) -> None:
         """Ends the running episode as interrupted and closes the recording."""
         if self._writer.closed:
             return
-        try:
-            if self._writer.failed is None:
-                self.end(INTERRUPTED, metadata)
-        finally:
-            self.put = self._closed
-            self._writer.close()
+        self.end(INTERRUPTED)
+        self.put = self._closed
+        self._rows = None
+        self._writer.close()
 
     def _closed(self, *_: Any) -> None:
-        raise self._writer.failed or RecordingError(
-            f"{self._writer.path} is closed; wrap the environment again to record"
-        )
+        raise self._writer.why_stopped()

@@ -140,6 +140,15 @@ class Stores:
                 store.flush()
         self.events.flush(keep_last=keep_last)
 
+    def let_go(self) -> None:
+        """Drops every view of the journal; no store can be used afterwards."""
+        vector = self.vector if isinstance(self.vector, VectorRows) else None
+        single = self.rows if isinstance(self.rows, SingleRows) else None
+        others = (*self._step_logs.values(), *self._image_rows.values(), self.infos, *self.frames)
+        for store in (single, vector, *others, self.events):
+            if store is not None:
+                vars(store).clear()  # views are held by encoders, too, and these by the stores
+
     def move(self, journal: Journal) -> None:
         """Goes on in another journal: only running records move, for everything must have been flushed."""
         for name, steps in self._step_logs.items():

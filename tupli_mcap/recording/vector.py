@@ -36,7 +36,10 @@ Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 
 
 class VectorRecorder:
-    """Records the episodes of `num_envs` sub-environments. `spaces` are those of one of them."""
+    """Records the episodes of `num_envs` sub-environments, for a `Work` that is marked while any of this runs.
+
+    `spaces` are those of one of them.
+    """
 
     def __init__(
         self,
@@ -78,6 +81,11 @@ class VectorRecorder:
         self._final_encoders: list[tuple[Leaf, Encoder]] | None = None
         self._final_rows: dict[int, int] = {}  # of final states that are in no row of steps
 
+    @property
+    def writer(self) -> RecordingWriter:
+        """Writes the file."""
+        return self._writer
+
     # ---- resets
 
     def reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None = None) -> None:
@@ -86,13 +94,8 @@ class VectorRecorder:
         Raises:
             StepError: a state cannot be stored exactly.
         """
-        if self._writer.failed is not None:
-            raise self._writer.failed
-        with self._writer.whole:
-            self._reset(states, facts, mask)
-        self._writer.sync_step()
-
-    def _reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None) -> None:
+        if self._writer.closed:
+            raise self._writer.why_stopped()
         self._settle()
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
         ended = self._ended.copy()
@@ -105,11 +108,11 @@ class VectorRecorder:
         self._fresh = True
         self._was_reset = True
         self._refused = False
-        store = self._writer.vector
-        if store is None:
+        if self._writer.vector is None:
             self._first = copy.deepcopy(states)
             return
         self._put_states(states, chosen if mask is not None else None)
+        self._writer.sync_step()
 
     def _replace_facts(self, i: int, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""
@@ -155,8 +158,8 @@ class VectorRecorder:
         Raises:
             StepError: something cannot be stored exactly; nothing of this batch is recorded.
         """
-        if self._writer.failed is not None:
-            raise self._writer.failed
+        if self._writer.closed:
+            raise self._writer.why_stopped()
         if not self._was_reset or self._refused:
             why = (
                 "the step before this one could not be recorded"
@@ -164,12 +167,6 @@ class VectorRecorder:
                 else "there was no reset yet"
             )
             raise StepError(f"{why}; call env.reset() to go on")
-        with self._writer.whole:
-            return self._put(actions, states, rewards, terminals, timeouts, infos)
-
-    def _put(
-        self, actions: Any, states: Any, rewards: Any, terminals: Any, timeouts: Any, infos: Any
-    ) -> Array:
         try:
             rewards, terminals, timeouts = self._numbers_of(rewards, terminals, timeouts)
             if self._writer.vector is None:
@@ -225,24 +222,22 @@ class VectorRecorder:
 
     def finish(self, terminals: Any, infos: Mapping[str, Any]) -> None:
         """Ends the episodes that ended in the batch just put; `infos` are that batch's."""
-        if not self._any_ended or self._told or self._writer.failed is not None:
+        if not self._any_ended or self._told:
             return
-        with self._writer.whole:
-            ended = self._ended.nonzero()[0].tolist()
-            self._end([(i, TERMINAL if terminals[i] else TIMEOUT) for i in ended])
-            if self._autoreset == "SameStep":
-                self._note_resets(self._ended, infos)
-                self._any_ended = False
+        ended = self._ended.nonzero()[0].tolist()
+        self._end([(i, TERMINAL if terminals[i] else TIMEOUT) for i in ended])
+        if self._autoreset == "SameStep":
+            self._note_resets(self._ended, infos)
+            self._any_ended = False
 
     def put_infos(self, stepped: Array, entries: Sequence[Mapping[str, Any]]) -> None:
         """Records infos of the batch just put."""
         if self._infos is None:
             return
-        with self._writer.whole:
-            for i in np.flatnonzero(stepped).tolist():
-                episode = self._episodes[i]
-                if episode is not None:
-                    self._infos.put(self._writer, episode.number, int(self._lengths[i]) - 1, entries[i])
+        for i in np.flatnonzero(stepped).tolist():
+            episode = self._episodes[i]
+            if episode is not None:
+                self._infos.put(self._writer, episode.number, int(self._lengths[i]) - 1, entries[i])
 
     def _begin(self, actions: Any, states: Any, rewards: Array) -> None:
         if self._spaces.constant:
@@ -486,8 +481,7 @@ class VectorRecorder:
 
         Episodes that run there go on here, `continued`; close `before` afterwards.
         """
-        with before._writer.whole:
-            before._settle()
+        before._settle()
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = set(range(self._n))
         cut = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
@@ -504,9 +498,7 @@ class VectorRecorder:
         self._refused = True
         self._final_rows.clear()
         self._writer.lost_streams.update(range(self._n))
-        if self._writer.failed is not None or self._writer.closed:
-            return
-        with self._writer.whole:
+        if not self._writer.closed:
             self._settle()
             self._end([(i, INTERRUPTED) for i in range(self._n) if self._lengths[i]])
 
@@ -514,11 +506,7 @@ class VectorRecorder:
         """Ends the running episodes as interrupted and closes the recording."""
         if self._writer.closed:
             return
-        try:
-            if self._writer.failed is None:
-                with self._writer.whole:
-                    self._settle()
-                    self._end([(i, INTERRUPTED) for i in range(self._n)])
-        finally:
-            self._refused = True
-            self._writer.close()
+        self._settle()
+        self._end([(i, INTERRUPTED) for i in range(self._n)])
+        self._refused = True
+        self._writer.close()

@@ -14,7 +14,6 @@ import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
 from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.journal import Area, Journal, journal_in, journal_path, owner_among
+from tupli_mcap.recording.journal import Area, Journal, journal_aside, journal_in, journal_path, owner_among
 from tupli_mcap.recording.library import library
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog
@@ -65,11 +64,9 @@ class RecordingWriter:
         self._place = Path(os.path.realpath(path))
         self.options = options = check_options(path, options)
         self.closed = False
-        self.failed: RecordingError | None = None
-        self._broken_off = False
+        self.failed: RecordingError | None = None  # why nothing more can be recorded, where that is known
         self._told_deleted = False
         self._old_journal: Path | None = None  # on append: where a writer that was killed has left its own
-        self.whole = _Whole(self)
         self.layout: StepLayout | None = None
         self.index = IndexBuilder()
         self.next_episode = 0
@@ -84,8 +81,8 @@ class RecordingWriter:
         self.events: EpisodeLog | None = None
         self.infos: EventLog | None = None
         self.frames: list[EventLog] = []
-        # set by the recorder: told of a fork (its encoder knows only its buffer), and asked whether the last event
-        # is the start of an episode without a step
+        # set by the recorder: called in a forked child (its encoder knows only its buffer), and asked whether the last
+        # event is the start of an episode without a step
         self.on_abandon: Callable[[], None] = lambda: None
         self.start_is_droppable: Callable[[], bool] = lambda: False
         # sub-environments whose random stream does not come from their last recorded episode
@@ -103,12 +100,14 @@ class RecordingWriter:
         self._is_cut = True  # False on append, while the file still is as it was found
         self._flush_seconds = options.flush_seconds
         self._flushed_at = time.monotonic()
-        self.lock = FileLock(self.path, options.mode)
+        lock: FileLock | None = None
         try:
+            self.lock = lock = FileLock(self.path, options.mode)
             self._open()
         except BaseException as err:
-            with contextlib.suppress(RecordingError):
-                self.lock.release()
+            if lock is not None:
+                with contextlib.suppress(RecordingError):
+                    lock.release()
             if isinstance(err, OSError):
                 raise RecordingError(f"{self.path} cannot be recorded to: {refused(err)}") from err
             raise
@@ -151,10 +150,9 @@ class RecordingWriter:
         self.container.add_metadata(RECORDING_METADATA, values)
         for name, (media_type, data) in (self.options.attachments or {}).items():
             self.container.add_attachment(name, media_type, data, now)
-        self.lock.publish()
-        self._remove_replaced()
-        if there:
-            self._remove_unnamed(journal_path(self._place))
+        if not self.lock.replaces:
+            self.lock.publish()
+            self._remove_replaced()
 
     # ---- the first step
 
@@ -187,7 +185,15 @@ class RecordingWriter:
         self.container.define_channels()
         if self._durable:
             self._settle()
+        self._take_place()
+        if self._durable:
             sync_directory(self._place.parent)
+
+    def _take_place(self) -> None:
+        """The file that this one replaces goes when nothing more is needed to record to this one."""
+        if self.lock.replaces:
+            self.lock.publish()
+            self._remove_replaced()
 
     def _png(self, layout: StepLayout) -> frozenset[str]:
         """The image leaves stored as PNG: as the options say, on append as they are in the file."""
@@ -226,7 +232,7 @@ class RecordingWriter:
     def _make_stores(self, areas: Sequence[Area]) -> None:
         layout, channels = self._laid(), self.channels
         self.journal = self._new_journal(areas)
-        self.journal.publish(durable=self._durable)
+        self.journal.publish(durable=self._durable, replaced=self.replaced)
         self._stores = stores = Stores(
             layout, channels, self.container, self.journal, self.index, self.add_chunk, self._start_chunks,
             vector=self.is_vector, sealed=self._sealed, durable=self._durable, grow=self._grow,
@@ -306,10 +312,8 @@ class RecordingWriter:
             self._settle()
 
     def _write_chunk(self, rows: Rows) -> None:
-        """After a failure nothing more is accepted, and the journal keeps what it holds."""
         self._check_room(rows)
-        with self.whole:
-            self.container.add_chunk(rows)
+        self.container.add_chunk(rows)
         self._warn_if_deleted()
 
     def _start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], None]:
@@ -320,27 +324,21 @@ class RecordingWriter:
         for rows in chunks:
             self._check_room(rows)
         container = self.container
-        with self.whole:
-            pack = container.start_chunks(chunks)
-            # a thread that needs the interpreter lock for every chunk would wait for it again and again
-            in_thread = len(chunks) == 1 or container.packs_together
-            size = sum(len(rows.data) for rows in chunks)
-            packed = self.worker.submit(pack, size) if in_thread else pack
+        pack = container.start_chunks(chunks)
+        # a thread that needs the interpreter lock for every chunk would wait for it again and again
+        in_thread = len(chunks) == 1 or container.packs_together
+        size = sum(len(rows.data) for rows in chunks)
+        packed = self.worker.submit(pack, size) if in_thread else pack
 
         def finish() -> None:
-            if self.failed is not None:
-                raise self.failed
-            with self.whole:
-                container.finish_chunks(packed())
-                if self._durable:
-                    self._settle()
+            container.finish_chunks(packed())
+            if self._durable:
+                self._settle()
             self._warn_if_deleted()
 
         return finish
 
     def _check_room(self, rows: Rows) -> None:
-        if self.failed is not None:
-            raise self.failed
         if rows.first + len(rows.offsets) > LAST_ROW:
             raise RecordingError(
                 f"{self.path}: a channel holds at most {LAST_ROW} messages; go on in a new recording"
@@ -359,33 +357,31 @@ class RecordingWriter:
 
     def _settle(self) -> None:
         """Waits until what was written is on the disk: the journal first, for it holds the ends of the episodes."""
-        with self.whole:
-            if self.journal is not None:
-                self.journal.sync()
-            sync_file(self.lock.fd, str(self.path))
+        if self.journal is not None:
+            self.journal.sync()
+        sync_file(self.lock.fd, str(self.path))
 
     def sync_step(self) -> None:
         """Waits until everything put so far is on the disk, where durability of steps is asked for."""
-        if self._sealed and self.journal is not None and self.failed is None:
-            with self.whole:
-                self.journal.sync()
+        if self._sealed and self.journal is not None:
+            self.journal.sync()
 
     def stop(self, err: BaseException) -> None:
-        """After something that was left half done: nothing more is accepted, and the journal keeps what it holds.
+        """Notes for `why_stopped` what has broken off the recorder's work; a refused step does not."""
+        if self.failed is None and not isinstance(err, StepError):
+            self.failed = err if isinstance(err, RecordingError) else self._broken_off(type(err).__name__)
 
-        A refused step leaves nothing half done.
-        """
-        if self.failed is not None or isinstance(err, StepError):
-            return
-        if isinstance(err, RecordingError):
-            self.failed = err
-        else:
-            self._broken_off = True
-            self.failed = RecordingError(
-                f"{self.path}: {type(err).__name__} broke off the recorder's work; every finished step is safe: "
-                'close the recording, and go on with mode="a"'
-            )
-        self.on_abandon()
+    def why_stopped(self) -> RecordingError:
+        """Why nothing more can be recorded: it is closed, or has been broken off."""
+        if self.closed and self.failed is None:
+            return RecordingError(f"{self.path} is closed; wrap the environment again to record")
+        return self.failed or self._broken_off("an interruption")
+
+    def _broken_off(self, what: str) -> RecordingError:
+        return RecordingError(
+            f"{self.path}: {what} broke off the recorder's work; every finished step is safe: "
+            'close the recording, and go on with mode="a"'
+        )
 
     def check_spaces(self, spaces: StepLayout, num_envs: int, *, vector: bool) -> None:
         """On append: raises SpaceError unless the environment is one the file can go on with."""
@@ -405,10 +401,7 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Writes everything recorded so far into chunks (the file still has no summary)."""
-        if self.failed is not None:
-            raise self.failed
-        with self.whole:
-            self._flush(keep_last=self.start_is_droppable())
+        self._flush(keep_last=self.start_is_droppable())
 
     def _flush(self, *, keep_last: bool) -> None:
         self._flushed_at = time.monotonic()
@@ -446,42 +439,69 @@ class RecordingWriter:
         )
 
     def close(self) -> None:
-        """Writes the rest, the episode index and the summary, and removes the journal."""
+        """Writes the rest, the episode index and the summary, and removes the journal.
+
+        Where it raises, `let_go` or `break_off` must follow.
+        """
         if self.closed:
-            return
-        self.closed = True
-        _live.discard(self)
-        if self._broken_off:
-            self._finish_broken_off()
             return
         if self.journal is None and (not self._is_cut or self._is_new_and_empty()):
             self._leave()
             return
+        self.flush()
+        data = self.index.encode(self.container.chunk_rows)
+        self.container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, time.time_ns())
+        self.container.finish()
+        self._take_place()
+        self._warn_if_deleted()
+        if self._durable:  # before the journal goes
+            sync_file(self.lock.fd, str(self.path))
+            sync_directory(self._place.parent)
+        if self.journal is not None:
+            self.journal.remove()
+        elif self._old_journal is not None:
+            self._remove_old_journal(self._old_journal, self.uuid)
+        self.closed = True
+        self.let_go()
+
+    def let_go(self) -> None:
+        """Lets go of the file, its lock and the journal, as they are. Calling it again goes on with what is left.
+
+        Raises:
+            RecordingError: as `FileLock.release`.
+        """
+        _live.discard(self)
         try:
-            self.flush()
-            data = self.index.encode(self.container.chunk_rows)
-            self.container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, time.time_ns())
-            self.container.finish()
-            self._warn_if_deleted()
-            if self._durable:  # before the journal goes
-                sync_file(self.lock.fd, str(self.path))
-                sync_directory(self._place.parent)
+            self.worker.close()
+            if self._stores is not None and not self.is_watched:  # who watches may be looking
+                self._stores.let_go()
+            self._stores = self.rows = self.vector = self.events = self.infos = None
+            self.images, self.frames = [], []
             if self.journal is not None:
-                self.journal.close(unlink=True)
-            elif self._old_journal is not None:
-                self._remove_old_journal(self._old_journal, self.uuid)
-        except BaseException as err:
-            if self.journal is not None:
-                self.journal.close(unlink=False)
-            self._broken_off = not isinstance(err, RecordingError)
-            raise
+                self.journal.close()
         finally:
-            try:
-                self.worker.close()
-            finally:
-                self.lock.release()
-            if self._broken_off:  # by Ctrl-C: the file is finished all the same
-                self._finish_broken_off()
+            self.lock.release()
+
+    def break_off(self) -> None:
+        """Finishes the recording from its file and its journal, as after a killed process.
+
+        What is in memory is not used. Calling it again goes on with what is left.
+
+        Raises:
+            RecordingError: the disk refuses. The file and the journal hold everything that was recorded.
+        """
+        if self.closed:
+            return
+        if self.lock.replaces or (self.journal is None and self._is_new_and_empty()):
+            self._leave()
+            return
+        self.let_go()
+        self._remove_unnamed(self.journal_place)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
+            options = WriterOptions(self.options.compression, "a", durability=self.options.durability)
+            RecordingWriter(self._place, options).close()
+        self.closed = True
 
     def _remove_old_journal(self, place: Path, uuid: str) -> None:
         """What a killed writer left of its journal, and of one that was not in its place yet."""
@@ -495,34 +515,28 @@ class RecordingWriter:
 
     def _remove_replaced(self) -> None:
         """The journal of the recording that this one took the place of."""
-        place = journal_path(self._place)
-        with contextlib.suppress(OSError):
-            if owner_among(place, [self.replaced]):
-                place.unlink()
+        beside = journal_path(self._place)
+        for place in (beside, journal_aside(beside, self.replaced)):
+            with contextlib.suppress(OSError):
+                if owner_among(place, [self.replaced]):
+                    place.unlink()
 
     def _is_new_and_empty(self) -> bool:
         return self.options.mode != "a" and not self.options.keep_empty
 
     def _leave(self) -> None:
-        """No step was recorded: what was appended to stays as it was, and a new file would only be in the way."""
+        """No step was recorded: what is appended to or replaced stays as it was, and a new file would only be in the
+        way."""
+        if self.journal is not None:
+            self.journal.remove()
         with contextlib.suppress(OSError):
+            self._remove_unnamed(self.journal_place)
             if self._is_cut:
-                self._place.unlink()
+                self.lock.unlink()
             if self._old_journal is not None:
                 self._remove_old_journal(self._old_journal, self.uuid)
-        self.lock.release()
-
-    def _finish_broken_off(self) -> None:
-        """What is in memory cannot be trusted; the file and the journal can, as after a killed process."""
-        self.worker.close()
-        if self.journal is not None:
-            self.journal.close(unlink=False)
-        self.lock.release()
-        self._remove_unnamed(self.journal_place)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
-            options = WriterOptions(self.options.compression, "a", durability=self.options.durability)
-            RecordingWriter(self._place, options).close()
+        self.closed = True
+        self.let_go()
 
     def abandon(self) -> None:
         """In a forked child: lets go of the file and its lock without writing; the parent goes on."""
@@ -532,24 +546,6 @@ class RecordingWriter:
         )
         self.lock.release()
         self.on_abandon()
-
-
-class _Whole:
-    """A context for what must not be left half done, by Ctrl-C for one; a refused step is no such thing."""
-
-    __slots__ = ("_writer",)
-
-    def __init__(self, writer: RecordingWriter) -> None:
-        self._writer = writer
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(
-        self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if err is not None:
-            self._writer.stop(err)
 
 
 def _metadata_of(path: Path) -> dict[str, str]:

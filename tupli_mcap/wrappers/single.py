@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from tupli_mcap.errors import RecordingError, SpaceError, StepError
+from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.durability import Durability
@@ -25,6 +25,7 @@ from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.recording.rotation import Rotation
 from tupli_mcap.recording.single import SingleRecorder
+from tupli_mcap.recording.work import ASKING, BEGUN, DONE, Work
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import benchmark_attachments
@@ -35,7 +36,7 @@ from tupli_mcap.wrappers.stacks import format_version, with_stacks
 if TYPE_CHECKING:
     from tupli_mcap.live import LiveSession
 
-__all__ = ["RecordEpisodes", "live_session", "metadata_text"]
+__all__ = ["RecordEpisodes", "close_recordings", "live_session", "metadata_of"]
 
 StepCallback = Callable[[Step], Mapping[str, Any] | None]
 
@@ -144,26 +145,29 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             format_version=format_version(spaces, image_format),
             image_format=image_format,
         )
-        self._writer = self.rotation.open_first(self._options)
-        try:
-            self._writer.check_spaces(spaces, 1, vector=False)
-        except SpaceError:
-            self._writer.close()
-            raise
         self._watches = metadata_callback is not None or wanted or bool(every)
         self._plain = (
             not self._watches and flush_seconds is None and durability != "step" and not self.rotation.limited
         )
-        self._recorder = SingleRecorder(self._writer, spaces, self._infos, leaves_to_rows=self._plain)
-        self._recorder.resets_itself = _resets_itself(env)
-        self._newest = [self._recorder]
-        self._frames = FrameRecorder(self._writer, 1, every, frame_format) if every else None
-        # shared with the finalizer, which must not hold the wrapper
-        self._episode_metadata: list[str] = ["{}"]
         self._stepped = False
         self._state: Any = None
-        self._live = live_session(self._writer, live, env)
-        self._finalizer = weakref.finalize(self, _close, self._newest, self._episode_metadata, self._live)
+        self._work = work = Work()
+        writer: RecordingWriter | None = None
+        try:
+            self._writer = writer = self.rotation.open_first(self._options)
+            self._recorder = SingleRecorder(self._writer, spaces, self._infos, leaves_to_rows=self._plain)
+            work.recorders.append(self._recorder)
+            self._writer.check_spaces(spaces, 1, vector=False)
+            self._recorder.resets_itself = _resets_itself(env)
+            self._frames = FrameRecorder(self._writer, 1, every, frame_format, work.ask) if every else None
+            self._live = live_session(self._writer, live, env)
+            # must not hold the wrapper
+            self._finalizer = weakref.finalize(self, close_recordings, work, self._live)
+        except BaseException:
+            work.close()
+            if writer is not None:
+                writer.close()
+            raise
 
     @property
     def path(self) -> Path:
@@ -186,87 +190,91 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         return self._writer.closed
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        work = self._work
+        if work.state:
+            work.refuse()
+        work.state = BEGUN
         try:
             result = self.env.step(action)
-            state, reward, terminal, timeout, info = result
+            state, reward, terminal, timeout, _ = result
         except Exception:  # a step that the environment refuses may be no step
+            work.state = DONE
             raise
         except (
             BaseException
         ):  # Ctrl-C: wherever the environment is now, it is not where the last step has led to
-            self._recorder.refuse(self._taken_metadata())
+            self._recorder.refuse()
+            work.state = DONE
             raise
         try:
-            put = (
-                self._recorder.put
-            )  # looked up as an attribute, which it is, and not as a method: that is quicker
+            # looked up as an attribute, which it is, and not as a method: that is quicker
+            put = self._recorder.put
             put(action, state, reward, terminal, timeout)
             if self._plain:
                 if terminal or timeout:
                     self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
+                work.state = DONE
                 return result
         except StepError:
-            self._recorder.refuse(self._taken_metadata())
+            self._recorder.refuse()
+            work.state = DONE
             raise
         except BaseException as err:  # a full disk, Ctrl-C
             self._writer.stop(err)
             raise
-        try:
-            if self._watches:
-                if self._recorder.step_index == 0:  # a step that was a reset
-                    self._state = copy.deepcopy(state)
-                    self._start_frames()
-                else:
-                    self._watch(action, state, reward, terminal, timeout, info)
-                    if self._frames is not None:
-                        number, step = self._recorder.running
-                        self._frames.step(0, number, step, bool(terminal or timeout), self.env.render)
-        finally:  # a callback that raises changes nothing about what the environment did
-            if terminal or timeout:
-                end = TERMINAL if terminal else TIMEOUT
-                if self._watches:
-                    self._end(end)
-                else:
-                    self._recorder.end(end)
-                if self.rotation.is_due(self._writer):
-                    self._rotate(state)
-        self._writer.flush_if_due()
-        self._writer.sync_step()
-        if self.rotation.is_overdue(self._writer):
-            self._rotate(state)
-            self._start_frames()
+        refusal = self._finish_step(action, result)
+        work.state = DONE
+        if refusal is not None:
+            raise refusal
         return result
+
+    def _finish_step(self, action: Any, result: Any) -> BaseException | None:
+        """Everything that follows a step's row; returns what a callback raised, which changes nothing about that."""
+        work, refusal = self._work, None
+        for part in (self._watch, self._end, self._go_on):
+            try:
+                part(action, result)
+            except BaseException as err:
+                if not work.is_whole_after(err):
+                    self._writer.stop(err)
+                    raise
+                refusal = err if refusal is None else refusal
+                work.state = BEGUN
+        return refusal
 
     def _rotate(self, state: Any) -> None:
         """Goes on in the next file, with the environment at `state`; an episode that runs is cut in two."""
-        before = self._recorder
-        writer = self.rotation.open_next(self._options)
-        try:
-            recorder = SingleRecorder(writer, self._spaces, self._infos, leaves_to_rows=before.leaves_to_rows)
-            recorder.go_on_from(before, state)
-        except BaseException:
-            writer.close()
-            raise
-        self._newest[0], left = recorder, self._writer
+        work, before, left = self._work, self._recorder, self._writer
+        writer = work.ask(self.rotation.open_next, self._options)
+        recorder = SingleRecorder(writer, self._spaces, self._infos, leaves_to_rows=before.leaves_to_rows)
+        work.recorders.append(recorder)
+        recorder.go_on_from(before, state)
         self._writer, self._recorder = writer, recorder
         if self._live is not None:
             self._live.go_on(writer)
         if self._frames is not None:
             self._frames.go_on(writer)
-        before.close(self._taken_metadata())
-        self.rotation.finished(left.path)
+        before.close()
+        work.recorders.remove(before)
+        work.ask(self.rotation.finished, left.path)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
+        work = self._work
+        if work.state:
+            work.refuse()
+        work.state = ASKING
         unseeded = seed is None and getattr(self._base, "_np_random", 0) is None
         try:
             result = self.env.reset(seed=seed, options=options)
             state, info = result
             has_facts = seed is not None or options is not None or info or unseeded
-            is_plain = self._plain and not has_facts and not self.rotation.is_due(self._writer)
-            if is_plain and self._recorder.begin_next(state):
-                return result
+            if self._plain and not has_facts and not self.rotation.is_due(self._writer):
+                work.state = BEGUN
+                if self._recorder.begin_next(state):
+                    work.state = DONE
+                    return result
             facts = ResetFacts(
                 seed,
                 drawn_seed(self.env) if unseeded else None,
@@ -276,60 +284,91 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             )
             if self._watches:
                 self._state = copy.deepcopy(state)
+            work.state = BEGUN
             if self.rotation.is_due(self._writer):
                 self._rotate(state)
-            self._recorder.reset(state, facts, self._taken_metadata())
-            if self._frames is not None:
-                self._start_frames()
-        except BaseException:  # wherever the environment is now: the running episode is over
-            self._recorder.forget_reset(self._taken_metadata())
-            if self._frames is not None:
-                self._frames.forget(0)
+            self._recorder.reset(state, facts)
+            self._start_frames()
+            if self._metadata_callback is not None and self._stepped:
+                work.ask(self._metadata_callback.reset)
+        except BaseException as err:
+            if work.is_whole_after(err):  # wherever the environment is now: the running episode is over
+                work.state = BEGUN
+                self._recorder.forget_reset()
+                if self._frames is not None:
+                    self._frames.forget(0)
+                work.state = DONE
+            else:
+                self._writer.stop(err)
             raise
-        if self._metadata_callback is not None and self._stepped:
-            self._metadata_callback.reset()
         self._stepped = False
+        work.state = DONE
         return result
 
     def _start_frames(self) -> None:
         if self._frames is not None:
-            self._frames.start(0, self.env.render())
+            self._frames.start(0, self.env.render)
 
-    def _taken_metadata(self) -> str:
-        metadata, self._episode_metadata[0] = self._episode_metadata[0], "{}"
-        return metadata
-
-    def _watch(
-        self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any, info: dict[str, Any]
-    ) -> None:
-        before, self._state = self._state, copy.deepcopy(state)  # the environment may reuse its arrays
+    def _watch(self, action: Any, result: Any) -> None:
+        """Callbacks, infos and frames of a step."""
+        if not self._watches:
+            return
+        state, reward, terminal, timeout, info = result
+        ask = self._work.ask
+        before, self._state = self._state, ask(copy.deepcopy, state)  # the environment may reuse its arrays
+        if self._recorder.step_index == 0:  # a step that was a reset
+            self._start_frames()
+            return
         self._stepped = True
         if self._infos is not None:
-            entries = self._infos.chosen(info)
+            entries = ask(self._infos.chosen, info)
             if self._step_callback is not None:
-                extra = self._step_callback(Step(before, action, reward, terminal, timeout, info))
+                extra = ask(self._step_callback, Step(before, action, reward, terminal, timeout, info))
                 entries.update(extra or {})
             self._recorder.put_info(entries)
         if self._metadata_callback is not None:
             rl_tuple = RLTuple.model_construct(
                 state=before, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
             )
-            self._episode_metadata[0] = metadata_text(self._metadata_callback(rl_tuple))
+            self._recorder.metadata = ask(metadata_of, self._metadata_callback, rl_tuple)
+        if self._frames is not None:
+            number, step = self._recorder.running
+            self._frames.step(0, number, step, bool(terminal or timeout), self.env.render)
 
-    def _end(self, end: int) -> None:
-        self._recorder.end(end, self._taken_metadata())
+    def _end(self, action: Any, result: Any) -> None:
+        """The end of an episode that a step has ended."""
+        _, _, terminal, timeout, _ = result
+        if not terminal and not timeout:
+            return
+        self._recorder.end(TERMINAL if terminal else TIMEOUT)
         self._stepped = False
         if self._metadata_callback is not None:
-            self._metadata_callback.reset()
+            self._work.ask(self._metadata_callback.reset)
+
+    def _go_on(self, action: Any, result: Any) -> None:
+        """In another file, if this one is full; and with what is to be on the disk."""
+        state, _, terminal, timeout, _ = result
+        if (terminal or timeout) and self.rotation.is_due(self._writer):
+            self._rotate(state)
+        self._writer.flush_if_due()
+        self._writer.sync_step()
+        if self.rotation.is_overdue(self._writer):
+            self._rotate(state)
+            self._start_frames()
 
     def flush(self) -> None:
         """Writes everything recorded so far into chunks; the journal already protects it."""
-        self._writer.flush()
+        self._work.flush()
 
     def close(self) -> None:
-        """Finishes the recording, then closes the environment. Calling it twice is fine."""
+        """Finishes the recording, then closes the environment. Calling it twice is fine.
+
+        Raises:
+            RecordingError: the disk refuses; everything that was recorded is safe.
+        """
         try:
-            self._finalizer()
+            close_recordings(self._work, self._live)
+            self._finalizer.detach()
         finally:
             super().close()
 
@@ -346,8 +385,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         )
 
 
-def metadata_text(metadata: Any) -> str:
-    """What a metadata callback returned, as JSON; RecordingError unless it is a dict of what JSON can hold."""
+def metadata_of(callback: EpisodeMetadataCallback, step: RLTuple) -> str:
+    """What a metadata callback returns, as JSON; RecordingError unless it is a dict of what JSON can hold."""
+    metadata: Any = callback(step)
     if not metadata:
         return "{}"
     if not isinstance(metadata, Mapping):
@@ -358,28 +398,23 @@ def metadata_text(metadata: Any) -> str:
         raise RecordingError(f"metadata_callback: {err}") from err
 
 
-def _close(newest: list[SingleRecorder], metadata: list[str], live: LiveSession | None) -> None:
+def close_recordings(work: Work, live: LiveSession | None) -> None:
+    """Finishes the files, and shows the rest of them."""
     try:
-        newest[0].close(metadata[0])
+        work.close()
     finally:
         if live is not None:
             live.close()
 
 
 def live_session(writer: RecordingWriter, live: str | None, env: Any) -> LiveSession | None:
-    """The live view of a recording that has just been opened; the recording is given up where `live` is wrong."""
+    """The live view of a recording that has just been opened."""
     if live is None:
         return None
     from tupli_mcap.live import open_session
 
     spec = getattr(env, "spec", None)
-    try:
-        return open_session(
-            writer, live, writer.path.name if spec is None else f"{spec.id} {writer.path.name}"
-        )
-    except BaseException:
-        writer.close()
-        raise
+    return open_session(writer, live, writer.path.name if spec is None else f"{spec.id} {writer.path.name}")
 
 
 def _resets_itself(env: gym.Env[Any, Any]) -> bool:

@@ -8,7 +8,7 @@ import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -26,16 +26,14 @@ from tupli_mcap.recording.pictures import FrameFormat, ImageFormat, check_format
 from tupli_mcap.recording.rotation import Rotation
 from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.vector_infos import final_info_of, info_of
-from tupli_mcap.recording.writer import ResetFacts
+from tupli_mcap.recording.work import ASKING, BEGUN, DONE, Work
+from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
-from tupli_mcap.wrappers.single import live_session, metadata_text
+from tupli_mcap.wrappers.single import close_recordings, live_session, metadata_of
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
-
-if TYPE_CHECKING:
-    from tupli_mcap.live import LiveSession
 
 __all__ = ["RecordEpisodes"]
 
@@ -115,25 +113,29 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             format_version=format_version(spaces, image_format),
             image_format=image_format,
         )
-        self._writer = self.rotation.open_first(self._options)
-        try:
-            self._writer.check_spaces(spaces, n, vector=True)
-        except SpaceError:
-            self._writer.close()
-            raise
         watches = wanted or metadata_callback is not None or bool(every)
         plain = not watches and flush_seconds is None and durability != "step"
-        self._recorder = VectorRecorder(
-            self._writer, spaces, n, self._autoreset, self._infos,
-            leaves_to_rows=plain and not self.rotation.limited,
-        )  # fmt: skip
-        self._newest = [self._recorder]
-        self._frames = VectorFrames(self._writer, n, every, frame_format) if every else None
         self._texts = ["{}"] * n
         self._states: list[Any] = []
         self._watches = wanted or metadata_callback is not None
-        self._live = live_session(self._writer, live, env)
-        self._finalizer = weakref.finalize(self, _close, self._newest, self._live)
+        self._work = work = Work()
+        writer: RecordingWriter | None = None
+        try:
+            self._writer = writer = self.rotation.open_first(self._options)
+            self._recorder = VectorRecorder(
+                self._writer, spaces, n, self._autoreset, self._infos,
+                leaves_to_rows=plain and not self.rotation.limited,
+            )  # fmt: skip
+            work.recorders.append(self._recorder)
+            self._writer.check_spaces(spaces, n, vector=True)
+            self._frames = VectorFrames(self._writer, n, every, frame_format, work.ask) if every else None
+            self._live = live_session(self._writer, live, env)
+            self._finalizer = weakref.finalize(self, close_recordings, work, self._live)
+        except BaseException:
+            work.close()
+            if writer is not None:
+                writer.close()
+            raise
 
     @property
     def path(self) -> Path:
@@ -146,72 +148,113 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         return self.rotation.paths
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        work = self._work
+        if work.state:
+            work.refuse()
+        work.state = BEGUN
         try:
             result = self.env.step(actions)
+            states, rewards, terminals, timeouts, infos = result
         except Exception:  # a step that an environment refuses may be no step
+            work.state = DONE
             raise
         except BaseException:  # Ctrl-C: some environments may have taken it
             self._recorder.refuse()
+            work.state = DONE
             raise
-        states, rewards, terminals, timeouts, infos = result
-        if self._writer.closed:
-            raise RecordingError(f"{self.path} is closed; wrap the environment again to record")
-        stepped = self._recorder.put(actions, states, rewards, terminals, timeouts, infos)
         try:
-            if self._watches:
-                self._watch(stepped, actions, result)
-            if self._frames is not None:
-                ended = np.logical_or(terminals, timeouts)
-                self._frames.step(
-                    self._recorder, stepped, ended, self.env.render, same_step=self._autoreset == "SameStep"
-                )
-        finally:  # a callback that raises changes nothing about what the environments did
-            self._recorder.finish(terminals, infos)
+            stepped = self._recorder.put(actions, states, rewards, terminals, timeouts, infos)
+        except StepError:
+            work.state = DONE
+            raise
+        except BaseException as err:
+            self._writer.stop(err)
+            raise
+        refusal = self._finish_step(stepped, actions, result)
+        work.state = DONE
+        if refusal is not None:
+            raise refusal
+        return result
+
+    def _finish_step(self, stepped: Any, actions: Any, result: Any) -> BaseException | None:
+        """Everything that follows a batch's rows; returns what a callback raised, which changes nothing about that."""
+        work, refusal = self._work, None
+        for part in (self._watch, self._film, self._end, self._go_on):
+            try:
+                part(stepped, actions, result)
+            except BaseException as err:
+                if not work.is_whole_after(err):
+                    self._writer.stop(err)
+                    raise
+                refusal = err if refusal is None else refusal
+                work.state = BEGUN
+        return refusal
+
+    def _film(self, stepped: Any, actions: Any, result: Any) -> None:
+        if self._frames is not None:
+            _, _, terminals, timeouts, _ = result
+            ended = np.logical_or(terminals, timeouts)
+            self._frames.step(
+                self._recorder, stepped, ended, self.env.render, same_step=self._autoreset == "SameStep"
+            )
+
+    def _end(self, stepped: Any, actions: Any, result: Any) -> None:
+        """The ends of the episodes that the batch has ended."""
+        _, _, terminals, timeouts, infos = result
+        if self._watches:
+            self._recorder.note_metadata(self._texts)
+        self._recorder.finish(terminals, infos)
+        if self._callbacks is not None:
+            self._work.ask(self._forget, np.flatnonzero(stepped & np.logical_or(terminals, timeouts)))
+
+    def _go_on(self, stepped: Any, actions: Any, result: Any) -> None:
+        """In another file, if this one is full; and with what is to be on the disk."""
         self._writer.flush_if_due()
         self._writer.sync_step()
         if self.rotation.is_due(self._writer):
             running = self._recorder.is_running
             if not running or self.rotation.is_overdue(self._writer):
-                self._rotate(states)
+                self._rotate(result[0])
                 if running and self._frames is not None:
                     self._frames.start(np.ones(self.num_envs, np.bool_), self.env.render)
-        return result
 
     def _rotate(self, states: Any) -> None:
         """Goes on in the next file, with the environments at `states`; episodes that run are cut in two."""
-        before = self._recorder
-        writer = self.rotation.open_next(self._options)
-        try:
-            recorder = VectorRecorder(
-                writer, self._spaces, self.num_envs, self._autoreset, self._infos,
-                leaves_to_rows=before.leaves_to_rows,
-            )  # fmt: skip
-            recorder.go_on_from(before, states)
-        except BaseException:
-            writer.close()
-            raise
-        self._newest[0], left = recorder, self._writer
+        work, before, left = self._work, self._recorder, self._writer
+        writer = work.ask(self.rotation.open_next, self._options)
+        recorder = VectorRecorder(
+            writer, self._spaces, self.num_envs, self._autoreset, self._infos,
+            leaves_to_rows=before.leaves_to_rows,
+        )  # fmt: skip
+        work.recorders.append(recorder)
+        recorder.go_on_from(before, states)
         self._writer, self._recorder = writer, recorder
         if self._live is not None:
             self._live.go_on(writer)
         if self._frames is not None:
             self._frames.go_on(writer)
         before.close()
-        self.rotation.finished(left.path)
+        work.recorders.remove(before)
+        work.ask(self.rotation.finished, left.path)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
+        work = self._work
+        if work.state:
+            work.refuse()
         told = "" if options is None else jsonvalue.dumps_any(options)
         mask = None if options is None else options.get("reset_mask")
         mask = None if mask is None else np.array(mask, dtype=np.bool_)
-        unseeded = [getattr(env.unwrapped, "_np_random", 0) is None for env in self._sub_environments()]
+        work.state = ASKING
         try:
+            unseeded = [getattr(env.unwrapped, "_np_random", 0) is None for env in self._sub_environments()]
             result = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
             states, infos = result
             facts = self._facts(seed, unseeded, told, infos)
             if self._watches:
                 self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
+            work.state = BEGUN
             if mask is None and self.rotation.is_due(self._writer):
                 self._rotate(states)
             self._recorder.reset(states, facts, mask)
@@ -219,11 +262,17 @@ class RecordEpisodes(gym.vector.VectorWrapper):
                 self._frames.start(
                     np.ones(self.num_envs, np.bool_) if mask is None else mask, self.env.render
                 )
-        except BaseException:  # wherever the environments are now: the running episodes are over
-            self._recorder.refuse()
+            if self._watches:
+                work.ask(self._forget, range(self.num_envs) if mask is None else np.flatnonzero(mask))
+        except BaseException as err:
+            if work.is_whole_after(err):  # wherever the environments are now: the running episodes are over
+                work.state = BEGUN
+                self._recorder.refuse()
+                work.state = DONE
+            else:
+                self._writer.stop(err)
             raise
-        if self._watches:
-            self._forget(range(self.num_envs) if mask is None else np.flatnonzero(mask))
+        work.state = DONE
         return result
 
     def _sub_environments(self) -> list[Any]:
@@ -249,24 +298,29 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         return facts
 
     def _watch(self, stepped: Any, actions: Any, result: Any) -> None:
-        states, rewards, terminals, timeouts, infos = result
-        before = self._states
-        self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
+        """Callbacks and infos of a batch."""
+        if self._watches:
+            ask, before = self._work.ask, self._states
+            self._states = ask(self._each_state, result[0])
+            self._recorder.put_infos(stepped, ask(self._asked, before, stepped, actions, result))
+
+    def _each_state(self, states: Any) -> list[Any]:
+        """A copy: the environments may reuse their arrays."""
+        return copy.deepcopy(list(iterate(self.env.observation_space, states)))
+
+    def _asked(self, before: Any, stepped: Any, actions: Any, result: Any) -> list[dict[str, Any]]:
+        """What is to be recorded with the infos, by sub-environment; metadata are in `_texts` afterwards."""
+        _, rewards, terminals, timeouts, infos = result
         entries: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         chosen = list(iterate(self.env.action_space, actions))
-        try:
-            for i in np.flatnonzero(stepped).tolist():
-                info = info_of(infos, i, self.num_envs)
-                if (terminals[i] or timeouts[i]) and self._autoreset == "SameStep":
-                    info = final_info_of(infos, i, self.num_envs)
-                step = Step(before[i], chosen[i], rewards[i], bool(terminals[i]), bool(timeouts[i]), info)
-                entries[i] = self._entries(step)
-                self._call(i, step)
-            self._recorder.put_infos(stepped, entries)
-        finally:
-            self._recorder.note_metadata(self._texts)
-            if self._callbacks is not None:
-                self._forget([i for i in np.flatnonzero(stepped) if terminals[i] or timeouts[i]])
+        for i in np.flatnonzero(stepped).tolist():
+            info = info_of(infos, i, self.num_envs)
+            if (terminals[i] or timeouts[i]) and self._autoreset == "SameStep":
+                info = final_info_of(infos, i, self.num_envs)
+            step = Step(before[i], chosen[i], rewards[i], bool(terminals[i]), bool(timeouts[i]), info)
+            entries[i] = self._entries(step)
+            self._call(i, step)
+        return entries
 
     def _entries(self, step: Step) -> dict[str, Any]:
         entries = {} if self._infos is None else self._infos.chosen(step.info)
@@ -286,7 +340,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             terminal=terminal,
             timeout=timeout,
         )
-        self._texts[i] = metadata_text(self._callbacks[i](rl_tuple))
+        self._texts[i] = metadata_of(self._callbacks[i], rl_tuple)
 
     def _forget(self, chosen: Any) -> None:
         for i in chosen:
@@ -296,14 +350,15 @@ class RecordEpisodes(gym.vector.VectorWrapper):
 
     def flush(self) -> None:
         """Writes everything recorded so far into chunks; the journal already protects it."""
-        self._writer.flush()
+        self._work.flush()
 
     def close(self, **kwargs: Any) -> None:
         """Finishes the recording, then closes the environment. Calling it twice is fine."""
         if "_finalizer" not in self.__dict__:
             return  # collected after its constructor raised: Gymnasium 1.0 closes then, and the caller's env too
         try:
-            self._finalizer()
+            close_recordings(self._work, self._live)
+            self._finalizer.detach()
         finally:
             super().close(**kwargs)
 
@@ -315,14 +370,6 @@ class RecordEpisodes(gym.vector.VectorWrapper):
 
     def __getstate__(self) -> dict[str, Any]:
         raise RecordingError(f"a wrapper that records to {self.path} cannot be pickled or copied; wrap there")
-
-
-def _close(newest: list[VectorRecorder], live: LiveSession | None) -> None:
-    try:
-        newest[0].close()
-    finally:
-        if live is not None:
-            live.close()
 
 
 def _autoreset(env: Any, given: str | None) -> Any:
