@@ -118,6 +118,13 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         self._texts = ["{}"] * n
         self._states: list[Any] = []
         self._watches = wanted or metadata_callback is not None
+        parts = (
+            (RecordEpisodes._watch, self._watches),
+            (RecordEpisodes._film, bool(every)),
+            (RecordEpisodes._end, True),
+            (RecordEpisodes._go_on, True),
+        )
+        self._parts = [part for part, is_wanted in parts if is_wanted]
         self._work = work = Work()
         writer: RecordingWriter | None = None
         try:
@@ -179,9 +186,9 @@ class RecordEpisodes(gym.vector.VectorWrapper):
     def _finish_step(self, stepped: Any, actions: Any, result: Any) -> BaseException | None:
         """Everything that follows a batch's rows; returns what a callback raised, which changes nothing about that."""
         work, refusal = self._work, None
-        for part in (self._watch, self._film, self._end, self._go_on):
+        for part in self._parts:
             try:
-                part(stepped, actions, result)
+                part(self, stepped, actions, result)
             except BaseException as err:
                 if not work.is_whole_after(err):
                     self._writer.stop(err)
@@ -299,10 +306,9 @@ class RecordEpisodes(gym.vector.VectorWrapper):
 
     def _watch(self, stepped: Any, actions: Any, result: Any) -> None:
         """Callbacks and infos of a batch."""
-        if self._watches:
-            ask, before = self._work.ask, self._states
-            self._states = ask(self._each_state, result[0])
-            self._recorder.put_infos(stepped, ask(self._asked, before, stepped, actions, result))
+        ask, before = self._work.ask, self._states
+        self._states = ask(self._each_state, result[0])
+        self._recorder.put_infos(stepped, ask(self._asked, before, stepped, actions, result))
 
     def _each_state(self, states: Any) -> list[Any]:
         """A copy: the environments may reuse their arrays."""
