@@ -40,7 +40,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli import app
 from tupli_mcap.doctor import examine
-from tupli_mcap.environment import scan_pickle
+from tupli_mcap.environment import named_imports
 from tupli_mcap.messages import encoder
 from tupli_mcap.recording.carried import carried_code
 from tupli_mcap.recording.describe import describe
@@ -251,7 +251,7 @@ def _attachments(recording: Recording) -> None:
 
 def _benchmark(recording: Recording) -> None:
     benchmark = recording.benchmark
-    scan_pickle(benchmark.record.pickle or b"")
+    named_imports(benchmark.record.pickle or b"")
     repr((benchmark, benchmark.needs_trust, benchmark.voucher))
     benchmark.make_env()
     raise AssertionError("the environment was built")
@@ -357,7 +357,7 @@ def main(corpus: Path, target: Path) -> None:
                 trap.armed = False
 
     # Lazy imports of our own first, on a harmless file: what is imported after that was named by a file.
-    scan_pickle(b"Vx\n.")  # the codecs of texts in pickles
+    named_imports(b"Vx\n.")  # the codecs of texts in pickles
     rich.cells.get_character_cell_size("\N{HORIZONTAL ELLIPSIS}")  # tables of characters' widths
     warm = target / "warm"
     warm.mkdir()

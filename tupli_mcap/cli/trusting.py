@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +12,7 @@ from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import bytes_of, print_facts, print_json
 
 if TYPE_CHECKING:
-    from tupli_mcap.environment import PickleScan
+    from tupli_mcap.environment import PickleImports
     from tupli_mcap.recording.carried import CarriedCode
 
 __all__ = ["register"]
@@ -29,7 +30,7 @@ def _trust(
     file: Annotated[
         Path | None, typer.Argument(metavar="[FILE]", help="A recording.", readable=False)
     ] = None,
-    show: Annotated[bool, typer.Option("--show", help="Only show what would run.")] = False,
+    show: Annotated[bool, typer.Option("--show", help="Only show what the file says of it.")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Trust it no longer.")] = False,
     key: Annotated[
         str | None,
@@ -41,8 +42,8 @@ def _trust(
 ) -> None:
     """Let the environment in a file be rebuilt.
 
-    Rebuilding it may run code that came with the file, as this user, on this machine. --show tells what,
-    without running it: a pickle is followed instruction by instruction. It cannot tell that code is harmless.
+    Rebuilding it may run code that came with the file, as this user, on this machine. --show tells what the
+    file says of that code, and runs nothing: of a pickle, the names that it imports. They prove nothing.
     Reading the episodes of a file needs no trust. Only this user's processes trust it from then on; one
     changed byte of the environment ends that. --key trusts every environment that somebody signs, see
     bundle --sign.
@@ -128,12 +129,9 @@ def _list(*, as_json: bool) -> None:
 
 
 def _json_of(code: CarriedCode) -> dict[str, Any]:
-    scan = None
-    if code.scan is not None:
-        scan = {**code.scan._asdict(), "imports": [one._asdict() for one in code.scan.imports]}
-        scan["suspicious"] = code.scan.suspicious
+    imports = None if code.imports is None else code.imports._asdict()
     entry_points = [one._asdict() for one in code.entry_points]
-    return {**code._asdict(), "entry_points": entry_points, "scan": scan}
+    return {**code._asdict(), "entry_points": entry_points, "imports": imports}
 
 
 def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
@@ -149,7 +147,7 @@ def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
         *([("spec", code.spec)] if code.spec else []),
         *((one.of, f"{one.name}{_registered(one.name, one.here)}") for one in code.entry_points),
         *([("classes", ", ".join(code.classes))] if code.classes else []),
-        *(_facts_of_scan(code.scan) if code.scan is not None else []),
+        *(_facts_of_pickle(code.imports) if code.imports is not None else []),
         ("made with", ", ".join(f"{name} {version}" for name, version in code.versions.items())),
         ("digest", code.digest),
         *([("foreign", "; ".join(code.foreign))] if code.foreign and code.kind == "spec" else []),
@@ -176,20 +174,13 @@ def _registered(name: str, here: str | None) -> str:
     return " (as registered here)" if here == name else f" (registered here: {here})"
 
 
-def _facts_of_scan(scan: PickleScan) -> list[tuple[str, str]]:
-    facts = []
-    for verdict in ("dangerous", "unknown", "known"):
-        names = [str(found) for found in scan.imports if found.verdict == verdict]
-        facts.append((f"imports, {verdict}", _several(names)))
-    facts += [
-        ("calls", _several(scan.calls)),
-        ("own code", _several([*(f"class {name}" for name in scan.classes), *scan.functions])),
-        ("it mentions", _several(scan.uses)),
-        ("not followed", _several(scan.problems)),
-    ]
-    return [(label, text) for label, text in facts if text]
+def _facts_of_pickle(imports: PickleImports) -> list[tuple[str, str]]:
+    from tupli_mcap.environment import WHAT_LOADING_DOES
+
+    facts = [("warning", WHAT_LOADING_DOES), ("imports", _several(imports.names))]
+    return [*facts, ("not listed", _several(imports.gaps))] if imports.gaps else facts
 
 
-def _several(texts: Any) -> str:
+def _several(texts: Sequence[str]) -> str:
     shown = ", ".join(texts[:_SHOWN])
     return shown if len(texts) <= _SHOWN else f"{shown} and {len(texts) - _SHOWN} more (--json lists them)"

@@ -3,22 +3,22 @@
 from tupli_mcap.environment._build import build, reasons_for_distrust
 from tupli_mcap.environment._capture import Snapshot, capture, record_environment
 from tupli_mcap.environment._docs import documented_labels
+from tupli_mcap.environment._imports import WHAT_LOADING_DOES, PickleImports, named_imports
 from tupli_mcap.environment._pickling import rebuild_ezpickled
 from tupli_mcap.environment._record import EnvironmentRecord, canonical_json, sha256
-from tupli_mcap.environment._scan import PickleImport, PickleScan, scan_pickle
 
 __all__ = [
+    "WHAT_LOADING_DOES",
     "EnvironmentRecord",
-    "PickleImport",
-    "PickleScan",
+    "PickleImports",
     "Snapshot",
     "build",
     "canonical_json",
     "capture",
     "documented_labels",
+    "named_imports",
     "reasons_for_distrust",
     "rebuild_ezpickled",
     "record_environment",
-    "scan_pickle",
     "sha256",
 ]

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import gymnasium as gym
 
 from tupli_mcap import trust
-from tupli_mcap.environment import PickleScan, reasons_for_distrust, scan_pickle
+from tupli_mcap.environment import PickleImports, named_imports, reasons_for_distrust
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.signed import claimed_signer
@@ -33,8 +33,8 @@ class EntryPoint(NamedTuple):
 class CarriedCode(NamedTuple):
     """An environment in a recording, as the file tells of it (`name`, `classes` and `versions` are claims).
 
-    kind: "spec" (its JSON text is `spec`, the code it names `entry_points`) or "pickle" (of `size` bytes, what
-        loading it would do is `scan`).
+    kind: "spec" (its JSON text is `spec`, the code it names `entry_points`) or "pickle" (of `size` bytes, whose
+        instructions name `imports`; it may import and run anything).
     foreign: what would run that this machine does not know; empty if it needs no trust.
     needs_trust: whether it is built only where somebody trusts it. trusted: whether this user trusts the digest,
         or the key that signed it.
@@ -47,7 +47,7 @@ class CarriedCode(NamedTuple):
     spec: str
     entry_points: list[EntryPoint]
     size: int
-    scan: PickleScan | None
+    imports: PickleImports | None
     classes: tuple[str, ...]
     versions: dict[str, str]
     digest: str
@@ -78,7 +78,7 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
         spec="" if spec is None else json.dumps(spec),
         entry_points=[] if spec is None else _entry_points(spec),
         size=len(record.pickle or b""),
-        scan=None if record.pickle is None else scan_pickle(record.pickle),
+        imports=None if record.pickle is None else named_imports(record.pickle),
         classes=record.classes,
         versions=dict(record.versions),
         digest=record.digest,
