@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 from tupli_mcap import (
     EpisodeData,
     FileStorage,
-    FormatError,
     RecordEpisodes,
     Recording,
     RecordingError,
@@ -33,15 +32,7 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.recording.attach import add_attachments
 from tupli_mcap.recording.repair import recover_recording
-from tupli_mcap.replay import (
-    CERTIFICATE_NAME,
-    Certificate,
-    certify,
-    covers,
-    read_certificate,
-    values,
-    write_certificate,
-)
+from tupli_mcap.replay import Certificate, certify, values
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
 SCHEMA = jsonschema.Draft202012Validator(
@@ -315,64 +306,34 @@ def test_rewriting_keeps_what_replaying_needs(tmp_path: Path) -> None:
     check_complete(certify(tmp_path / "b.mcap"))
 
 
-# --- the certificate in the file ---
+# --- the certificate ---
 
 
-def test_a_certificate_is_added_and_nothing_else_changes(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with RecordEpisodes(gym.make("CartPole-v1"), path, compression="lz4") as env:
-        roll(env, 100)
-    path.chmod(0o640)
-    before = path.read_bytes()
-    certificate = certify(path)
-    write_certificate(path, certificate)
-    after = path.read_bytes()
-    with Recording(path) as recording:
-        assert read_certificate(recording) == certificate
-        assert covers(certificate, recording)
-        assert recording.complete
-        SCHEMA.validate(json.loads(recording.read_attachment(CERTIFICATE_NAME)))
-        end = recording._contents.attachments[CERTIFICATE_NAME].offset
-        assert after[:end] == before[:end]
-    assert path.stat().st_mode & 0o777 == 0o640
-    write_certificate(path, certificate)  # in place of the one before
-    assert len(path.read_bytes()) == len(after)
-    assert list(tmp_path.iterdir()) == [path]
-    check_complete(certify(path))
-
-
-def test_a_certificate_is_of_the_episodes_it_was_made_of(tmp_path: Path) -> None:
+def test_a_certificate_tells_which_episodes_it_is_of(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 50)
-    certificate = certify(path)
-    write_certificate(path, certificate)
-    record(path, gym.make("CartPole-v1"), 50, seed=2, mode="a")
+    before = certify(path)
+    SCHEMA.validate(json.loads(before.to_json()))
     with Recording(path) as recording:
-        carried = read_certificate(recording)
-        assert carried == certificate
-        assert not covers(certificate, recording)
         rewrite_recording(recording, tmp_path / "b.mcap")
-    with pytest.raises(RecordingError, match="expected a certificate of its .* replay it again"):
-        write_certificate(path, certificate)
-    again = certify(path)
-    write_certificate(path, again)
-    with Recording(path) as recording, Recording(tmp_path / "b.mcap") as copy:
-        assert read_certificate(recording) == again
-        assert covers(again, recording) and covers(again, copy)
+    assert certify(tmp_path / "b.mcap").content_sha256 == before.content_sha256
+    record(path, gym.make("CartPole-v1"), 50, seed=2, mode="a")
+    after = certify(path)
+    assert after.recording == before.recording
+    assert after.content_sha256 != before.content_sha256
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (b"{}", "no replay certificate"),
-        (b"\xff", "no replay certificate"),
-        (b'{"format": "tupli_mcap.replay_certificate", "version": 2}', "version"),
-    ],
+    "text", [b"{}", b"\xff", b'{"format": "tupli_mcap.replay_certificate", "version": 2}']
 )
-def test_a_forged_certificate_is_a_format_error(tmp_path: Path, text: bytes, message: str) -> None:
+def test_a_certificate_in_a_file_is_an_attachment_like_any_other(tmp_path: Path, text: bytes) -> None:
     path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 20)
-    add_attachments(path, {CERTIFICATE_NAME: ("application/json", text)})
-    with Recording(path) as recording, pytest.raises(FormatError, match=message):
-        read_certificate(recording)
+    add_attachments(path, {"replay-certificate.json": ("application/json", text)})
+    for command in (["info"], ["verify", "--replay"], ["episodes"]):
+        code, out, err = run(*command, path)
+        assert (code, err) == (0, ""), command
+        assert "\ncertificate" not in out
+    assert "replay-certificate.json" in run("info", path)[1]
+    check_complete(certify(path))
 
 
 def test_nothing_is_attached_to_an_unfinished_recording(tmp_path: Path) -> None:
@@ -382,11 +343,11 @@ def test_nothing_is_attached_to_an_unfinished_recording(tmp_path: Path) -> None:
     certificate = certify(path)  # a live recording can be replayed as far as it is
     assert certificate.agrees
     with pytest.raises(RecordingError, match="is being recorded by another writer"):
-        write_certificate(path, certificate)
+        add_attachments(path, {"a.json": ("application/json", b"{}")})
     env.close()
 
 
-def test_a_storage_sees_its_recording_with_the_certificate(tmp_path: Path) -> None:
+def test_a_certificate_names_the_benchmark(tmp_path: Path) -> None:
     storage = FileStorage(tmp_path / "lab")
     env = TupliEnvWrapper(gym.make("CartPole-v1"), storage)
     env.reset(seed=5)
@@ -395,15 +356,9 @@ def test_a_storage_sees_its_recording_with_the_certificate(tmp_path: Path) -> No
     env.close()
     path = env.recording_path
     assert path is not None
-    before = storage.list_episodes()
     certificate = certify(path)
     check_complete(certificate)
     assert certificate.benchmark_id == env.id
-    write_certificate(path, certificate)
-    assert storage.list_episodes() == before
-    bundle = storage.bundle(str(env.id), tmp_path / "bundle.mcap")
-    with Recording(bundle) as recording:
-        assert read_certificate(recording) == certificate
 
 
 def test_a_repaired_recording_keeps_what_replaying_needs(tmp_path: Path) -> None:
@@ -622,21 +577,14 @@ def test_verify_replay(tmp_path: Path) -> None:
     assert (code, err) == (0, "")
     assert f"{path}: all {episodes} episodes (100 steps) agree bit for bit\n  replayed in" in out
     assert path.read_bytes() == before
-    code, out, err = run("verify", "--replay", "--write-certificate", "--json", path)
+    code, out, err = run("verify", "--replay", "--json", path)
     assert (code, err) == (0, "")
-    document = json.loads(out)
-    with Recording(path) as recording:
-        certificate = read_certificate(recording)
-    assert certificate is not None
-    (told,) = document["replays"]
-    assert told == {"path": str(path), "agrees": True, **json.loads(certificate.to_json())}
-    assert run("verify", path)[0] == 0
-    code, out, _ = run("info", path)
-    assert f"certificate  says that all {episodes} episodes (100 steps) agree bit for bit" in out
-    record(path, gym.make("CartPole-v1"), 10, mode="a")
-    assert "of other episodes than are in the file now" in run("info", path)[1]
-    assert json.loads(run("info", path, "--json")[1])["certificate"]["covers"] is False
-    assert run("verify", path)[0] == 0
+    (told,) = json.loads(out)["replays"]
+    assert (told.pop("path"), told.pop("agrees")) == (str(path), True)
+    SCHEMA.validate(told)
+    certificate = json.loads(certify(path).to_json())
+    assert told == {**certificate, "created_ns": told["created_ns"]}
+    assert path.read_bytes() == before
 
 
 def test_verify_replay_of_what_differs_or_cannot_be_replayed(
@@ -663,21 +611,11 @@ def test_verify_replay_of_what_differs_or_cannot_be_replayed(
     assert run("verify", "--replay", "--trust", pickled)[0] == 0
 
 
-@pytest.mark.parametrize(
-    "args", [["--trust"], ["--write-certificate"], ["--episodes", "1"], ["--replay", "--episodes", "1-x"]]
-)
+@pytest.mark.parametrize("args", [["--trust"], ["--episodes", "1"], ["--replay", "--episodes", "1-x"]])
 def test_options_that_make_no_sense(tmp_path: Path, args: list[str]) -> None:
     code, out, err = run("verify", *args, tmp_path / "a.mcap")
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
-
-
-def test_an_unreadable_certificate_does_not_hide_the_rest(tmp_path: Path) -> None:
-    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 20)
-    add_attachments(path, {CERTIFICATE_NAME: ("application/json", b"[]")})
-    code, out, _ = run("info", path)
-    assert code == 0
-    assert "certificate  unreadable:" in out and "CartPole-v1" in out
 
 
 @pytest.mark.parametrize("block", [1, 500, 5000])
@@ -704,7 +642,6 @@ def test_kept_resets_are_nothing_that_verify_minds(tmp_path: Path) -> None:
         with RecordEpisodes(inner, path, mode="a" if path.exists() else "x") as env:
             env.reset(seed=seed)
             roll(env, 10, seed=None)
-    write_certificate(path, certify(path))
     code, out, err = run("verify", path)
     assert (code, err) == (0, "")
     assert out.startswith(f"{path}: ok")

@@ -47,7 +47,7 @@ from tupli_mcap.recording.describe import describe
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.signature import check_signature
 from tupli_mcap.recording.verify import verify_recording
-from tupli_mcap.replay import certify, read_certificate, render
+from tupli_mcap.replay import certify, render
 from tupli_mcap.viewer.companions import write_companions
 
 # Starting programs, networks, native code, other processes: never, whatever the arguments are.
@@ -218,7 +218,6 @@ def _facts(recording: Recording) -> None:
     describe(recording)
     repr((recording, recording.metadata, recording.all_metadata(), recording.observation_space))
     check_signature(recording)
-    read_certificate(recording)
     _tolerant(lambda: recording.labels)
 
 

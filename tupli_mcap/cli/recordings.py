@@ -26,7 +26,6 @@ from tupli_mcap.cli.output import (
     time_of,
     when,
 )
-from tupli_mcap.cli.replaying import carried_certificate
 from tupli_mcap.cli.sparklines import print_sketch
 
 if TYPE_CHECKING:
@@ -228,16 +227,12 @@ def _info(
 
     with Recording(file) as recording:
         description = describe(recording)
-        replayed = carried_certificate(recording)
         if not as_json:
-            print_facts(
-                [*_facts(description), *([] if replayed is None else [("certificate", str(replayed))])]
-            )
+            print_facts(_facts(description))
             print_sketch(recording)
     if as_json:
         channels = [channel._asdict() for channel in description.channels]
-        certificate = {} if replayed is None else {"certificate": replayed._asdict()}
-        print_json({**asdict(description), "channels": channels, **_spreads(description), **certificate})
+        print_json({**asdict(description), "channels": channels, **_spreads(description)})
         return
     if description.channels:
         print()

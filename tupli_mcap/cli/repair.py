@@ -48,9 +48,6 @@ def _verify(
     trust: Annotated[
         bool, typer.Option("--trust", help="With --replay: run the code that the files carry.")
     ] = False,
-    write: Annotated[
-        bool, typer.Option("--write-certificate", help="With --replay: write the result into the file.")
-    ] = False,
     episodes: Annotated[
         str | None, typer.Option(metavar="NUMBERS", help="With --replay: only these, such as 0,4,10-19.")
     ] = None,
@@ -65,9 +62,9 @@ def _verify(
     --replay rebuilds the environment of each recording, takes every episode again with its seed, options and
     actions, and says where something differs. Exit code 1 if something does, or nothing could be checked.
     """
-    replays = Replays(trust, episode_numbers(episodes), write) if replay else None
-    if replays is None and (trust or write or episodes is not None):
-        raise typer.BadParameter("--trust, --write-certificate and --episodes go with --replay")
+    replays = Replays(trust, episode_numbers(episodes)) if replay else None
+    if replays is None and (trust or episodes is not None):
+        raise typer.BadParameter("--trust and --episodes go with --replay")
     from tupli_mcap.storage.verify import StorageReport, verify_paths
 
     found = StorageReport()

@@ -1,4 +1,4 @@
-"""What `verify --replay` prints, and `info` of a certificate."""
+"""What `verify --replay` prints."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ import textwrap
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from tupli_mcap.cli.output import counted, number, step_progress, terminal_width, time_of, visible
-from tupli_mcap.errors import FormatError, TupliError
+from tupli_mcap.cli.output import counted, number, step_progress, terminal_width, visible
+from tupli_mcap.errors import TupliError
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording import Recording
     from tupli_mcap.replay import Certificate
 
-__all__ = ["Replays", "carried_certificate", "episode_numbers"]
+__all__ = ["Replays", "episode_numbers"]
 
 _SHOWN = 5  # diverging episodes beside the first; what is beyond is in --json
 _MAX_NUMBERS = 10_000_000
@@ -43,10 +42,9 @@ def episode_numbers(text: str | None) -> list[int] | None:
 class Replays:
     """Recordings replayed one after another; one that cannot be stops nothing."""
 
-    def __init__(self, trust: bool, episodes: Sequence[int] | None, write: bool) -> None:
+    def __init__(self, trust: bool, episodes: Sequence[int] | None) -> None:
         self._trust = trust
         self._episodes = episodes
-        self._write = write
         self._found: list[tuple[Path, Certificate | None, str]] = []
 
     @property
@@ -63,15 +61,13 @@ class Replays:
     def add(self, path: Path, *, quiet: bool) -> None:
         """Replays a recording; says the outcome unless `quiet`."""
         from tupli_mcap.recording import Recording
-        from tupli_mcap.replay import certify, write_certificate
+        from tupli_mcap.replay import certify
 
         began = time.perf_counter()
         try:
             with Recording(path) as recording, step_progress(recording.num_steps, "replaying") as progress:
                 found = certify(recording, trust=self._trust, episodes=self._episodes, progress=progress)
             seconds = time.perf_counter() - began
-            if self._write:
-                write_certificate(path, found)
         except TupliError as err:
             self._found.append((path, None, str(err)))
             if not quiet:
@@ -79,7 +75,7 @@ class Replays:
             return
         self._found.append((path, found, ""))
         if not quiet:
-            _print_lines(f"{path}: {_outcome(found)}", _lines(found, seconds, written=self._write))
+            _print_lines(f"{path}: {_outcome(found)}", _lines(found, seconds))
 
     def to_json(self) -> list[dict[str, Any]]:
         return [
@@ -87,39 +83,6 @@ class Replays:
             | ({"error": error} if found is None else {"agrees": found.agrees, **found.model_dump()})
             for path, found, error in self._found
         ]
-
-
-class CarriedCertificate(NamedTuple):
-    """What a file says of its replaying; `error` where that cannot be read."""
-
-    agrees: bool
-    complete: bool
-    covers: bool
-    created_ns: int
-    text: str
-    error: str = ""
-
-    def __str__(self) -> str:
-        if self.error:
-            return f"unreadable: {self.error}"
-        stale = "" if self.covers else "; of other episodes than are in the file now"
-        return f"says that {self.text}, {time_of(self.created_ns)}{stale}; verify --replay checks it"
-
-
-def carried_certificate(recording: Recording) -> CarriedCertificate | None:
-    """The certificate of a recording, None if it carries none."""
-    from tupli_mcap.replay import CERTIFICATE_NAME, covers, read_certificate
-
-    if CERTIFICATE_NAME not in recording.attachments:
-        return None
-    try:
-        found = read_certificate(recording)
-    except FormatError as err:
-        return CarriedCertificate(False, False, False, 0, "", str(err))
-    if found is None:
-        return None
-    known = covers(found, recording)
-    return CarriedCertificate(found.agrees, found.complete, known, found.created_ns, _outcome(found)[:200])
 
 
 def _print_lines(head: str, lines: Sequence[str]) -> None:
@@ -142,7 +105,7 @@ def _outcome(c: Certificate) -> str:
     return f"{number(c.agreed.episodes)} of {counted(c.recorded.episodes, 'episode')} ({steps}) agree bit for bit"
 
 
-def _lines(c: Certificate, seconds: float, *, written: bool) -> list[str]:
+def _lines(c: Certificate, seconds: float) -> list[str]:
     lines = []
     first = c.first
     if first is not None:
@@ -165,7 +128,7 @@ def _lines(c: Certificate, seconds: float, *, written: bool) -> list[str]:
     versions = ", ".join(f"{name} {version}" for name, version in c.versions.items())
     machine = " ".join(c.platform.get(name, "") for name in ("system", "machine")).strip()
     lines.append(f"replayed in {seconds:.1f} s on {c.environment} with {versions}, {machine}")
-    return [*lines, "the certificate is in the file"] if written else lines
+    return lines
 
 
 def _spread(first: Any) -> list[str]:

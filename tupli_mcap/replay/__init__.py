@@ -1,12 +1,10 @@
 """Recordings replayed: the environment rebuilt, every episode taken again, and compared bit for bit."""
 
-from tupli_mcap.replay.carried import CERTIFICATE_NAME, covers, read_certificate, write_certificate
 from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, Skipped
 from tupli_mcap.replay.certify import certify
 from tupli_mcap.replay.render import RenderedEpisode, RenderReport, render
 
 __all__ = [
-    "CERTIFICATE_NAME",
     "Certificate",
     "Counts",
     "Divergence",
@@ -14,8 +12,5 @@ __all__ = [
     "RenderedEpisode",
     "Skipped",
     "certify",
-    "covers",
-    "read_certificate",
     "render",
-    "write_certificate",
 ]

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
-from tupli_mcap.errors import FormatError
+from pydantic import BaseModel, ConfigDict, Field
 
 __all__ = ["Certificate", "Counts", "Divergence", "SkipKind", "Skipped"]
 
@@ -132,17 +130,3 @@ class Certificate(_Model):
     def to_json(self) -> bytes:
         """The certificate as UTF-8 JSON."""
         return self.model_dump_json(indent=2).encode()
-
-    @classmethod
-    def from_json(cls, data: bytes, *, where: str = "replay-certificate.json") -> Certificate:
-        """Reads what `to_json` wrote.
-
-        Raises:
-            FormatError: it is no certificate.
-        """
-        try:
-            return cls.model_validate_json(data)
-        except ValidationError as err:
-            first = err.errors(include_url=False, include_input=False)[0]
-            place = ".".join(str(part) for part in first["loc"]) or "the document"
-            raise FormatError(f"{where}: no replay certificate: {place}: {first['msg']}") from err
