@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import bytes_of, print_facts, print_json
+from tupli_mcap.cli.output import bytes_of, print_facts, print_json, visible
 
 if TYPE_CHECKING:
     from tupli_mcap.environment import PickleImports
@@ -77,7 +77,7 @@ def _trust_key(text: str, name: str | None, *, as_json: bool) -> None:
     if as_json:
         print_json({"fingerprint": fingerprint(key.public_key), "name": name or key.name})
     else:
-        print(f"what {fingerprint(key.public_key)} {name or key.name} signs is trusted")
+        print(visible(f"what {fingerprint(key.public_key)} {name or key.name} signs is trusted"))
 
 
 def _untrust(
@@ -125,7 +125,7 @@ def _list(*, as_json: bool) -> None:
         return
     lines = [f"environment  {digest}" for digest in digests]
     lines += [f"key          {key['fingerprint']} {key['name']}" for key in keys]
-    print("\n".join(lines) or "nothing is trusted")
+    print("\n".join(map(visible, lines)) or "nothing is trusted")
 
 
 def _json_of(code: CarriedCode) -> dict[str, Any]:
