@@ -167,6 +167,28 @@ def test_keys_are_found_by_name_and_fingerprint(tmp_path: Path, alice: signing.S
         signing.find_key("alice")
 
 
+def test_a_bare_word_is_no_file(bundle: Path, tmp_path: Path, alice: signing.SigningKey) -> None:
+    """An unpacked folder may hold a file of the name of somebody the user knows."""
+    (tmp_path / "bob").write_text((tmp_path / "alice.pub").read_text())
+    with pytest.raises(NotFoundError, match=r"no trusted key 'bob' .* as FILE\.pub or \./FILE"):
+        signing.find_key("bob")
+    assert fails("import", bundle, "--require-signature", "--from", "bob").startswith(
+        "there is no trusted key"
+    )
+    assert not Path("_local_storage").exists()
+    for text in ("./bob", str(tmp_path / "bob"), "alice.pub"):
+        assert signing.find_key(text).public_key == alice.public_key
+
+
+def test_the_comment_of_a_key_moves_no_cursor(tmp_path: Path, alice: signing.SigningKey) -> None:
+    text = (tmp_path / "alice.pub").read_text().split()
+    comment = "alice\x1b[2K\r what SHA256:HARMLESS alice\x9b2J\u202e"
+    (tmp_path / "evil.pub").write_text(f"{text[0]} {text[1]} {comment}\n")
+    shown = ok("trust", "--key", "evil.pub") + ok("trust", "--list")
+    assert shown.count(signing.fingerprint(alice.public_key)) == 2
+    assert all(line.isprintable() for line in shown.split("\n"))
+
+
 # --- signatures ---
 
 
@@ -408,9 +430,11 @@ def test_on_the_command_line(
     assert not Path("lab").exists()
     assert f"\nsigned by    {mark} (not checked)\n" in ok("info", bundle)
     assert re.search(rf"signed by +{re.escape(mark)}\ntrusted +no\n$", ok("trust", bundle, "--show"))
-    assert ok("import", bundle, "--storage", "other", "--from", "alice.pub").startswith(
-        "imported 3 of 3 episodes"
-    )
+    out = ok("import", bundle, "--storage", "other", "--from", "alice.pub")
+    assert out.startswith("imported 3 of 3 episodes")
+    assert re.search(rf"^signed by +{re.escape(mark)}$", out, re.MULTILINE)
+    told = run("import", bundle, "--storage", "other", "--from", "alice.pub", "--json").json
+    assert told["signed_by"] == mark
     assert run("trust", "--key", "alice.pub", "--name", "Alice", "--json").json == {
         "fingerprint": mark,
         "name": "Alice",

@@ -112,6 +112,9 @@ def read_public_key(text: str, where: str = "the key") -> trust.TrustedKey:
 def find_key(text: str) -> trust.TrustedKey:
     """A public key, given as the name or fingerprint of a trusted one, as the path of its file, or itself.
 
+    A bare word is a name and never a file, unless it ends in `.pub`: somebody else may have put a file of that name
+    into the working directory.
+
     Raises:
         NotFoundError: it is none of these, or several trusted keys have the name.
         SignatureError: the file holds something else.
@@ -126,12 +129,18 @@ def find_key(text: str) -> trust.TrustedKey:
     if text.startswith("ssh-") or "-----BEGIN" in text:
         return read_public_key(text)
     path = Path(text)
-    if _FINGERPRINT.match(text) or not path.is_file():
+    if not _is_path(text) or not path.is_file():
         raise NotFoundError(
             f"there is no trusted key {text!r} and no file of that name; `tupli-mcap trust --key FILE.pub --name NAME` "
-            "adds one"
+            "adds one (a file is given as FILE.pub or ./FILE)"
         )
     return read_public_key(_read(path).decode("utf-8", "replace"), str(path))
+
+
+def _is_path(text: str) -> bool:
+    return not _FINGERPRINT.match(text) and (
+        text.endswith(".pub") or os.sep in text or (os.altsep or os.sep) in text
+    )
 
 
 def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:

@@ -121,9 +121,11 @@ def _import(
     create = not dry_run
     required = require_signature or bool(signers)
     keys = [find_key(text).public_key for text in signers or ()]
+    signed_by: str | None = None
     if required:  # before a storage is made
         with Recording(file) as recording:
-            bundles.checked_signature(recording, required, keys)
+            signature = bundles.checked_signature(recording, required, keys)
+            signed_by = None if signature is None else signature.fingerprint
     with (
         open_storage(storage_path, create=create)
         if create or storage_path.is_dir()
@@ -133,14 +135,15 @@ def _import(
         if storage is not None and not dry_run:
             storage.import_bundle(file, trust=trust, require_signature=required, signers=keys)
     if as_json:
-        print_json({"dry_run": dry_run, **preview._asdict()})
+        print_json({"dry_run": dry_run, **preview._asdict(), "signed_by": signed_by})
         return
     verb = "would import" if dry_run else "imported"
     print(
         f"{verb} {number(preview.new_episodes)} of {counted(preview.episodes, 'episode')}, "
         f"{number(preview.new_artifacts)} of {counted(preview.artifacts, 'artifact')}"
     )
-    print_facts([("benchmark", preview.benchmark_id), ("name", preview.name)])
+    signer = [("signed by", signed_by)] if signed_by is not None else []
+    print_facts([("benchmark", preview.benchmark_id), ("name", preview.name), *signer])
 
 
 def _signing_key(path: Path) -> SigningKey:
