@@ -223,6 +223,23 @@ class TestRecord:
             columns = recording.read()
             np.testing.assert_array_equal(columns.actions, columns.states[:, 2] > 0)
 
+    @pytest.mark.parametrize(
+        ("args", "ran"),
+        [
+            (["CartPole-v1"], []),
+            (["CartPole-v1", "--policy", "left:act"], ["ran_left"]),
+            (["left:CartPole-v1"], ["ran_left"]),
+        ],
+    )
+    def test_files_that_lie_here_replace_no_installed_module(
+        self, here: Path, args: list[str], ran: list[str]
+    ) -> None:
+        for name in ("pygame", "PIL", "left"):
+            Path(f"{name}.py").write_text(f"open('ran_{name}', 'w').close()\ndef act(state): return 0\n")
+        done = tool("record", *args, "-o", "a.mcap", "--steps", "3", "--frames", cwd=here)
+        assert (done.code, done.err) == (0, "")
+        assert [path.name for path in here.glob("ran_*")] == ran
+
     def test_policies_that_do_not_import(self, here: Path) -> None:
         line = fails("record", "CartPole-v1", "-o", "a.mcap", "--policy", "no_such_module:act")
         assert line == (

@@ -114,7 +114,8 @@ def _record(
 ) -> None:
     """Record rollouts of an environment.
 
-    Modules (of a policy, or an ENV_ID such as my_envs:Maze-v0) are looked for in the current directory too.
+    Modules (of a policy, or an ENV_ID such as my_envs:Maze-v0) are looked for in the current directory too,
+    after the installed ones.
     Ctrl-C ends the recording early; what was recorded stays.
     """
     if every > 1 and not frames:
@@ -125,7 +126,8 @@ def _record(
         )  # no window is opened: pygame need not look for a screen
     from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
-    sys.path.insert(0, "")  # as `python -m` has it
+    if policy is not None or ":" in env_id:
+        sys.path.append("")  # last: a file that happens to lie here replaces no installed module
     function = None if policy is None else load_policy(policy)
     with step_progress(steps) as progress:
         summary = record_rollouts(
