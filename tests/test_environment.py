@@ -385,6 +385,43 @@ def test_arguments_that_may_name_files_or_code_need_trust() -> None:
         build(record, trust=True)
 
 
+def test_numbers_that_may_fill_the_memory_need_trust() -> None:
+    spec = dict(capture(gym.make("CartPole-v1")).spec or {})
+
+    def stacked(size: int) -> EnvironmentRecord:
+        entry_point = "gymnasium.wrappers.stateful_observation:FrameStackObservation"
+        stack = {"name": "F", "entry_point": entry_point, "kwargs": {"stack_size": size}}
+        return EnvironmentRecord("CartPole-v1", spec={**spec, "additional_wrappers": [stack]})
+
+    assert build(stacked(4)).observation_space.shape == (4, 4)
+    with pytest.raises(
+        UntrustedError, match="'stack_size' of the wrapper 'F', which holds 100000000 and may be a size"
+    ):
+        build(stacked(10**8))
+    for value in (1 << 21, -(1 << 21), [[1], {"a": 1 << 400}]):
+        with pytest.raises(UntrustedError, match="the argument 'length', which holds .* may be a size"):
+            build(EnvironmentRecord("CartPole-v1", spec={**spec, "kwargs": {"length": value}}))
+    for value in (1 << 20, 1e300, True, [1, 2.5]):
+        with pytest.raises(TupliError, match="unexpected keyword argument 'length'"):  # it was tried
+            build(EnvironmentRecord("CartPole-v1", spec={**spec, "kwargs": {"length": value}}))
+
+
+def test_no_window_opens_without_trust() -> None:
+    spec = dict(capture(gym.make("CartPole-v1")).spec or {})
+    for mode in ("human", "a window", ["human"], 3):
+        record = EnvironmentRecord("CartPole-v1", spec={**spec, "kwargs": {"render_mode": mode}})
+        assert build(record).render_mode is None
+        assert build(record, render_mode="rgb_array").render_mode == "rgb_array"
+    pictures = EnvironmentRecord("CartPole-v1", spec={**spec, "kwargs": {"render_mode": "rgb_array"}})
+    assert build(pictures).render_mode == "rgb_array"
+    trust.trust(record.digest)
+    with pytest.raises(TupliError, match=r"cannot be rebuilt here"):
+        build(record)  # with the mode that it has
+    window = {"name": "H", "entry_point": "gymnasium.wrappers.rendering:HumanRendering", "kwargs": {}}
+    with pytest.raises(UntrustedError, match="the wrapper 'gymnasium.wrappers.rendering:HumanRendering'"):
+        build(EnvironmentRecord("CartPole-v1", spec={**pictures.spec, "additional_wrappers": [window]}))  # type: ignore[dict-item]
+
+
 def test_registered_arguments_are_known_here() -> None:
     gym.register("TupliNamed-v0", entry_point=f"{__name__}:Counter", kwargs={"start": "a.b/c"})
     try:

@@ -1,5 +1,6 @@
 """An environment as data: captured from a live one, rebuilt from a record, executed only where trusted."""
 
+from tupli_mcap.environment._arguments import more_than_data
 from tupli_mcap.environment._build import build, reasons_for_distrust
 from tupli_mcap.environment._capture import Snapshot, capture, record_environment
 from tupli_mcap.environment._docs import documented_labels
@@ -16,6 +17,7 @@ __all__ = [
     "canonical_json",
     "capture",
     "documented_labels",
+    "more_than_data",
     "named_imports",
     "reasons_for_distrust",
     "rebuild_ezpickled",

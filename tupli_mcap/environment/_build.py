@@ -5,23 +5,25 @@ from __future__ import annotations
 import contextlib
 import copy
 import platform
-import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, cast
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
 from tupli_mcap import trust as _trust
+from tupli_mcap.environment._arguments import foreign_arguments
 from tupli_mcap.environment._pickling import load
 from tupli_mcap.environment._record import EnvironmentRecord, sha256
 from tupli_mcap.errors import TupliError, UntrustedError
 
-__all__ = ["build", "foreign_arguments", "foreign_code", "make_from_spec", "reasons_for_distrust"]
+__all__ = ["build", "foreign_code", "make_from_spec", "reasons_for_distrust"]
 
-# Such a text can name no file, URL, module or attribute.
-_PLAIN_WORD = re.compile(r"[A-Za-z0-9_ +=,;()\[\]<>#-]{0,256}\Z")
+# What these render opens no window.
+_PICTURES = frozenset(
+    {"rgb_array", "rgb_array_list", "depth_array", "depth_array_list", "rgbd_tuple", "ansi", "ansi_list"}
+)
 
 
 def build(
@@ -33,22 +35,28 @@ def build(
     wrappers are gymnasium's own or come from the environment's own package, already imported. Everything
     else, the pickled environment above all, is code from a file: it runs only if this user made or trusted
     it (`tupli_mcap.trust`) or `trust=True` is given. Arguments in a spec are data for code installed here, unless
-    one of them may name a file or more code (`foreign_arguments`). `render_mode` replaces the record's; a pickled
-    environment that has no such mode keeps its own.
+    one of them may name a file or more code, or be a size that fills the memory (`foreign_arguments`). `render_mode`
+    replaces the record's, which is left out without trust if it may open a window; a pickled environment that has no
+    such mode keeps its own.
 
     Raises:
         UntrustedError: Code would run that nobody here has trusted; nothing has been executed.
         TupliError: The environment does not build: a package is missing, another Python version made it.
     """
     reasons = reasons_for_distrust(record)
-    if reasons and not trust and not _trust.is_trusted(record.digest):
+    window = record.spec is not None and _may_open_a_window(record.spec)
+    trusted = trust or (bool(reasons or window) and _trust.is_trusted(record.digest))
+    if reasons and not trusted:
         raise UntrustedError(
             f"rebuilding the environment {record.name[:200]!r} would run {'; '.join(reasons)}. If you trust "
             "where it comes from, pass trust=True or run `tupli-mcap trust FILE` (digest "
             f"{record.digest}); reading its episodes needs no trust"
         )
+    spec = record.spec
+    if spec is not None and window and not trusted:
+        spec = {**spec, "kwargs": {k: v for k, v in spec["kwargs"].items() if k != "render_mode"}}
     try:
-        env = _unpickle(record) if record.spec is None else make_from_spec(record.spec, render_mode)
+        env = _unpickle(record) if spec is None else make_from_spec(spec, render_mode)
     except (Exception, SystemExit) as err:
         made_with = ", ".join(f"{name} {version}" for name, version in list(record.versions.items())[:20])
         raise TupliError(
@@ -64,6 +72,12 @@ def build(
         with contextlib.suppress(AttributeError):  # where it cannot be set
             env.unwrapped.render_mode = render_mode
     return env
+
+
+def _may_open_a_window(spec: Mapping[str, Any]) -> bool:
+    arguments = spec.get("kwargs")
+    mode = arguments.get("render_mode") if isinstance(arguments, dict) else None
+    return mode is not None and not (isinstance(mode, str) and mode in _PICTURES)
 
 
 def _render_modes(env: gym.Env[Any, Any]) -> list[Any]:
@@ -113,52 +127,6 @@ def foreign_code(spec: Mapping[str, Any]) -> list[str]:
     return reasons
 
 
-def foreign_arguments(spec: Mapping[str, Any]) -> list[str]:
-    """Arguments in a spec that may name a file or code, such as `xml_file="../x.xml"`, unless they are registered so.
-
-    Some environments hand such names to `open` or `gymnasium.make`. Numbers, flags and plain words are data.
-    """
-    told = spec.get("kwargs", {})
-    known = gym.registry.get(str(spec.get("id")))
-    usual = {} if known is None else known.kwargs
-    wrappers = spec.get("additional_wrappers")
-    given = [("", told)]
-    given += [
-        (f" of the wrapper {str(wrapper.get('name'))[:60]!r}", wrapper.get("kwargs"))
-        for wrapper in (wrappers if isinstance(wrappers, list) else ())
-        if isinstance(wrapper, dict)
-    ]
-    found = []
-    for of, arguments in given:
-        items = arguments.items() if isinstance(arguments, dict) else [("kwargs", arguments)]
-        for name, value in items:
-            if not of and name in usual and _same_text(usual[name], value):
-                continue
-            text = next((text for text in _texts(value) if not _PLAIN_WORD.match(text)), None)
-            if text is not None:
-                found.append(
-                    f"the argument {name[:60]!r}{of}, which holds {text[:100]!r} and may name a file or code"
-                )
-    return found
-
-
-def _same_text(usual: object, value: object) -> bool:
-    return isinstance(usual, str) and usual == value
-
-
-def _texts(value: object) -> Iterator[str]:
-    """All texts in a JSON value, keys included."""
-    rest = [value]
-    while rest:
-        item = rest.pop()
-        if isinstance(item, str):
-            yield item
-        elif isinstance(item, list):
-            rest += item
-        elif isinstance(item, dict):
-            rest += [*item, *item.values()]
-
-
 def _is_known_wrapper(entry_point: object, package: str) -> bool:
     """Not every imported wrapper will do: some write to files that their arguments name."""
     if not isinstance(entry_point, str):
@@ -173,7 +141,8 @@ def _is_known_wrapper(entry_point: object, package: str) -> bool:
     return (
         isinstance(found, type)
         and issubclass(found, gym.Wrapper)
-        and not issubclass(found, gym.wrappers.RecordVideo)  # writes to the folder it is told
+        # These write to the folder they are told, and open a window.
+        and not issubclass(found, gym.wrappers.RecordVideo | gym.wrappers.HumanRendering)
     )
 
 
