@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,10 @@ import gymnasium as gym
 import jsonschema
 import numpy as np
 import pytest
+from cryptography.hazmat.primitives import serialization as ser
+from cryptography.hazmat.primitives.asymmetric import ed25519
 from environments import Sampler
+from gymnasium.envs.classic_control import CartPoleEnv
 from sample_spaces import SPACES, space_id
 from typer.testing import CliRunner
 
@@ -27,12 +31,16 @@ from tupli_mcap import (
     TupliEnvWrapper,
     UntrustedError,
     rewrite_recording,
+    trust,
     write_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.recording.attach import add_attachments
 from tupli_mcap.recording.repair import recover_recording
-from tupli_mcap.replay import Certificate, certify, values
+from tupli_mcap.recording.signature import sign_recording
+from tupli_mcap.replay import Certificate, certify, render, values
+from tupli_mcap.signing import SigningKey
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
 SCHEMA = jsonschema.Draft202012Validator(
@@ -367,6 +375,103 @@ def test_a_repaired_recording_keeps_what_replaying_needs(tmp_path: Path) -> None
         roll(env, 20, seed=None)
     recover_recording(tmp_path / "a.mcap", tmp_path / "b.mcap")
     check_complete(certify(tmp_path / "b.mcap"))
+
+
+# --- options of resets ---
+
+GIVEN: list[Any] = []
+
+
+class Levels(CartPoleEnv):
+    """Notes the options that it is given; others would open the file that one of them names."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        GIVEN.append(options)
+        return super().reset(seed=seed)
+
+
+LEVELS = {"id": "tests/Levels-v0", "entry_point": f"{__name__}:Levels"}
+
+
+@pytest.fixture
+def levels() -> Iterator[dict[str, tuple[str, bytes]]]:
+    """The attachments of an environment that is registered here."""
+    gym.register(**LEVELS)  # type: ignore[arg-type]
+    GIVEN.clear()
+    yield {"benchmark.json": ("application/json", EnvironmentRecord("Levels", spec=LEVELS).to_json())}
+    del gym.registry[LEVELS["id"]]
+
+
+def record_levels(path: Path, attachments: Any, *options: Any) -> Path:
+    """An episode of three steps for each of the options, all with a seed but the last."""
+    with RecordEpisodes(gym.make("tests/Levels-v0"), path, attachments=attachments) as env:
+        for i, given in enumerate(options):
+            env.reset(seed=None if i and i == len(options) - 1 else i, options=given)
+            for _ in range(3):
+                env.step(0)
+    GIVEN.clear()
+    return path
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *("../level.txt", "module:Level-v0", b"/etc/passwd", ["a", {"b": ("~",)}], {"a.b": 1}),
+        *(np.array(["x", "a/b"]), {1: 1 << 21}, np.int64(1 << 40), [np.array([3, -(1 << 30)])]),
+    ],
+    ids=repr,
+)
+def test_options_that_are_more_than_data_need_trust(tmp_path: Path, levels: Any, value: Any) -> None:
+    harmless = {"level": "8x8", "low": -0.05, "size": 64, "mask": np.array([1, 0], np.int8)}
+    path = record_levels(tmp_path / "a.mcap", levels, harmless, {"level": value}, None)
+    for found in (certify(path), certify(path, env=gym.make("tests/Levels-v0"))):
+        assert found.agrees and not found.complete
+        assert found.agreed.episodes == 1
+        (skipped,) = found.skipped
+        assert (skipped.kind, skipped.first, skipped.episodes) == ("untrusted", 1, 2)
+        SCHEMA.validate(json.loads(found.to_json()))
+    assert GIVEN and all(given is None or given["level"] == "8x8" for given in GIVEN)
+    check_complete(certify(path, trust=True))
+    assert any(given and str(given["level"]) == str(value) for given in GIVEN)
+
+
+def test_rendering_gives_no_such_options_either(tmp_path: Path, levels: Any) -> None:
+    path = record_levels(tmp_path / "a.mcap", levels, None, {"level": "../x"}, None)
+    report = render(path, tmp_path / "new.mcap", episodes=[0, 1])
+    assert [skipped.kind for skipped in report.skipped] == ["untrusted"]
+    assert [(episode.episode, episode.whole) for episode in report.episodes] == [(0, True)]
+    assert {"level": "../x"} not in GIVEN
+    assert render(path, tmp_path / "more.mcap", episodes=[0, 1], trust=True).ok
+
+
+def test_options_are_trusted_with_their_file(tmp_path: Path, levels: Any) -> None:
+    path = record_levels(tmp_path / "a.mcap", levels, {"level": "../x"}, None)
+    other = record_levels(tmp_path / "b.mcap", levels, {"level": "../y"}, None)
+    code, out, _ = run("verify", "--replay", path)
+    assert code == 1
+    assert "2 episodes could not be checked, the first is 0: reset with options that need trust" in out
+    shown = run("trust", path, "--show")[1]
+    assert "options      of a reset hold '../x' and may name a file or code\n" in shown
+    assert re.search("^trusted +no$", shown, re.MULTILINE)
+    assert re.search("^trusted +yes$", run("trust", path)[1], re.MULTILINE)
+    assert run("verify", "--replay", path)[0] == 0
+    assert run("verify", "--replay", other)[0] == 1  # the same environment, from somebody else
+    assert {"level": "../y"} not in GIVEN
+    assert run("untrust", path)[0] == 0
+    assert run("verify", "--replay", path)[0] == 1
+    assert json.loads(run("trust", "--list", "--json")[1])["digests"] == []
+
+
+def test_options_are_trusted_where_a_trusted_key_signed_them(tmp_path: Path, levels: Any) -> None:
+    path = record_levels(tmp_path / "a.mcap", levels, {"level": "../x"}, None)
+    key = ed25519.Ed25519PrivateKey.generate()
+    (tmp_path / "key").write_bytes(
+        key.private_bytes(ser.Encoding.PEM, ser.PrivateFormat.PKCS8, ser.NoEncryption())
+    )
+    signed = sign_recording(path, SigningKey(tmp_path / "key"))
+    assert not certify(path).agrees
+    trust.trust_key(signed.public_key, "alice")
+    check_complete(certify(path))
 
 
 # --- environments of every kind ---

@@ -46,7 +46,8 @@ def _verify(
         bool, typer.Option("--replay", help="Also replay recordings and compare, bit for bit.")
     ] = False,
     trust: Annotated[
-        bool, typer.Option("--trust", help="With --replay: run the code that the files carry.")
+        bool,
+        typer.Option("--trust", help="With --replay: run the code that the files carry, with all options."),
     ] = False,
     episodes: Annotated[
         str | None, typer.Option(metavar="NUMBERS", help="With --replay: only these, such as 0,4,10-19.")

@@ -44,9 +44,9 @@ def _trust(
 
     Rebuilding it may run code that came with the file, as this user, on this machine. --show tells what the
     file says of that code, and runs nothing: of a pickle, the names that it imports. They prove nothing.
-    Reading the episodes of a file needs no trust. Only this user's processes trust it from then on; one
-    changed byte of the environment ends that. --key trusts every environment that somebody signs, see
-    bundle --sign.
+    Options of resets that may name files or code are trusted with it. Reading the episodes of a file needs
+    no trust. Only this user's processes trust it from then on; one changed byte of the environment ends
+    that. --key trusts every environment that somebody signs, see bundle --sign.
     """
     from tupli_mcap.recording.carried import carried_code, set_trust
 
@@ -139,7 +139,7 @@ def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
         "spec": "the registered environment, by its spec",
         "pickle": f"{bytes_of(code.size)} of pickled Python code",
     }
-    if code.kind == "spec" and code.needs_trust:
+    if code.kind == "spec" and code.foreign:
         runs["spec"] = "code that its spec names"
     return [
         ("environment", code.name),
@@ -151,6 +151,7 @@ def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
         ("made with", ", ".join(f"{name} {version}" for name, version in code.versions.items())),
         ("digest", code.digest),
         *([("foreign", "; ".join(code.foreign))] if code.foreign and code.kind == "spec" else []),
+        *(("options", f"of a reset hold {why}") for why in code.options),
         *(
             [("signed by", f"{code.signed_by}{f' ({code.signer})' if code.signer else ''}")]
             if code.signed_by

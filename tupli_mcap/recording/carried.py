@@ -1,24 +1,43 @@
-"""The code that a recording carries: what rebuilding its environment would run, and trusting it."""
+"""What a recording carries that needs trust: its environment's code, and options of resets that are more than data."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 
 from tupli_mcap import trust
-from tupli_mcap.environment import PickleImports, named_imports, reasons_for_distrust
-from tupli_mcap.errors import NotFoundError
+from tupli_mcap.environment import (
+    PickleImports,
+    canonical_json,
+    more_than_data,
+    named_imports,
+    reasons_for_distrust,
+    sha256,
+)
+from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
+from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.recording.signed import claimed_signer
+from tupli_mcap.recording.signature import verify_signature
+from tupli_mcap.recording.signed import SIGNATURE_NAME, claimed_signer
 
-__all__ = ["CarriedCode", "EntryPoint", "carried_code", "set_trust", "untrust"]
+__all__ = [
+    "CarriedCode",
+    "EntryPoint",
+    "carried_code",
+    "foreign_options",
+    "options_are_trusted",
+    "set_trust",
+    "untrust",
+]
 
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
+_MAX_OPTIONS = 20  # that are shown
 
 
 class EntryPoint(NamedTuple):
@@ -35,9 +54,11 @@ class CarriedCode(NamedTuple):
 
     kind: "spec" (its JSON text is `spec`, the code it names `entry_points`) or "pickle" (of `size` bytes, whose
         instructions name `imports`; it may import and run anything).
-    foreign: what would run that this machine does not know; empty if it needs no trust.
-    needs_trust: whether it is built only where somebody trusts it. trusted: whether this user trusts the digest,
-        or the key that signed it.
+    foreign: what would run that this machine does not know; empty if building it needs no trust.
+    options: what options of its resets hold that is more than data, which replaying would hand to the environment.
+    needs_trust: whether it is built, and given all options, only where somebody trusts it. trusted: whether this user
+        trusts the digests, or the key that signed it.
+    options_digest: of the environment and those options; None if there are none.
     signed_by: the fingerprint of the key that the file says has signed it; None if it is not signed.
     signer: what this user calls that key, if it is trusted here and has signed this very environment.
     """
@@ -52,6 +73,8 @@ class CarriedCode(NamedTuple):
     versions: dict[str, str]
     digest: str
     foreign: list[str]
+    options: list[str]
+    options_digest: str | None
     needs_trust: bool
     trusted: bool
     signed_by: str | None
@@ -59,7 +82,7 @@ class CarriedCode(NamedTuple):
 
 
 def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
-    """What rebuilding a recording's environment would run; nothing is run.
+    """What rebuilding a recording's environment would run, and be given; nothing is run.
 
     Raises:
         RecordingError: the recording carries no environment.
@@ -68,6 +91,8 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
     with Recording(path) as recording:
         benchmark = recording.benchmark
         signed_by = claimed_signer(recording)
+        options = _foreign_options(recording)
+        given = options_are_trusted(recording) if options else True
     record = benchmark.record
     voucher = benchmark.voucher if signed_by is not None else None
     spec: dict[str, Any] | None = None if record.spec is None else dict(record.spec)
@@ -83,8 +108,10 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
         versions=dict(record.versions),
         digest=record.digest,
         foreign=foreign,
-        needs_trust=bool(foreign),
-        trusted=trust.is_trusted(record.digest) or voucher is not None,
+        options=list(dict.fromkeys(options.values()))[:_MAX_OPTIONS],
+        options_digest=_options_digest(record.digest, options) if options else None,
+        needs_trust=bool(foreign or options),
+        trusted=(trust.is_trusted(record.digest) or voucher is not None) and given,
         signed_by=signed_by,
         signer=None if voucher is None else voucher.name or "no name",
     )
@@ -102,18 +129,18 @@ def _entry_points(spec: dict[str, Any]) -> list[EntryPoint]:
 
 
 def set_trust(path: str | os.PathLike[str], *, trusted: bool) -> CarriedCode:
-    """Trusts the environment of a recording on this machine, or no longer; returns what it is about.
+    """Trusts the environment of a recording, and the options of its resets, on this machine, or no longer; returns what
+    it is about.
 
     Raises:
         RecordingError: the recording carries no environment.
         TupliError: the signature cannot be written.
     """
     code = carried_code(path)
-    if trusted:
-        trust.trust(code.digest)
-    else:
-        trust.untrust(code.digest)
-    return code._replace(trusted=trusted or code.signer is not None)
+    for digest in (code.digest, code.options_digest):
+        if digest is not None:
+            (trust.trust if trusted else trust.untrust)(digest)
+    return code._replace(trusted=trusted or carried_code(path).trusted)
 
 
 def untrust(what: str) -> tuple[str, bool]:
@@ -127,7 +154,10 @@ def untrust(what: str) -> tuple[str, bool]:
         RecordingError, FormatError: as `carried_code`.
     """
     if Path(what).exists() or not re.fullmatch(r"[0-9a-f]{8,64}", what):
-        digest = carried_code(what).digest
+        code = carried_code(what)
+        digest = code.digest
+        if code.options_digest is not None:
+            trust.untrust(code.options_digest)
     elif _DIGEST.match(what):
         digest = what
     else:
@@ -139,3 +169,44 @@ def untrust(what: str) -> tuple[str, bool]:
             )
         (digest,) = found
     return digest, trust.untrust(digest)
+
+
+def foreign_options(text: str) -> str:
+    """What in the options of a reset (exact JSON, empty for none) is more than data, as for arguments of a spec."""
+    return more_than_data(jsonvalue.loads(text)) if text else ""
+
+
+def options_are_trusted(recording: Recording) -> bool:
+    """Whether this user trusts what is more than data in the options of a recording's resets: these very options, with
+    this environment, or the key that signed the whole recording.
+
+    Trust in the environment alone is not enough: others may have recorded the same one, with other options.
+    """
+    carried = "benchmark.json" in recording.attachments
+    digest = recording.benchmark.record.digest if carried else ""
+    if trust.is_trusted(_options_digest(digest, _foreign_options(recording))):
+        return True
+    if SIGNATURE_NAME not in recording.attachments or not trust.trusted_keys():
+        return False
+    try:
+        return verify_signature(recording).trusted
+    except (SignatureError, MissingExtraError):
+        return False
+
+
+def _foreign_options(recording: Recording) -> dict[str, str]:
+    """The texts of options that hold more than data, and what that is."""
+    found: dict[str, str] = {}
+    seen = {""}
+    for position in range(len(recording)):
+        for reset in (*recording.resets_before(position), recording.episode_start(position)):
+            if reset.options not in seen:
+                seen.add(reset.options)
+                why = foreign_options(reset.options)
+                if why:
+                    found[reset.options] = why
+    return found
+
+
+def _options_digest(environment: str, options: Iterable[str]) -> str:
+    return sha256(canonical_json({"environment": environment, "options": sorted(options)}))

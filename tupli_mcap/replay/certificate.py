@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 __all__ = ["Certificate", "Counts", "Divergence", "SkipKind", "Skipped"]
 
 _HEX_DIGEST = r"^[0-9a-f]{64}$"
-SkipKind = Literal["unseeded", "after_divergence", "no_predecessor"]
+SkipKind = Literal["unseeded", "after_divergence", "no_predecessor", "untrusted"]
 
 
 class _Model(BaseModel):

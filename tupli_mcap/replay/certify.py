@@ -12,6 +12,7 @@ import gymnasium as gym
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.carried import foreign_options, options_are_trusted
 from tupli_mcap.replay.attempt import Attempt, Watch, attempt, repeats_itself
 from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, SkipKind, Skipped
 from tupli_mcap.replay.compare import Checker, Difference
@@ -27,6 +28,8 @@ _REASONS: dict[SkipKind, str] = {
     "unseeded": "reset without a seed, from a random state that the recording does not hold",
     "after_divergence": "reset without a seed, after an episode that diverged",
     "no_predecessor": "reset without a seed, after steps or episodes that are not in the recording any more",
+    "untrusted": "reset with options that need trust, such as names of files, or after such a reset; "
+    "`tupli-mcap trust FILE` or --trust (trust=True) lets the environment have them",
 }
 
 
@@ -46,7 +49,7 @@ def certify(
 
     Args:
         recording: an open recording, or what `Recording` opens.
-        trust: rebuild the environment even if that runs code from the file.
+        trust: rebuild the environment even if that runs code from the file, and reset it with any options.
         episodes: numbers of those to check (all by default); what they depend on is replayed too.
         env: used instead of the environment in the file; it is not closed.
         progress: called with the number of steps done.
@@ -90,6 +93,7 @@ class Certifier:
         self._settled = False  # which of the two it is
         self._deterministic: bool | None = None
         self._stopped = False
+        self._any_options: bool | None = None  # whether resets may be given options that are more than data
 
     def run(self) -> Certificate:
         """Replays and compares; the result."""
@@ -144,13 +148,16 @@ class Certifier:
             values = recorded_values(self._recording, [plan.position for plan in plans])
             for plan, recorded in zip(plans, values, strict=True):
                 doubt = self._doubt(plan, doubt)
-                found, replayer = self._attempt(plan, recorded, replayer)
                 outcome: Divergence | SkipKind | None = None
-                if found.agrees:
-                    doubt = None if doubt == "after_divergence" else doubt
+                if self._withheld(plan):
+                    outcome = doubt = "untrusted"
                 else:
-                    outcome = doubt or self._divergence(plan, recorded, found)
-                    doubt = doubt or "after_divergence"
+                    found, replayer = self._attempt(plan, recorded, replayer)
+                    if found.agrees:
+                        doubt = None if doubt == "after_divergence" else doubt
+                    else:
+                        outcome = doubt or self._divergence(plan, recorded, found)
+                        doubt = doubt or "after_divergence"
                 self._outcomes[plan.position] = outcome
                 self._done += recorded.length
                 if self._progress is not None:
@@ -160,6 +167,14 @@ class Certifier:
                     return
         finally:
             replayer.close()
+
+    def _withheld(self, plan: EpisodePlan) -> bool:
+        """Whether an episode is not reset: a stranger's options for code of this machine are more than data."""
+        if not any(foreign_options(reset.options) for reset in plan.resets):
+            return False
+        if self._any_options is None:
+            self._any_options = self._trust or options_are_trusted(self._recording)
+        return not self._any_options
 
     def _doubt(self, plan: EpisodePlan, before: SkipKind | None) -> SkipKind | None:
         """Why an episode may differ although nothing is wrong; None if it may not."""

@@ -102,7 +102,7 @@ def render(
         every: a frame of every so many steps, and of the last one.
         width: of the frames (pixels); as the environment renders them by default.
         frame_format: of the frames in a ".mcap".
-        trust: rebuild the environment even if that runs code from the file.
+        trust: rebuild the environment even if that runs code from the file, and reset it with any options.
         env: used instead of the environment in the file, made with render_mode="rgb_array"; it is not closed.
         overwrite: whether an existing target is replaced.
         progress: called with the number of steps done.
