@@ -20,7 +20,15 @@ from gymnasium.utils.env_checker import check_env
 from interruptions import Counting
 from sample_spaces import SPACES, space_id
 
-from tupli_mcap import RecordEpisodes, Recording, RecordingError, SpaceError, StepError
+from tupli_mcap import (
+    EpisodeData,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    SpaceError,
+    StepError,
+    write_recording,
+)
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -282,6 +290,49 @@ def test_unknown_spaces_are_refused_before_a_file_is_made(tmp_path: Path) -> Non
             Scripted(lambda step: None, spaces.Box(0, 1, (2,), np.longdouble)), tmp_path / "r.mcap"
         )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_too_many_leaves_are_refused(tmp_path: Path) -> None:
+    """Code is generated for each, also from the spaces of a stranger's file that is written anew."""
+    space = spaces.Dict({f"key{i}": spaces.Discrete(2) for i in range(4095)})
+    with RecordEpisodes(Sampler(space, spaces.Discrete(2)), tmp_path / "r.mcap") as env:
+        env.reset(seed=0)
+        with pytest.raises(
+            SpaceError, match="at most 4,096 leaves in the spaces of a step, found 4,097; join"
+        ):
+            env.step(0)
+
+
+COLUMNS = ("states", "actions", "rewards", "terminals", "timeouts")
+
+
+def test_keys_of_a_space_are_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = "open('ran', 'w').close()"
+    keys = [
+        f"'] + [{run}] + ['",
+        f'"] + [{run}] + ["',
+        f"\n    {run}\n",
+        f"{{{run}}}",
+        "\\'] #",
+        "\u2028'",
+        ("'", run),
+    ]
+    space = spaces.Dict({key: spaces.Discrete(5) for key in keys})
+    with RecordEpisodes(Sampler(space, space), tmp_path / "a.mcap") as env:
+        roll(env, 2)
+    with Recording(tmp_path / "a.mcap") as old:
+        steps = list(old.episodes[0])
+        columns = {name: [getattr(step, name[:-1]) for step in steps] for name in COLUMNS}
+        write_recording(
+            tmp_path / "b.mcap",
+            [EpisodeData(**columns, final_state=old.episodes[0].final_state)],
+            observation_space=old.observation_space,
+            action_space=old.action_space,
+        )
+        with Recording(tmp_path / "b.mcap") as new:
+            assert all(same(a.state, b.state) for a, b in zip(steps, new.episodes[0], strict=True))
+    assert not (tmp_path / "ran").exists()
 
 
 # ---- how episodes end

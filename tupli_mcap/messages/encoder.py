@@ -1,6 +1,8 @@
 """Generated encoders: one Python function per recording that writes a step into a row of constant layout.
 
-The source is generated from the live environment's spaces only, never from a file. It takes the fast way when a value
+The source is generated from validated spaces: the live environment's, or those of a file whose episodes are written
+anew. Keys come into it as `repr` of a `str` or `int` or are bound as objects, names and dtypes are of fixed alphabets,
+and leaves are counted before anything is compiled. Readers generate nothing. The source takes the fast way when a value
 has the recorded type, and otherwise calls an exact (slow) cast that refuses what it cannot store.
 
 A row is a complete MCAP Message record. One `struct` call writes the end of row j (action, reward, flags) and the start
@@ -18,7 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value, shorten
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import DType, Leaf
@@ -32,6 +34,7 @@ EPISODE_AND_STEP = Struct("<II")
 _TIME = Struct("<Q")
 HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 PREFIX = BODY + 8  # record header, CDR header, episode, step: the same for a whole episode
+_MAX_LEAVES = 4096  # compiling takes time and memory for each
 _LARGE = 2048  # bytes from which a leaf is copied as an array instead of through `bytes`
 _INT_FORMATS = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
@@ -113,6 +116,14 @@ class _Packed:
         self.offset = offset + size
 
 
+def _check_leaves(layout: StepLayout) -> None:
+    if len(layout.leaves) > _MAX_LEAVES:
+        raise SpaceError(
+            f"expected at most {_MAX_LEAVES:,} leaves in the spaces of a step, found {len(layout.leaves):,}; "
+            "join some into arrays"
+        )
+
+
 def make_row_encoder(
     layout: StepLayout,
     buffer: Any,
@@ -126,7 +137,11 @@ def make_row_encoder(
 
     `images` has a sink for each image leaf; `switch` is called when the row after the last one has been started;
     `seal`, if given, with the offset of each committed row. `move` and `begin` come before the first step.
+
+    Raises:
+        SpaceError: the layout has more than 4,096 leaves.
     """
+    _check_leaves(layout)
     message = layout.step_message
     size = message.record_size
     source = _Source()
