@@ -75,7 +75,11 @@ def test_an_image_chunk_that_is_refused_is_no_wrong_step(tmp_path: Path) -> None
     assert str(caught.value).startswith(f"{tmp_path}/r.mcap: could not write ")
     assert "No space left on device; free some space there" in str(caught.value)
     with pytest.raises(RecordingError, match="No space left on device"):
-        env.close()
+        env.step(0)
+    env.close()  # there is space again
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert recording.complete
+        assert recording.num_steps >= 5
 
 
 def test_a_disk_that_cannot_be_read_is_no_defect(tmp_path: Path) -> None:

@@ -224,7 +224,7 @@ class TestTables:
         journal = Journal(path, areas, {"uuid": "0" * 32})
         journal.publish()
         data = path.read_bytes()
-        journal.close(unlink=True)
+        journal.remove()
         head = read_by_table("journal-header", data)
         text = data[place("journal-header", "description") :][: head["length"]]
         assert head["magic"] == b"TMCAPJ1\0"

@@ -17,7 +17,7 @@ from pathlib import Path
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.options import Mode, WriterOptions, check_local
-from tupli_mcap.recording.writer import LAST_ROW, RecordingWriter
+from tupli_mcap.recording.writer import LAST_ROW, RecordingWriter, finish_recording
 
 __all__ = ["Rotation", "series"]
 
@@ -91,7 +91,7 @@ class Rotation:
         files = [base, *later.values()]
         for left in files[-2:-1]:  # changes nothing about a finished one
             with contextlib.suppress(RecordingError, FormatError):  # it is read as it is
-                RecordingWriter(left, WriterOptions(mode="a")).close()
+                finish_recording(left, WriterOptions(mode="a"))
         self._paths = [files[-1]]
 
     @property

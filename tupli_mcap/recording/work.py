@@ -103,7 +103,7 @@ class Work:
                 recorder.close()
             except RecordingError as err:
                 writer.stop(err)
-                writer.let_go()
+                writer.leave_unfinished()
                 raise
             except BaseException:
                 writer.break_off()

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError
+from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.container import Container, Rows
@@ -46,6 +46,7 @@ __all__ = [
     "RecordingWriter",
     "ResetFacts",
     "StartedEpisode",
+    "finish_recording",
 ]
 
 RECORDING_METADATA = "tupli_mcap.recording"
@@ -441,7 +442,7 @@ class RecordingWriter:
     def close(self) -> None:
         """Writes the rest, the episode index and the summary, and removes the journal.
 
-        Where it raises, `let_go` or `break_off` must follow.
+        Where it raises, `leave_unfinished` or `break_off` must follow.
         """
         if self.closed:
             return
@@ -495,13 +496,22 @@ class RecordingWriter:
         if self.lock.replaces or (self.journal is None and self._is_new_and_empty()):
             self._leave()
             return
-        self.let_go()
-        self._remove_unnamed(self.journal_place)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
-            options = WriterOptions(self.options.compression, "a", durability=self.options.durability)
-            RecordingWriter(self._place, options).close()
+        options = WriterOptions(self.options.compression, "a", durability=self.options.durability)
+        try:
+            self.let_go()
+            self._remove_unnamed(self.journal_place)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
+                finish_recording(self._place, options)
+        except TupliError:
+            self.leave_unfinished()
+            raise
         self.closed = True
+
+    def leave_unfinished(self) -> None:
+        """Lets go of everything; whoever appends to the file next goes on from here."""
+        self.closed = True
+        self.let_go()
 
     def _remove_old_journal(self, place: Path, uuid: str) -> None:
         """What a killed writer left of its journal, and of one that was not in its place yet."""
@@ -511,7 +521,8 @@ class RecordingWriter:
         self._remove_unnamed(place)
 
     def _remove_unnamed(self, place: Path) -> None:
-        place.with_name(f"{place.name}.tmp").unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            place.with_name(f"{place.name}.tmp").unlink()
 
     def _remove_replaced(self) -> None:
         """The journal of the recording that this one took the place of."""
@@ -546,6 +557,21 @@ class RecordingWriter:
         )
         self.lock.release()
         self.on_abandon()
+
+
+def finish_recording(path: Path, options: WriterOptions) -> None:
+    """Finishes a recording that its writer has left unfinished; a finished one stays as it is.
+
+    Raises:
+        RecordingError: somebody records to it, or the disk refuses.
+        FormatError: it is damaged.
+    """
+    writer = RecordingWriter(path, options)
+    try:
+        writer.close()
+    except BaseException:
+        writer.leave_unfinished()
+        raise
 
 
 def _metadata_of(path: Path) -> dict[str, str]:
