@@ -153,11 +153,7 @@ def state_of(lab: Lab) -> dict[str, str]:
 
 def strays(lab: Lab) -> list[str]:
     """Files that nothing needs."""
-    found = [
-        path
-        for path in lab.root.parent.rglob("*")
-        if path.is_file() and path.suffix != ".lock" and path.name != ".lock"
-    ]
+    found = [path for path in lab.root.parent.rglob("*") if path.suffix != ".lock" and path.name != ".lock"]
     return [
         path.name
         for path in found

@@ -20,12 +20,12 @@ import os
 import re
 import secrets
 import stat
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
 import platformdirs
 
+from tupli_mcap import files
 from tupli_mcap.errors import TupliError
 from tupli_mcap.system import refused
 
@@ -214,7 +214,7 @@ def _store(name: str, text: str) -> None:
     path = config_dir() / name
     try:
         _make_private_dir(path.parent)
-        _write(path, text.encode(), replace=True)
+        files.write_bytes(path, text.encode(), permissions=0o600)
     except OSError as err:
         raise TupliError(f"the signature {str(path)!r} cannot be written: {refused(err)}") from err
 
@@ -251,7 +251,7 @@ def _key(*, create: bool) -> bytes | None:
         _make_private_dir(path.parent)
         # The first process to link wins; the others read its key.
         with contextlib.suppress(FileExistsError):
-            _write(path, secrets.token_bytes(_KEY_BYTES), replace=False)
+            files.write_bytes(path, secrets.token_bytes(_KEY_BYTES), overwrite=False, permissions=0o600)
         return _read_key(path)
     except OSError as err:
         raise TupliError(f"the key {str(path)!r} cannot be made: {refused(err)}") from err
@@ -291,21 +291,3 @@ def _make_private_dir(path: Path) -> None:
     path.mkdir(mode=0o700, exist_ok=True)
     if path != config_dir() and stat.S_IMODE(path.stat().st_mode) & 0o077:
         path.chmod(0o700)
-
-
-def _write(path: Path, data: bytes, *, replace: bool) -> None:
-    """Write a private file as a whole or not at all; `replace=False` raises FileExistsError if it exists."""
-    fd, name = tempfile.mkstemp(prefix=".", dir=path.parent)  # mode 0600
-    temporary = Path(name)
-    try:
-        with os.fdopen(fd, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        if replace:
-            temporary.replace(path)
-        else:
-            os.link(temporary, path)
-    finally:
-        with contextlib.suppress(OSError):  # the file is there, or something else is said
-            temporary.unlink(missing_ok=True)

@@ -8,8 +8,6 @@ has mapped the old files keeps them.
 from __future__ import annotations
 
 import contextlib
-import errno
-import os
 import re
 import shutil
 import tempfile
@@ -17,6 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from tupli_mcap import files
 from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.materialized.manifest import MANIFEST, Manifest
 from tupli_mcap.recording.lock import drop_private
@@ -98,28 +97,17 @@ def _publish(directory: Path, stage: Path, manifest: Manifest) -> None:
     staged = stage / MANIFEST
     staged.write_bytes(manifest.to_bytes())
     with ThreadPoolExecutor(_THREADS) as pool:  # a disk writes many files in the time of one
-        list(pool.map(_sync, stage.iterdir()))
+        list(pool.map(files.sync, stage.iterdir()))
     (directory / MANIFEST).unlink(missing_ok=True)
-    _sync(directory)
+    files.sync(directory)
     for path in list(directory.iterdir()):
         if path.name not in manifest.files and _COLUMN.fullmatch(path.name):
             path.unlink()
     for name in manifest.files:
         (stage / name).replace(directory / name)
-    _sync(directory)  # no manifest before its columns, after a power loss either
+    files.sync(directory)  # no manifest before its columns, after a power loss either
     staged.replace(directory / MANIFEST)
-    _sync(directory)
-
-
-def _sync(path: Path) -> None:
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    except OSError as err:
-        if err.errno not in (errno.EINVAL, errno.ENOTSUP):  # not every file system can, of a directory
-            raise
-    finally:
-        os.close(fd)
+    files.sync(directory)
 
 
 @contextlib.contextmanager

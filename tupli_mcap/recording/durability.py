@@ -14,6 +14,7 @@ import zlib
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from tupli_mcap import files
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.system import refused
@@ -94,10 +95,6 @@ def sync_directory(path: Path) -> None:
         RecordingError: the disk refused.
     """
     try:
-        fd = os.open(path, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | os.O_CLOEXEC)
-        try:
-            os.fsync(fd)
-        finally:
-            os.close(fd)
+        files.sync(path)
     except OSError as err:
         raise RecordingError(f"{path}: could not be synced to the disk: {refused(err)}") from err

@@ -26,6 +26,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from tupli_mcap import files
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording.durability import boot_id, sync_directory
 from tupli_mcap.recording.source import open_regular
@@ -275,8 +276,9 @@ def _place(areas: list[Area], header: int) -> tuple[dict[str, int], int]:
 
 
 def _create(path: Path, size: int) -> tuple[mmap.mmap, os.stat_result]:
-    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | getattr(os, "O_CLOEXEC", 0), 0o644)
+    fd = files.create(path, 0o644)
     try:
+        files.hold(fd)  # the map keeps it
         _reserve(fd, size)
         return mmap.mmap(fd, size), os.fstat(fd)
     finally:

@@ -12,7 +12,6 @@ import errno
 import fcntl
 import io
 import os
-import secrets
 import stat
 import threading
 import time
@@ -20,6 +19,7 @@ import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
+from tupli_mcap import files
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.system import refused
 
@@ -137,7 +137,7 @@ class FileLock:
         if self._old is not None and (mode == "a" or not stat.S_ISREG(os.fstat(self._old.fileno()).st_mode)):
             self._file, self._old = self._old, None
             return
-        self._temporary = self._path.with_name(f".{secrets.token_hex(8)}.tmp")
+        self._temporary = files.temporary_path(self._path.parent)
         try:
             self._file = _open_file(self._temporary, "x+")
         except OSError as err:
@@ -169,10 +169,7 @@ class FileLock:
         if self._temporary is None:
             return
         try:
-            if self._old is not None:
-                self._temporary.replace(self._path)
-            else:
-                _link(self._temporary, self._path)
+            files.put(self._temporary, self._path, overwrite=self._old is not None)
         except FileExistsError as err:
             raise _exists(self._shown) from err
         except OSError as err:
@@ -222,21 +219,6 @@ def _exists(path: Path) -> RecordingError:
     return RecordingError(
         f'{path} exists and is not overwritten; choose another path, or mode="a" to append, "w" to replace'
     )
-
-
-def _link(temporary: Path, path: Path) -> None:
-    """Gives a file its name unless there is one of that name."""
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links
-        if os.path.lexists(path):
-            raise FileExistsError(errno.EEXIST, "exists", str(path)) from None
-        temporary.rename(path)
-        return
-    with contextlib.suppress(OSError):
-        temporary.unlink()
 
 
 @contextlib.contextmanager

@@ -7,13 +7,13 @@ import fcntl
 import functools
 import inspect
 import os
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
+from tupli_mcap import files
 from tupli_mcap.errors import RecordingError, StorageError
 from tupli_mcap.recording import journal_path
 from tupli_mcap.recording.lock import drop_private, open_private
@@ -25,41 +25,33 @@ _Class = TypeVar("_Class")
 
 
 def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
-    """Write a file as a whole: a crash leaves the old file, or none.
+    """Write a file as a whole, and its directory if it is missing: a crash leaves the old file, or none.
 
     Raises:
         FileExistsError: The file exists and `replace` is false.
         OSError: The directory cannot be written to, the disk is full, ...
     """
-    with fill(path, replace=replace) as temporary:
-        temporary.write_bytes(data)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write_bytes(path, data, overwrite=replace)
 
 
 @contextlib.contextmanager
-def fill(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Gives the path of an empty file beside `path`, which becomes `path` when the block ends without an
-    error."""
+def fill(path: Path) -> Iterator[Path]:
+    """Gives the path of a recording to write, which becomes `path` when the block ends without an error.
+
+    Raises:
+        FileExistsError: There is a file at `path` by then.
+        OSError: The directory cannot be written to, the disk is full, ...
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    fd, name = tempfile.mkstemp(prefix=".", suffix=".tmp", dir=path.parent)
-    temporary = Path(name)
-    try:
-        os.close(fd)
-        yield temporary
-        with temporary.open("rb+") as file:
-            # mkstemp's files are private; a storage is shared the way its directory is.
-            os.fchmod(file.fileno(), 0o666 & ~_umask())
-            os.fsync(file.fileno())
-        if replace:
-            temporary.replace(path)
-        else:
-            os.link(temporary, path)
-        _sync_directory(path.parent)
-    except RecordingError as err:  # nobody knows the file by its name for now
-        raise RecordingError(str(err).replace(name, str(path))) from err
-    finally:
-        for left in (temporary, journal_path(temporary)):
-            with contextlib.suppress(OSError):  # the file is written, or something else is said
-                left.unlink(missing_ok=True)
+    with files.replacing(path, overwrite=False) as new:
+        try:
+            yield new
+        except RecordingError as err:  # nobody knows the file by its name for now
+            raise RecordingError(str(err).replace(str(new), str(path))) from err
+        finally:
+            with contextlib.suppress(OSError):  # of a writer that was broken off
+                journal_path(new).unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -156,21 +148,3 @@ def locked(path: Path, *, exclusive: bool = True) -> int:
         drop_private(fd)
         raise
     return fd
-
-
-def _umask() -> int:
-    # There is no way to read it without setting it; Linux says it in /proc.
-    with contextlib.suppress(OSError, ValueError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("Umask:"):
-                return int(line.split()[1], 8)
-    return 0o022
-
-
-def _sync_directory(path: Path) -> None:
-    with contextlib.suppress(OSError):  # not every file system can
-        fd = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(fd)
-        finally:
-            os.close(fd)

@@ -88,7 +88,6 @@ def write(
     def attempt() -> None:
         headers = storage.list_episodes(wanted)
         with os_errors("cannot write the bundle", target), fill(target) as temporary:
-            temporary.unlink()
             _write_episodes(storage, benchmark_id, headers, temporary, attachments)
             if sign is not None:
                 sign_recording(temporary, sign)
@@ -113,7 +112,6 @@ def export(storage: FileStorage, target: Path, filter: BaseFilter | None = None)
             f"{', '.join(benchmarks)[:300] or 'nothing matches'}"
         )
     with os_errors("cannot export", target), fill(target) as temporary:
-        temporary.unlink()
         _write_episodes(storage, benchmarks[0], headers, temporary, None)
     return target
 
@@ -230,7 +228,6 @@ def from_recording(
             _environment(recording, path)  # refuses a recording that carries none
         kept = [int(number) for number in recording.index["episode"] if int(number) not in deleted]
         with os_errors("cannot write the bundle", target), fill(target) as temporary:
-            temporary.unlink()
             chosen = kept if len(kept) < len(recording) else None
             rewrite_recording(recording, temporary, episodes=chosen, attachments=attachments)
             if sign is not None:
@@ -426,6 +423,5 @@ def _copy(storage: FileStorage, recording: Recording, path: Path, benchmark_id: 
         if recording.complete and len(missing) == len(recording):
             shutil.copyfile(path, temporary)
         else:
-            temporary.unlink()
             rewrite_recording(recording, temporary, episodes=missing)
     storage.ingest(target)

@@ -191,7 +191,6 @@ class FileStorage(TupliStorage):
         spaces = episode_spaces(episodes, declared_spaces(benchmark.serialized))
         path = self.new_recording_path(benchmark_id)
         with os_errors("cannot record", path), fill(path) as temporary:
-            temporary.unlink()
             write_recording(
                 temporary,
                 (episode_data(episode, spaces) for episode in episodes),

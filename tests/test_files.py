@@ -1,0 +1,192 @@
+"""Files that take their place as a whole: what a link that somebody prepared, a full disk or a kill does to them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+from tupli_mcap import (
+    RecordEpisodes,
+    Recording,
+    files,
+    merge_recordings,
+    recover_recording,
+    rewrite_recording,
+)
+from tupli_mcap.recording.attach import add_attachments
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from tupli_mcap import files
+with files.replacing(Path(sys.argv[1])) as new:
+    new.write_bytes(b"half of it")
+    print("ready", flush=True)
+    time.sleep(600)
+"""
+
+
+@contextlib.contextmanager
+def writer(goal: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that has written half of a file; it is killed in the end."""
+    process = subprocess.Popen([sys.executable, "-c", HOLDER, str(goal)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        env.reset(seed=0)
+        while not any(env.step(0)[2:4]):
+            pass
+    return path
+
+
+def _rewrite(path: Path) -> None:
+    with Recording(path) as recording:
+        rewrite_recording(recording, path.with_name("out.mcap"))
+
+
+def _record(path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), path.with_name("out.mcap")) as env:
+        env.reset(seed=0)
+        env.step(0)
+
+
+WRITES: dict[str, Callable[[Path], object]] = {
+    "record": _record,
+    "rewrite": _rewrite,
+    "merge": lambda path: merge_recordings([path], path.with_name("out.mcap")),
+    "recover": lambda path: recover_recording(path, path.with_name("out.mcap")),
+    "attach": lambda path: add_attachments(path, {"a": ("text/plain", b"a")}),
+    "bytes": lambda path: files.write_bytes(path.with_name("out.mcap"), b"new"),
+}
+
+
+@pytest.mark.parametrize("name", WRITES)
+def test_no_link_that_somebody_prepared_is_followed(recording: Path, tmp_path: Path, name: str) -> None:
+    precious = tmp_path / "precious"
+    precious.write_bytes(b"precious data")
+    for goal in ("out.mcap", "r.mcap"):
+        for foreseen in (f".{goal}.{os.getpid()}.tmp", f"{goal}.journal.tmp"):
+            (tmp_path / foreseen).symlink_to(precious)
+    WRITES[name](recording)
+    assert precious.read_bytes() == b"precious data"
+    out = tmp_path / "out.mcap"
+    assert not out.is_symlink()
+    assert name == "attach" or out.stat().st_size
+    assert list(tmp_path.glob("*.journal")) == []
+
+
+def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
+    goal = tmp_path / "file"
+    with pytest.raises(ValueError, match="broken off"), files.replacing(goal) as new:
+        new.write_bytes(b"half")
+        raise ValueError("broken off")
+    assert list(tmp_path.iterdir()) == []
+    files.write_bytes(goal, b"first", overwrite=False)
+    with pytest.raises(FileExistsError, match=r"file'$"):
+        files.write_bytes(goal, b"second", overwrite=False)
+    assert goal.read_bytes() == b"first"
+    files.write_bytes(goal, b"second")
+    assert goal.read_bytes() == b"second"
+    assert list(tmp_path.iterdir()) == [goal]
+
+
+def test_nobody_else_can_look_into_what_is_being_written(tmp_path: Path) -> None:
+    with files.replacing(tmp_path / "file") as new:
+        assert stat.S_IMODE(new.parent.stat().st_mode) == 0o700
+        new.write_bytes(b"")
+
+
+def test_a_file_is_as_open_as_its_directory_is(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        files.write_bytes(tmp_path / "file", b"")
+        files.write_bytes(tmp_path / "key", b"", permissions=0o600)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
+    assert stat.S_IMODE((tmp_path / "key").stat().st_mode) == 0o600
+
+
+def test_an_error_names_the_file_and_not_the_temporary_one(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"none/file'$"):
+        files.write_bytes(tmp_path / "none" / "file", b"")
+    (tmp_path / "directory").mkdir()
+    with pytest.raises(IsADirectoryError, match="directory"):
+        files.write_bytes(tmp_path / "directory", b"")
+    assert [path.name for path in tmp_path.iterdir()] == ["directory"]
+
+
+# --- what killed processes leave
+
+
+def test_what_a_killed_process_left_is_told_from_what_is_in_use(tmp_path: Path) -> None:
+    with writer(tmp_path / "file") as process:
+        (temporary,) = tmp_path.iterdir()
+        assert files.is_temporary(temporary.name)
+        assert files.left_in(tmp_path) == [] == list(files.left_below(tmp_path))
+        assert files.remove_left([temporary]) == 0
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert files.left_in(tmp_path) == [temporary] == list(files.left_below(tmp_path.parent))
+    assert files.remove_left(files.left_in(tmp_path)) == len(b"half of it")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_was_just_made_is_left_alone(tmp_path: Path) -> None:
+    """Its writer is about to take the lock."""
+    made = [files.temporary_path(tmp_path) for _ in range(2)]
+    made[0].mkdir()
+    made[1].touch()
+    assert files.left_in(tmp_path) == []
+    for path in made:
+        os.utime(path, (time.time() - 3600,) * 2)
+    assert files.left_in(tmp_path) == sorted(made)
+
+
+def test_names_of_earlier_versions_and_of_others(tmp_path: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    left = [".0123456789abcdef.tmp", f".r.mcap.{ended.pid}.tmp", "r.mcap.journal.tmp"]
+    others = [f".r.mcap.{os.getpid()}.tmp", ".settings.tmp", "r.tmp", "r.mcap", "tmp"]
+    for name in (*left, *others):
+        (tmp_path / name).write_bytes(b"x")
+    link = files.temporary_path(tmp_path)
+    link.symlink_to(tmp_path / "r.mcap")
+    assert [path.name for path in files.left_in(tmp_path)] == sorted(left)
+    assert files.remove_left(tmp_path.iterdir()) == len(left)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, link.name])
+
+
+def test_a_journal_that_is_not_in_its_place_yet_is_in_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The map of a journal keeps its lock."""
+    found = []
+    monkeypatch.setattr(
+        "tupli_mcap.recording.journal.Journal.publish",
+        lambda self, *, durable: found.extend([self._temporary.exists(), *files.left_in(tmp_path)]),
+    )
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+        env.reset(seed=0)
+        env.step(0)
+    assert found == [True]

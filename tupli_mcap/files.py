@@ -1,0 +1,245 @@
+"""Files that take their place as a whole: the only place that makes temporary files and puts files at their paths.
+
+1. A new file is written in a directory of its own beside its goal. Nobody can foresee the name of that directory, and
+   only its owner may enter it, so nobody can prepare anything in it: a symbolic link, say.
+2. Its writer holds a lock on the directory until the file is at its goal. A process that dies loses the lock.
+3. The file is synced, then renamed to its goal, or linked where nothing may be replaced; then the names are synced.
+
+So a goal is the old file or the new one, and a temporary file that nobody holds was left by a process that was killed.
+A recording and a journal that are begun are files instead of directories, locked themselves.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import re
+import secrets
+import shutil
+import stat
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+__all__ = [
+    "create",
+    "hold",
+    "is_temporary",
+    "left_below",
+    "left_in",
+    "put",
+    "remove_left",
+    "replacing",
+    "sync",
+    "temporary_path",
+    "write_bytes",
+]
+
+_NEW = "new"  # the file in its directory; no suffix, so that nobody takes it for a recording
+# The last two are of earlier versions; those with the number of a process were not locked.
+_TEMPORARY = re.compile(
+    r"\.tupli-mcap-[0-9a-f]{32}\.tmp|.+\.journal\.tmp|\.[0-9a-f]{16}\.tmp|\..+\.(?P<pid>[0-9]{1,9})\.tmp"
+)
+_MOMENT = 60.0  # seconds in which a file that is still empty is locked by its writer
+_NO_SYNC = (errno.EINVAL, errno.ENOTSUP)  # not every file system syncs directories
+
+
+def temporary_path(directory: Path) -> Path:
+    """A path for a temporary file in a directory, which nobody can foresee."""
+    return directory / f".tupli-mcap-{secrets.token_hex(16)}.tmp"
+
+
+def create(path: Path, permissions: int = 0o666) -> int:
+    """A descriptor of a new, empty file; what is at its path goes.
+
+    Raises:
+        OSError: the system refuses, or somebody else has made a file there at this moment.
+    """
+    path.unlink(missing_ok=True)  # also a link that somebody has prepared
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, permissions)
+
+
+def hold(fd: int) -> None:
+    """Takes the lock that says a temporary file is in use; it is held as long as anybody has the descriptor, or a map
+    of it."""
+    with contextlib.suppress(OSError):  # no locks there: then nobody can tell that it is unheld either
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@contextlib.contextmanager
+def replacing(goal: Path, *, overwrite: bool = True) -> Iterator[Path]:
+    """The path of a file to make, which becomes `goal` when the block ends without an error.
+
+    Raises:
+        FileExistsError: `goal` exists by then, and not `overwrite`.
+        OSError: the system refuses; `goal` is as it was.
+    """
+    directory, fd = temporary_path(goal.parent), -1
+    new = directory / _NEW
+    try:
+        directory.mkdir(mode=0o700)
+        fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        hold(fd)
+        yield new
+        sync(new)
+        put(new, goal, overwrite=overwrite)
+        with contextlib.suppress(OSError):  # the file is there, whatever becomes of its name in a power loss
+            sync(goal.parent)
+    except OSError as err:
+        if err.filename is not None and os.fsdecode(err.filename).startswith(str(directory)):
+            err.filename = str(goal)  # nobody knows the file by its other name
+        raise
+    finally:
+        _remove(directory)
+        if fd >= 0:
+            with contextlib.suppress(OSError):  # nothing was written to it
+                os.close(fd)
+
+
+def write_bytes(goal: Path, data: bytes, *, overwrite: bool = True, permissions: int = 0o666) -> None:
+    """Writes a file as a whole; raises as `replacing` does."""
+    with replacing(goal, overwrite=overwrite) as new, os.fdopen(create(new, permissions), "wb") as file:
+        file.write(data)
+
+
+def put(new: Path, goal: Path, *, overwrite: bool) -> None:
+    """Gives a file its path, instead of the file that is there if `overwrite`.
+
+    Raises:
+        FileExistsError: there is one, and not `overwrite`.
+        OSError: the system refuses.
+    """
+    if overwrite:
+        new.replace(goal)
+        return
+    try:
+        os.link(new, goal)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        if os.path.lexists(goal):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(goal)) from None
+        new.rename(goal)
+        return
+    with contextlib.suppress(OSError):
+        new.unlink()
+
+
+def sync(path: Path) -> None:
+    """Waits until a file, or the names in a directory, are on the disk.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    except OSError as err:
+        if err.errno not in _NO_SYNC:
+            raise
+    finally:
+        os.close(fd)
+
+
+# ---- what killed processes have left
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file of that name is a temporary one."""
+    return _TEMPORARY.fullmatch(name) is not None
+
+
+def left_in(directory: Path) -> list[Path]:
+    """The temporary files of killed processes in a directory, but not in those below it.
+
+    Raises:
+        OSError: the directory cannot be read.
+    """
+    found = sorted(name for name in os.listdir(directory) if is_temporary(name))  # noqa: PTH208 - names only
+    return [path for path in map(directory.joinpath, found) if _is_left(path)]
+
+
+def left_below(root: Path) -> Iterator[Path]:
+    """The temporary files of killed processes in a directory and in all below it; links are not followed."""
+    for directory, below, names in os.walk(root):
+        place = Path(directory)
+        temporary = sorted(name for name in (*below, *names) if is_temporary(name))
+        below[:] = sorted(set(below).difference(temporary))
+        yield from (path for path in map(place.joinpath, temporary) if _is_left(path))
+
+
+def remove_left(paths: Iterable[Path]) -> int:
+    """Removes temporary files that nobody holds, and no others; returns how many bytes that frees."""
+    freed = 0
+    for path in paths:
+        with _unheld(path) as unheld, contextlib.suppress(OSError):
+            if unheld:
+                size = sum(_size(part) for part in (path, *path.rglob("*")))
+                _remove(path)
+                freed += 0 if os.path.lexists(path) else size
+    return freed
+
+
+def _size(path: Path) -> int:
+    status = path.lstat()
+    return status.st_size if stat.S_ISREG(status.st_mode) else 0
+
+
+def _is_left(path: Path) -> bool:
+    with _unheld(path) as unheld:
+        return unheld
+
+
+@contextlib.contextmanager
+def _unheld(path: Path) -> Iterator[bool]:
+    """Whether nobody holds a temporary file; within the block nobody can come to hold it."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:  # gone, or somebody else's
+        yield False
+        return
+    try:
+        yield is_temporary(path.name) and _is_unheld(fd, path)
+    finally:
+        os.close(fd)
+
+
+def _is_unheld(fd: int, path: Path) -> bool:
+    status = os.fstat(fd)
+    if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    found = _TEMPORARY.fullmatch(path.name)
+    if found is not None and found["pid"] is not None and _lives(int(found["pid"])):
+        return False
+    is_empty = not status.st_size if stat.S_ISREG(status.st_mode) else not os.listdir(fd)
+    return not is_empty or time.time() - status.st_mtime > _MOMENT
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _remove(path: Path) -> None:
+    """Removes a temporary file, or a directory with what is in it, as far as the system allows it."""
+    with contextlib.suppress(OSError):
+        if not stat.S_ISDIR(path.lstat().st_mode):
+            path.unlink()
+            return
+        with contextlib.suppress(OSError):  # without a descriptor, which may not be had any more
+            (path / _NEW).unlink()
+        try:
+            path.rmdir()
+        except OSError:
+            shutil.rmtree(path, ignore_errors=True)
