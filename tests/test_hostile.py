@@ -308,6 +308,17 @@ def test_a_size_that_lies_either_way(name: str, wrong: int) -> None:
             decompress(name, memoryview(bytes(lying)), claimed, "here")
 
 
+@pytest.mark.parametrize("name", ["zstd", "lz4"])
+def test_nothing_follows_the_frame_of_a_chunk(name: str) -> None:
+    """Readers that go on to the next frame would see other messages."""
+    data = bytes(range(250)) * 4
+    plain = zstandard.ZstdCompressor().compress(data) if name == "zstd" else lz4.frame.compress(data)
+    assert bytes(decompress(name, memoryview(plain), len(data), "here")) == data
+    for more in (plain, b"x"):
+        with pytest.raises(FormatError, match="here: .*(unused data|bytes behind it)"):
+            decompress(name, memoryview(plain + more), len(data), "here")
+
+
 @pytest.mark.parametrize(
     "name", [b"../../x", b"/etc/passwd", b"a\0b", b"CON", b"", b"\xff", b"x" * 70_000, b"artifacts/../../x"]
 )

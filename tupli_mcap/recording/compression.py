@@ -23,16 +23,24 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
-    """`size` bytes, or FormatError: neither more is produced nor allocated than `size`."""
+    """`size` bytes of one frame, or FormatError: neither more is produced nor allocated than `size`.
+
+    Nothing may follow the frame: other readers would read on in it.
+    """
     try:
         if name == "zstd":
             if zstandard.frame_content_size(data) not in (size, zstandard.CONTENTSIZE_UNKNOWN):
                 raise FormatError(
                     f"{where}: expected {size} bytes, the zstd frame says {zstandard.frame_content_size(data)}"
                 )
-            found: Any = _decompressor().decompress(data, max_output_size=size)
+            found: Any = _decompressor().decompress(data, max_output_size=size, allow_extra_data=False)
         elif name == "lz4":
-            found = lz4.frame.LZ4FrameDecompressor().decompress(bytes(data), max_length=size + 1)
+            frame = lz4.frame.LZ4FrameDecompressor()
+            found = frame.decompress(bytes(data), max_length=size + 1)
+            if frame.unused_data:
+                raise FormatError(
+                    f"{where}: expected one lz4 frame, found {len(frame.unused_data)} bytes behind it"
+                )
         elif name == "":
             found = data
         else:
