@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import shutil
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,10 @@ import gymnasium as gym
 import pytest
 from cryptography.hazmat.primitives import serialization as ser
 from cryptography.hazmat.primitives.asymmetric import ed25519, rsa
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.records import Chunk, ChunkIndex, DataEnd, McapRecord, Message, Metadata, Statistics, SummaryOffset
 from test_cli import fails, ok, run
 from test_environment import Counter
 
@@ -38,6 +45,7 @@ from tupli_mcap.errors import (
     UntrustedError,
 )
 from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.recording.container import Container, Prepared, Rows
 from tupli_mcap.recording.signature import check_signature, sign_recording, verify_signature
 from tupli_mcap.recording.signed import SIGNATURE_NAME, Signed
 from tupli_mcap.recording.verify import verify_recording
@@ -327,6 +335,148 @@ def test_a_changed_step_is_found(bundle: Path, tmp_path: Path) -> None:
         rewrite_recording(recording, tmp_path / "forged.mcap", attachments=forged, compression="lz4")
     with pytest.raises(SignatureError, match="the channel '/step' was changed after signing"):
         verified(tmp_path / "forged.mcap")
+
+
+# --- what other readers see ---
+
+
+def seen(path: Path) -> list[Any]:
+    """What the readers of the `mcap` package see, by the order of the file and by its indexes, in every order."""
+    found = []
+    for reader, order in itertools.product((SeekingReader, NonSeekingReader), (False, True)):
+        with path.open("rb") as file:
+            messages = reader(file).iter_messages(log_time_order=order)
+            found.append(sorted((c.topic, s.data, m.sequence, m.data) for s, c, m in messages))
+    return found
+
+
+def _record(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def _forged_chunk() -> bytes:
+    message = _record(Message(channel_id=1, log_time=5, data=b"forged", publish_time=5, sequence=0))
+    return _record(Chunk("", message, 5, 5, zlib.crc32(message), len(message)))
+
+
+def _other_definitions(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    real = Container.definitions
+    monkeypatch.setattr(
+        Container, "definitions", lambda self, channel: real(self, channel).replace(b" reward", b" regret")
+    )
+    return {}
+
+
+def _messages_among_the_definitions(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    real = Container.prepare
+
+    def prepare(self: Container, rows: Rows) -> Prepared:
+        chunk = real(self, rows)
+        first = bytes(rows.data[: int((*rows.offsets, len(rows.data))[1])])
+        data = bytes(chunk.data[: chunk.skip]) + first + bytes(chunk.data[chunk.skip :])
+        return Prepared(rows, chunk.skip + len(first), data, zlib.crc32(data))
+
+    monkeypatch.setattr(Container, "prepare", prepare)
+    return {}
+
+
+def _an_index_into_an_attachment(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The summary names a chunk in an attachment, where anybody may add one, instead of those that were signed."""
+    chunk = _forged_chunk()
+    real = Container.finish
+
+    def finish(self: Container) -> None:
+        (note,) = (index for index in self.attachment_indexes if index.name == "note")
+        at = note.offset + note.length - 4 - len(chunk)
+        size = len(chunk) - 49
+        index = _record(ChunkIndex(len(chunk), at, "", size, 5, 0, {}, 5, size))
+        self.chunk_indexes = [index] * len(self.chunk_indexes)
+        real(self)
+
+    monkeypatch.setattr(Container, "finish", finish)
+    return {"note": ("text/plain", chunk)}
+
+
+def _a_chunk_behind_the_data(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Who reads the file in its order goes on behind the end of the data, up to the footer."""
+    real = Container.finish
+
+    def finish(self: Container) -> None:
+        self.write(_record(DataEnd(0)), _forged_chunk())
+        real(self)
+
+    monkeypatch.setattr(Container, "finish", finish)
+    return {}
+
+
+def _metadata_in_the_summary(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Behind the last group of records that the summary lists, counted nowhere."""
+    extra = Metadata("tupli_mcap.recording", {"benchmark_id": "forged"})
+    finish, statistics = Container.finish, Container._statistics
+
+    def longer(self: Container) -> None:
+        self.metadata_indexes.append(extra)  # type: ignore[arg-type]
+        finish(self)
+
+    def offset(opcode: int, start: int, length: int) -> SummaryOffset:
+        return SummaryOffset(opcode, start, length - len(_record(extra)) * (opcode == Opcode.METADATA_INDEX))
+
+    def counted(self: Container) -> Statistics:
+        return replace(statistics(self), metadata_count=len(self.metadata_indexes) - 1)
+
+    monkeypatch.setattr(Container, "finish", longer)
+    monkeypatch.setattr(Container, "_statistics", counted)
+    monkeypatch.setattr("tupli_mcap.recording.container.SummaryOffset", offset)
+    return {}
+
+
+def _an_older_attachment(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The environment is in the file twice: the summary lists the signed one only."""
+    real = Container.start
+
+    def start(self: Container, library: str) -> None:
+        real(self, library)
+        self.add_attachment("benchmark.json", "application/json", b"{}", 0)
+        self.attachment_indexes.clear()
+
+    monkeypatch.setattr(Container, "start", start)
+    return {}
+
+
+FORGERIES: dict[str, tuple[Callable[[pytest.MonkeyPatch], dict[str, Any]], str]] = {
+    "definitions": (_other_definitions, "schema records say other than the data"),
+    "skipped": (_messages_among_the_definitions, "expected consecutive rows in it"),
+    "index": (_an_index_into_an_attachment, "chunk index records say other than the data"),
+    "behind the data": (_a_chunk_behind_the_data, "the end of the data"),
+    "summary": (_metadata_in_the_summary, "expected no record with opcode 12 in the summary"),
+    "twice": (_an_older_attachment, "'benchmark.json' is in it twice"),
+}
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_file_that_others_read_otherwise_does_not_fit(
+    bundle: Path, tmp_path: Path, name: str, alice: signing.SigningKey
+) -> None:
+    """Every reader sees what was signed; where one sees something else, the signature is refused."""
+    honest = seen(tampered(bundle, tmp_path / "honest.mcap", compression="lz4"))
+    assert all(messages == honest[0] for messages in honest)
+    verified(tmp_path / "honest.mcap")
+    forge, message = FORGERIES[name]
+    with pytest.MonkeyPatch.context() as mallory:
+        attachments = forge(mallory)
+        tampered(bundle, tmp_path / "forged.mcap", compression="lz4", attachments=attachments)
+    assert name in ("summary", "twice") or seen(tmp_path / "forged.mcap") != honest
+    with Recording(bundle) as original, Recording(tmp_path / "forged.mcap") as forged:
+        assert str(forged.read().rewards) == str(original.read().rewards)
+    expected = f"other readers may see something else in it than what is signed: .*{message}"
+    with pytest.raises(SignatureError, match=expected):
+        verified(tmp_path / "forged.mcap")
+    with pytest.raises(SignatureError, match=expected):
+        sign_recording(tmp_path / "forged.mcap", alice)
+    with FileStorage(tmp_path / "lab") as storage, pytest.raises(SignatureError, match=expected):
+        storage.import_bundle(tmp_path / "forged.mcap", require_signature=True, signers=[alice.public_key])
 
 
 def test_a_signed_recording_is_not_appended_to(bundle: Path) -> None:

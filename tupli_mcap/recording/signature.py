@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any, NamedTuple
-
-from mcap.opcode import Opcode
 
 from tupli_mcap import signing, trust
 from tupli_mcap.environment import canonical_json, sha256
 from tupli_mcap.errors import FormatError, SignatureError
 from tupli_mcap.recording.attach import add_attachments
-from tupli_mcap.recording.container import MAGIC
+from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.findings import Findings, VerifyReport
+from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.signed import (
     SIGNATURE_MEDIA_TYPE,
@@ -26,10 +26,11 @@ from tupli_mcap.recording.signed import (
     Signed,
     is_covered_kind,
 )
+from tupli_mcap.recording.tail import read_tail
+from tupli_mcap.recording.verify_structure import Structure
 
 __all__ = ["SIGNATURE_NAME", "Signature", "check_signature", "sign_recording", "verify_signature"]
 
-_RECORD_HEAD = 9
 # Of the metadata; the other keys are about the file as it happened to be written.
 _IDENTITY = ("uuid", "format_version", "library", "created_ns", "benchmark_id")
 
@@ -59,7 +60,7 @@ def sign_recording(path: str | os.PathLike[str], key: signing.SigningKey) -> Sig
     """Adds the signature of a key to a finished recording, instead of one that is there; it is replaced in one rename.
 
     Raises:
-        SignatureError: the recording is not finished.
+        SignatureError: the recording is not finished, or not every reader would see the same in it.
         RecordingError, FormatError: it cannot be read or written.
     """
     with Recording(path) as recording:
@@ -67,7 +68,9 @@ def sign_recording(path: str | os.PathLike[str], key: signing.SigningKey) -> Sig
             raise SignatureError(
                 f"{recording.name}: only a finished recording can be signed; recover it first"
             )
-        signed = Signed.make(_manifest(recording), key)
+        manifest = _manifest(recording)
+        _check_readers(recording, manifest["attachments"], None)
+        signed = Signed.make(manifest, key)
     add_attachments(path, {SIGNATURE_NAME: (SIGNATURE_MEDIA_TYPE, signed.encode())})
     with Recording(path) as written:  # a signature that does not fit is worse than none
         return verify_signature(written)
@@ -78,8 +81,10 @@ def check_signature(recording: Recording) -> Signature | None:
     return verify_signature(recording) if SIGNATURE_NAME in recording.attachments else None
 
 
-def verify_signature(recording: Recording) -> Signature:
+def verify_signature(recording: Recording, walk: Structure | None = None) -> Signature:
     """Checks the signature of a recording against everything it covers; all chunks are read.
+
+    walk: of the file, if somebody has made it already.
 
     Raises:
         SignatureError: there is none, or it does not fit: the message says what was changed.
@@ -95,9 +100,9 @@ def verify_signature(recording: Recording) -> Signature:
         raise SignatureError(f"{name}: its signature was not made by the key {fingerprint} that it names")
     if not recording.complete:
         raise SignatureError(f"{name}: what was signed is finished, this recording is not")
-    _check_records(recording)
     found = _manifest(recording)
     _compare(signed.manifest, found, f"{name}, signed by {fingerprint}")
+    _check_readers(recording, found["attachments"], walk)
     names = {key.public_key: key.name for key in trust.trusted_keys()}
     not_covered = tuple(
         sorted(recording.attachments.keys() - {*signed.manifest["attachments"], SIGNATURE_NAME})
@@ -148,26 +153,23 @@ def _channel(recording: Recording, number: int) -> dict[str, Any]:
     return {"topic": channel.topic, "messages": store.count(number), "sha256": digest.hexdigest()}
 
 
-def _check_records(recording: Recording) -> None:
-    """The chunks in the file must be those of the index, which were hashed: other tools read the file in its order."""
-    contents, source = recording._contents, recording._source
-    listed = sorted(int(offset) for offset in contents.table["offset"])
-    position, found = len(MAGIC), 0
-    for _ in range(8 * len(listed) + 4 * len(contents.channels) + len(contents.attachments) + 1000):
-        if position >= contents.data_end:
-            break
-        head = source.read(position, _RECORD_HEAD)
-        if head[0] == Opcode.CHUNK:
-            if found >= len(listed) or listed[found] != position:
-                break
-            found += 1
-        elif head[0] == Opcode.MESSAGE:
-            break
-        position += _RECORD_HEAD + int.from_bytes(head[1:], "little")
-    if position != contents.data_end or found != len(listed):
+def _check_readers(recording: Recording, covered: Container[str], walk: Structure | None) -> None:
+    """Other readers go by the definitions in the chunks, by the summary's indexes, or by the order of the file: what
+    they see must be what was hashed, so all of it must agree, and nothing `covered` may be there twice."""
+    if walk is None:
+        source = recording._source
+        walk = Structure(source, read_tail(source), Findings(VerifyReport(recording.name)))
+        walk.run()
+    wrong = [problem.message + f" ({problem.place})" * bool(problem.place) for problem in walk.report.errors]
+    wrong += [
+        f"{name!r:.100} is in it twice"
+        for name in sorted(walk.repeated)
+        if name in covered or is_covered_kind(name) or name in (INDEX_NAME, RECORDING_METADATA)
+    ]
+    if wrong:
         raise SignatureError(
-            f"{recording.name}: expected the {len(listed)} chunks that were signed and nothing else, found another "
-            f"record at offset {position}"
+            f"{recording.name}: other readers may see something else in it than what is signed: {wrong[0]}; "
+            "ask its signer for another copy, or write it anew with tupli-mcap bundle"
         )
 
 

@@ -181,7 +181,7 @@ def _carried(recording: Recording, structure: Structure, findings: Findings) -> 
                 _benchmark(recording, findings)
             elif name == SIGNATURE_NAME:
                 with findings.following(structure.missing):
-                    _signature(recording, findings)
+                    _signature(recording, structure, findings)
         except TupliError as err:
             findings.error("benchmark", str(err).removeprefix(f"{recording.name}: "))
     if "env.cloudpickle" in recording.attachments and "benchmark.json" not in recording.attachments:
@@ -197,9 +197,9 @@ def _names_pickle(recording: Recording) -> bool:
         return False
 
 
-def _signature(recording: Recording, findings: Findings) -> None:
+def _signature(recording: Recording, structure: Structure, findings: Findings) -> None:
     try:
-        verify_signature(recording)
+        verify_signature(recording, structure)
     except MissingExtraError as err:
         findings.note("signature", "it is signed, which was not checked", str(err))
     except SignatureError as err:

@@ -15,7 +15,7 @@ from tupli_mcap.recording.checked import message_index
 from tupli_mcap.recording.checksums import check_crc
 from tupli_mcap.recording.container import CHUNK_ROWS, COMPRESSIONS, MAGIC, PROFILE
 from tupli_mcap.recording.contents import CHANNEL_KEYS, RECORDING_KEYS, RECORDING_METADATA, is_ours
-from tupli_mcap.recording.findings import Findings
+from tupli_mcap.recording.findings import Findings, VerifyReport
 from tupli_mcap.recording.headers import ChunkRecords, chunk_records
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.source import Source
@@ -29,6 +29,11 @@ _CDR = int.from_bytes(CDR_HEADER, "little")
 _KINDS = {
     Opcode.CHUNK: "chunk", Opcode.ATTACHMENT: "attachment", Opcode.MESSAGE_INDEX: "message_index",
     Opcode.METADATA: "metadata",
+}  # fmt: skip
+
+_SUMMARY = {
+    Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX,
+    Opcode.STATISTICS,
 }  # fmt: skip
 
 
@@ -65,6 +70,13 @@ class Structure:
         self.missing = False  # damage that rows may have been lost with
         self._ended = False
         self._outside: set[tuple[type[Any], int]] = set()  # definitions outside chunks
+        self._names: set[tuple[int, str]] = set()
+        self.repeated: set[str] = set()  # names of several attachments, or of several metadata records
+
+    @property
+    def report(self) -> VerifyReport:
+        """What was found."""
+        return self._findings.report
 
     # ---- the data section
 
@@ -119,6 +131,7 @@ class Structure:
             self._chunk(found, found.chunk)
         elif found.attachment is not None:
             self._attachments.append(found.attachment)
+            self._name(Opcode.ATTACHMENT, found.attachment.name)
         elif found.opcode == Opcode.MESSAGE_INDEX:
             with self._findings.following(behind_damage):
                 self._message_index(found, waiting)
@@ -128,6 +141,9 @@ class Structure:
             self._define(record, found.offset)
         elif found.opcode == Opcode.DATA_END:
             self._ended = True
+            end = found.offset + found.length
+            if self._tail.data_end not in (None, end):
+                self._findings.error("record", "expected the summary after the end of the data", offset=end)
             if bytes(found.body) != bytes(4):
                 self._findings.error(
                     "record", "expected 0 as the CRC of the data section", offset=found.offset
@@ -149,12 +165,18 @@ class Structure:
         elif found.opcode == Opcode.METADATA:
             record = parse_record(found.opcode, found.body, found.offset, self._source.name)
             self._metadata.append(MetadataIndex(found.offset, found.length, record.name))
+            self._name(Opcode.METADATA, record.name)
             if record.name == RECORDING_METADATA:
                 self._crc(record.metadata, RECORDING_KEYS, "metadata", found.offset)
             elif self._records == 2:
                 self._findings.error(
                     "metadata", f"expected {RECORDING_METADATA!r} first", offset=found.offset
                 )
+
+    def _name(self, opcode: int, name: str) -> None:
+        if (opcode, name) in self._names:
+            self.repeated.add(name)
+        self._names.add((opcode, name))
 
     def _crc(self, values: dict[str, str], known: Sequence[str], kind: str, offset: int) -> None:
         try:
@@ -293,6 +315,9 @@ class Structure:
                     "summary", f"records with opcode {opcode} are not together", offset=offset
                 )
             group[1] = offset + 9 + len(body)
+        for opcode in sorted(found.keys() - _SUMMARY):
+            why = f"expected no record with opcode {opcode} in the summary"
+            self._findings.error("summary", why, offset=groups[opcode][0])
         for opcode, wanted in (
             (Opcode.SCHEMA, list(self.schemas.values())),
             (Opcode.CHANNEL, list(self.channels.values())),
