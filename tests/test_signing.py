@@ -41,6 +41,7 @@ from tupli_mcap.errors import (
     MissingExtraError,
     NotFoundError,
     SignatureError,
+    StorageError,
     TupliError,
     UntrustedError,
 )
@@ -49,7 +50,7 @@ from tupli_mcap.recording.container import Container, Prepared, Rows
 from tupli_mcap.recording.signature import check_signature, sign_recording, verify_signature
 from tupli_mcap.recording.signed import SIGNATURE_NAME, Signed
 from tupli_mcap.recording.verify import verify_recording
-from tupli_mcap.schema import ArtifactMetadata
+from tupli_mcap.schema import ArtifactMetadata, FilterEQ
 
 
 def write_key(path: Path, *, format: str = "ssh", passphrase: str | None = None) -> signing.SigningKey:
@@ -322,7 +323,8 @@ def test_a_change_is_found_and_named(
         verified(tampered(bundle, tmp_path / "other.mcap", **change(bundle)))
 
 
-def test_a_changed_step_is_found(bundle: Path, tmp_path: Path) -> None:
+def with_another_step(bundle: Path, target: Path) -> Path:
+    """A copy of a bundle with its signature in which one step is another, all CRCs right."""
     with Recording(bundle) as recording:
         signature = recording.read_attachment(SIGNATURE_NAME)
         store = recording._store
@@ -332,9 +334,13 @@ def test_a_changed_step_is_found(bundle: Path, tmp_path: Path) -> None:
         store.chunk(chunk).data = bytes(body)  # what a forger would write, with all CRCs and indexes right
         forged = {SIGNATURE_NAME: ("application/json", signature)}
         # compressed anew, so that no chunk is copied as it is in the file
-        rewrite_recording(recording, tmp_path / "forged.mcap", attachments=forged, compression="lz4")
+        rewrite_recording(recording, target, attachments=forged, compression="lz4")
+    return target
+
+
+def test_a_changed_step_is_found(bundle: Path, tmp_path: Path) -> None:
     with pytest.raises(SignatureError, match="the channel '/step' was changed after signing"):
-        verified(tmp_path / "forged.mcap")
+        verified(with_another_step(bundle, tmp_path / "forged.mcap"))
 
 
 # --- what other readers see ---
@@ -691,6 +697,98 @@ def test_a_required_signature(bundle: Path, tmp_path: Path, alice: signing.Signi
         storage.import_bundle(bundle, require_signature=True, signers=[alice.public_key])
         assert storage.count_episodes() == 3
         assert trust.trusted_digests() == []  # a key that is only named for this import
+
+
+def steps_in(storage: FileStorage) -> str:
+    found = []
+    for header in storage.list_episodes():
+        with storage.open_recording(header.recording) as recording:
+            columns = recording.read()
+            found.append(
+                (header.id, columns.states.tolist(), columns.actions.tolist(), columns.rewards.tolist())
+            )
+    return str(found)
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+@pytest.mark.filterwarnings("ignore:skipped a recording")
+def test_who_was_there_first_under_its_name_does_not_count(
+    bundle: Path, tmp_path: Path, alice: signing.SigningKey, by_hand: bool
+) -> None:
+    """The same UUID and the same episodes, with other contents: that is no copy of what was signed."""
+    forged = with_another_step(bundle, tmp_path / "forged.mcap")
+    with FileStorage(tmp_path / "lab") as storage:
+        if by_hand:
+            shutil.copy(forged, tmp_path / "lab" / "a.mcap")
+        else:
+            storage.import_bundle(forged)
+        before = steps_in(storage)
+        (name,) = {header.recording for header in storage.list_episodes()}
+        expected = f"with other contents: '{name}' differs from '{bundle}'; delete the one that is wrong"
+        for signers in ([alice.public_key], []):
+            with pytest.raises(StorageError, match=re.escape(expected)):
+                storage.import_bundle(bundle, require_signature=bool(signers), signers=signers)
+        assert steps_in(storage) == before
+        assert storage.count_episodes() == 3
+        assert len(list((tmp_path / "lab").rglob("*.mcap"))) == 1
+        storage.delete_episodes(FilterEQ(key="recording", value=name))
+        storage.import_bundle(bundle, require_signature=True, signers=[alice.public_key])
+        assert storage.count_episodes() == 3
+        assert steps_in(storage) != before
+
+
+def test_a_part_that_is_there_with_the_same_contents(
+    bundle: Path, tmp_path: Path, alice: signing.SigningKey
+) -> None:
+    """Compressed otherwise, without a signature, some of the episodes only: still the same episodes."""
+    part = tmp_path / "part.mcap"
+    with Recording(bundle) as recording:
+        rewrite_recording(recording, part, episodes=[1], compression="lz4")
+    with FileStorage(tmp_path / "lab") as storage:
+        storage.import_bundle(part)
+        for _ in range(2):
+            storage.import_bundle(bundle, require_signature=True, signers=[alice.public_key])
+            assert storage.count_episodes() == 3
+            assert len({header.id for header in storage.list_episodes()}) == 3
+        storage.import_bundle(part)
+        assert len(list((tmp_path / "lab").rglob("*.mcap"))) == 2
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_what_was_checked_is_what_is_taken(
+    bundle: Path, tmp_path: Path, alice: signing.SigningKey, monkeypatch: pytest.MonkeyPatch, in_place: bool
+) -> None:
+    """The file is another one, or other bytes, as soon as it has been checked."""
+    honest = bundle.read_bytes()
+    forged = with_another_step(bundle, tmp_path / "forged.mcap").read_bytes()
+    with FileStorage(tmp_path / "other") as other:
+        other.import_bundle(bundle)
+        expected = steps_in(other)
+    store_benchmark = FileStorage.store_benchmark
+
+    def swap(self: FileStorage, query: Any) -> Any:
+        if in_place:
+            with bundle.open("r+b") as file:
+                file.write(forged)
+                file.truncate()
+        else:
+            (tmp_path / "new").write_bytes(forged)
+            (tmp_path / "new").replace(bundle)
+        return store_benchmark(self, query)
+
+    with FileStorage(tmp_path / "lab") as storage:
+        with monkeypatch.context() as swapping:
+            swapping.setattr(FileStorage, "store_benchmark", swap)
+            if in_place:
+                with pytest.raises((SignatureError, FormatError), match="bundle|recordings"):
+                    storage.import_bundle(bundle, require_signature=True, signers=[alice.public_key])
+                assert storage.count_episodes() == 0
+            else:
+                storage.import_bundle(bundle, require_signature=True, signers=[alice.public_key])
+                assert steps_in(storage) == expected
+        bundle.write_bytes(honest)
+        storage.import_bundle(bundle, require_signature=True, signers=[alice.public_key])
+        assert steps_in(storage) == expected
 
 
 def test_without_the_extra(

@@ -29,6 +29,7 @@ __all__ = [
     "is_temporary",
     "left_below",
     "left_in",
+    "private_directory",
     "put",
     "remove_left",
     "replacing",
@@ -76,20 +77,33 @@ def replacing(goal: Path, *, overwrite: bool = True) -> Iterator[Path]:
         FileExistsError: `goal` exists by then, and not `overwrite`.
         OSError: the system refuses; `goal` is as it was.
     """
-    directory, fd = temporary_path(goal.parent), -1
-    new = directory / _NEW
-    try:
-        directory.mkdir(mode=0o700)
-        fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-        hold(fd)
+    with private_directory(goal.parent, shown=goal) as directory:
+        new = directory / _NEW
         yield new
         sync(new)
         put(new, goal, overwrite=overwrite)
         with contextlib.suppress(OSError):  # the file is there, whatever becomes of its name in a power loss
             sync(goal.parent)
+
+
+@contextlib.contextmanager
+def private_directory(parent: Path, *, shown: Path) -> Iterator[Path]:
+    """A directory that only this user may enter, and that goes with what is in it when the block ends.
+
+    shown: what the system's errors name instead of it.
+
+    Raises:
+        OSError: the system refuses.
+    """
+    directory, fd = temporary_path(parent), -1
+    try:
+        directory.mkdir(mode=0o700)
+        fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        hold(fd)
+        yield directory
     except OSError as err:
         if err.filename is not None and os.fsdecode(err.filename).startswith(str(directory)):
-            err.filename = str(goal)  # nobody knows the file by its other name
+            err.filename = str(shown)  # nobody knows the file by its other name
         raise
     finally:
         _remove(directory)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from tupli_mcap import signing, trust
+from tupli_mcap import files, signing, trust
 from tupli_mcap.environment import canonical_json, sha256
 from tupli_mcap.errors import FormatError, SignatureError
 from tupli_mcap.recording.attach import add_attachments
@@ -19,6 +20,7 @@ from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.findings import Findings, VerifyReport
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.signed import (
     SIGNATURE_MEDIA_TYPE,
     SIGNATURE_NAME,
@@ -29,7 +31,14 @@ from tupli_mcap.recording.signed import (
 from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.recording.verify_structure import Structure
 
-__all__ = ["SIGNATURE_NAME", "Signature", "check_signature", "sign_recording", "verify_signature"]
+__all__ = [
+    "SIGNATURE_NAME",
+    "Signature",
+    "check_signature",
+    "episodes_alike",
+    "sign_recording",
+    "verify_signature",
+]
 
 # Of the metadata; the other keys are about the file as it happened to be written.
 _IDENTITY = ("uuid", "format_version", "library", "created_ns", "benchmark_id")
@@ -112,20 +121,45 @@ def verify_signature(recording: Recording, walk: Structure | None = None) -> Sig
     )
 
 
+def episodes_alike(one: Recording, other: Recording, numbers: Sequence[int], directory: Path) -> bool:
+    """Whether the episodes of these numbers are the same in two recordings: steps, events, images, frames, times.
+
+    directory: where to write them anew meanwhile, for other episodes may lie between them, in other chunks.
+
+    Raises:
+        FormatError: one of the recordings is damaged.
+        RecordingError: the directory cannot be written to.
+    """
+    found = []
+    for recording in (one, other):
+        with files.private_directory(directory, shown=directory) as private:
+            rewrite_recording(recording, private / "episodes", episodes=numbers)
+            with Recording(private / "episodes") as written:
+                found.append(_contents(written))
+    return found[0] == found[1]
+
+
 def _manifest(recording: Recording) -> dict[str, Any]:
     """What a signature covers, as it is in the file now."""
-    index = recording._contents.index
     carried = "benchmark.json" in recording.attachments
     return {
         "format": "tupli_mcap.manifest",
         "version": 1,
-        "recording": {key: recording.metadata[key] for key in _IDENTITY if key in recording.metadata},
+        **_contents(recording),
         "environment": recording.benchmark.record.digest if carried else None,
         "attachments": {
             name: sha256(recording.read_attachment(name))
             for name in sorted(recording.attachments)
             if name not in STATEMENTS
         },
+    }
+
+
+def _contents(recording: Recording) -> dict[str, Any]:
+    """The part of the manifest that is about episodes."""
+    index = recording._contents.index
+    return {
+        "recording": {key: recording.metadata[key] for key in _IDENTITY if key in recording.metadata},
         "channels": {
             str(number): _channel(recording, number) for number in sorted(recording._contents.channels)
         },

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from tupli_mcap import files
-from tupli_mcap.errors import RecordingError, StorageError
+from tupli_mcap.errors import FormatError, RecordingError, SignatureError, StorageError
 from tupli_mcap.recording import journal_path
 from tupli_mcap.recording.lock import drop_private, open_private
 from tupli_mcap.system import refused
@@ -47,8 +47,12 @@ def fill(path: Path) -> Iterator[Path]:
     with files.replacing(path, overwrite=False) as new:
         try:
             yield new
-        except RecordingError as err:  # nobody knows the file by its name for now
-            raise RecordingError(str(err).replace(str(new), str(path))) from err
+        except (
+            FormatError,
+            RecordingError,
+            SignatureError,
+        ) as err:  # nobody knows the file by its name for now
+            raise type(err)(str(err).replace(str(new), str(path))) from err
         finally:
             with contextlib.suppress(OSError):  # of a writer that was broken off
                 journal_path(new).unlink(missing_ok=True)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import shutil
+import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,10 +14,17 @@ from pydantic import ValidationError
 from tupli_mcap import trust as _trust
 from tupli_mcap.environment import EnvironmentRecord, sha256
 from tupli_mcap.errors import FormatError, NotFoundError, SignatureError, StepError, StorageError
+from tupli_mcap.files import create
 from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
 from tupli_mcap.recording.cameras import EncodedFrame
 from tupli_mcap.recording.framing import CAMERA
-from tupli_mcap.recording.signature import SIGNATURE_NAME, Signature, sign_recording, verify_signature
+from tupli_mcap.recording.signature import (
+    SIGNATURE_NAME,
+    Signature,
+    episodes_alike,
+    sign_recording,
+    verify_signature,
+)
 from tupli_mcap.schema import (
     ArtifactMetadata,
     BaseFilter,
@@ -50,6 +57,8 @@ if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
 
 __all__ = ["ImportPreview", "checked_signature", "export", "from_recording", "preview", "read", "write"]
+
+_PIECE = 1 << 22
 
 Attachments = dict[str, tuple[str, bytes]]
 
@@ -136,13 +145,14 @@ def read(
     Raises:
         SignatureError: A signature is required, and missing, not fitting, or of another key.
         FormatError: The file is damaged, or its contents are not what its benchmark says.
-        StorageError: It carries no benchmark, or lacks an artifact.
+        StorageError: It carries no benchmark, or lacks an artifact; or the storage holds episodes of this recording
+            already, with other contents.
     """
-    with Recording(path) as recording:
+    with Recording(path) as recording:  # what is refused leaves nothing behind
         signature = checked_signature(recording, require_signature, signers)
         record, header, query = incoming(recording, path)
-        artifacts = _read_artifacts(storage, recording, record, path)
-        for data, metadata in artifacts:
+        _missing(storage, recording)
+        for data, metadata in _read_artifacts(storage, recording, record, path):
             storage.store_artifact(data, metadata)
         if trust:
             _trust.trust(record.digest)
@@ -150,7 +160,16 @@ def read(
             _trust.vouch(record.digest, signature.public_key)
         with storage.import_lock:
             storage.store_benchmark(query)
-            _copy(storage, recording, path, header.id)
+
+            def check(copy: Recording) -> None:
+                if require_signature:
+                    checked_signature(copy, True, signers)
+                if incoming(copy, path)[1].id != header.id:
+                    raise FormatError(
+                        f"{path} was replaced by another bundle while it was imported; import that"
+                    )
+
+            _copy(storage, recording, header.id, check)
     return header.id
 
 
@@ -405,23 +424,70 @@ def _read_artifacts(
 
 
 def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
-    """Numbers of the episodes that the storage does not hold yet."""
+    """Numbers of the episodes that the storage does not hold yet.
+
+    Raises:
+        StorageError: It holds others under their names.
+    """
     ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
     if storage is None:
         return list(ids.values())
-    present = {header.id for header in storage.list_episodes(FilterIN(key="id", value=list(ids)))}
-    return [number for uri, number in ids.items() if uri not in present]
+    here: dict[str, list[int]] = {}
+    for header in storage.list_episodes(FilterIN(key="id", value=list(ids))):
+        here.setdefault(header.recording, []).append(header.episode)
+    for name, numbers in here.items():
+        with storage.open_recording(name) as stored:
+            if not _same_file(recording, stored) and not episodes_alike(
+                recording, stored, numbers, storage.root
+            ):
+                raise StorageError(
+                    f"episodes of the recording {recording.uuid} are in {str(storage.root)!r} already, with other "
+                    f"contents: {name!r} differs from {recording.name!r}; delete the one that is wrong"
+                )
+    held = {number for numbers in here.values() for number in numbers}
+    return [number for number in ids.values() if number not in held]
 
 
-def _copy(storage: FileStorage, recording: Recording, path: Path, benchmark_id: str) -> None:
-    """Copy the episodes that the storage does not hold yet."""
-    missing = _missing(storage, recording)
-    if not missing:
-        return
+def _same_file(one: Recording, other: Recording) -> bool:
+    """Whether two finished files have the same bytes."""
+    if not (one.complete and other.complete and one.size == other.size):
+        return False
+    return all(a == b for a, b in zip(_pieces(one), _pieces(other), strict=True))
+
+
+def _pieces(recording: Recording) -> Iterator[bytes]:
+    for start in range(0, recording.size, _PIECE):
+        yield recording._source.read(start, min(_PIECE, recording.size - start))
+
+
+class _NothingNewError(Exception):
+    pass
+
+
+def _copy(
+    storage: FileStorage, recording: Recording, benchmark_id: str, check: Callable[[Recording], None]
+) -> None:
+    """Copy the episodes that the storage does not hold yet.
+
+    The file may be changed by others at any time. So what counts is a copy that nobody else can write to: `check` is
+    made on it, and what it holds goes into the storage.
+    """
     target = storage.new_recording_path(benchmark_id)
-    with os_errors("cannot import", target), fill(target) as temporary:
-        if recording.complete and len(missing) == len(recording):
-            shutil.copyfile(path, temporary)
-        else:
-            rewrite_recording(recording, temporary, episodes=missing)
+    try:
+        with os_errors("cannot import", target), fill(target) as new:
+            if recording.complete:
+                recording._source.refresh()  # as it is now, whole
+                with os.fdopen(create(new), "wb") as file:
+                    file.writelines(_pieces(recording))
+            else:
+                rewrite_recording(recording, new)  # with what is in its journal
+            with Recording(new) as copy:
+                check(copy)
+                missing = _missing(storage, copy)
+                if not missing:
+                    raise _NothingNewError
+                if len(missing) < len(copy):
+                    rewrite_recording(copy, new, episodes=missing)
+    except _NothingNewError:
+        return
     storage.ingest(target)

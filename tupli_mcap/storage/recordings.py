@@ -340,7 +340,8 @@ class RecordingFiles:
                 if header.recording != relative:
                     self._catalog.remove_recording(relative)
                     original = f"holds episodes of {header.recording} again"
-                    self._warn_once(relative, stamp, f"skipped a recording: {path} {original}")
+                    advice = "that one is listed, whatever they hold; verify both, and delete one"
+                    self._warn_once(relative, stamp, f"skipped a recording: {path} {original}; {advice}")
                     return True
         return False
 
