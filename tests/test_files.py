@@ -14,8 +14,10 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from typer.testing import CliRunner
 
 from tupli_mcap import (
+    FileStorage,
     RecordEpisodes,
     Recording,
     files,
@@ -23,6 +25,7 @@ from tupli_mcap import (
     recover_recording,
     rewrite_recording,
 )
+from tupli_mcap.cli.app import app
 from tupli_mcap.recording.attach import add_attachments
 
 HOLDER = """
@@ -175,6 +178,40 @@ def test_names_of_earlier_versions_and_of_others(tmp_path: Path) -> None:
     assert [path.name for path in files.left_in(tmp_path)] == sorted(left)
     assert files.remove_left(tmp_path.iterdir()) == len(left)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, link.name])
+
+
+def test_commands_name_and_remove_what_is_left(recording: Path, tmp_path: Path) -> None:
+    storage = tmp_path / "lab"
+    with FileStorage(storage):
+        pass
+    places = [tmp_path, storage, storage / "recordings"]
+    places[2].mkdir(exist_ok=True)
+    with writer(tmp_path / "a"), writer(storage / "a"), writer(places[2] / "a"):
+        in_use = {path for place in places for path in place.glob(".*.tmp")}
+        assert len(in_use) == 3
+        for path in (recording, storage):
+            assert "left by a process" not in run("verify", path)
+        run("compact", "--storage", storage)
+        merge_recordings([recording], tmp_path / "out.mcap")
+        assert {path for place in places for path in place.glob(".*.tmp")} == in_use
+    for where, names in ((recording, places[:1]), (storage, places[1:]), (tmp_path, places)):
+        said = run("verify", where)
+        for path in in_use:
+            assert (path.name in said.replace("\n  ", "")) == (path.parent in names)
+    assert (
+        run("compact", "--storage", storage, "--dry-run")
+        == "would remove 2 temporary files of killed processes\n"
+    )
+    assert run("compact", "--storage", storage) == "rewrote 0 recordings, freed 20 B\n"
+    assert not any((*storage.glob(".*.tmp"), *places[2].glob(".*.tmp")))
+    recover_recording(recording, tmp_path / "again.mcap")
+    assert not any(tmp_path.glob(".*.tmp"))
+
+
+def run(*words: object) -> str:
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    return result.stdout
 
 
 def test_a_journal_that_is_not_in_its_place_yet_is_in_use(

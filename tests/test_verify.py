@@ -390,7 +390,7 @@ def test_a_storage_with_damage_goes_on_and_sums_up(tmp_path: Path) -> None:
         artifact.write_bytes(b"other")
         flip(root / "recordings" / "one.mcap", 2000)
         (root / "recordings" / "gone.mcap.journal").write_bytes(b"x")
-        (root / "recordings" / ".x.tmp").write_bytes(b"x")
+        (root / "recordings" / ".0123456789abcdef.tmp").write_bytes(b"x")
         (root / "recordings" / "two.mcap.json").write_text('{"version": 1, "deleted": [77]}')
         report = verify_storage(storage)
         (root / "recordings" / "two.mcap.json").write_text("nonsense")

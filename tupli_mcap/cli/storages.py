@@ -107,26 +107,32 @@ def _compact(
 ) -> None:
     """Free the space of deleted episodes.
 
-    Recordings that hold deleted episodes are rewritten without them.
+    Recordings that hold deleted episodes are rewritten without them, and temporary files that killed processes
+    have left are removed.
     Episodes that stay keep their ids. Recordings that are being written are left alone.
     """
+    from tupli_mcap.files import left_below
     from tupli_mcap.storage.listing import compactable
 
     with open_storage(storage_path) as storage:
         found = compactable(storage_path)
+        left = [str(path) for path in left_below(storage_path)]
         freed = 0 if dry_run else storage.compact()
     if as_json:
         told = [item._asdict() for item in found]
-        print_json({"dry_run": dry_run, "recordings": told, "bytes_freed": freed})
+        print_json({"dry_run": dry_run, "recordings": told, "left_over": left, "bytes_freed": freed})
         return
     if dry_run:
         columns = (Column("RECORDING", shrink="start"), Column("DELETED", "right"), Column("SIZE", "right"))
         rows = [(short_ids(i.recording), number(i.deleted), bytes_of(i.size)) for i in found]
-        print_table(columns, rows, empty="nothing to compact")
+        if found or not left:
+            print_table(columns, rows, empty="nothing to compact")
+        if left:
+            print(f"would remove {counted(len(left), 'temporary file')} of killed processes")
         return
     print(
         f"rewrote {counted(len(found), 'recording')}, freed {bytes_of(freed)}"
-        if found
+        if found or left
         else "nothing to compact"
     )
 

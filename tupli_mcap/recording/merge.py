@@ -20,7 +20,7 @@ from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.library import library
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.recording.replacing import replacing
+from tupli_mcap.recording.replacing import replacing, tidy
 from tupli_mcap.recording.rewrite import camera_channels, define, write
 from tupli_mcap.recording.rotation import series
 from tupli_mcap.recording.signed import STATEMENTS
@@ -98,6 +98,7 @@ def merge_recordings(
         )
         if dry_run:
             return report
+        tidy(target.parent)
         with replacing(target) as (fd, _):
             merged = _merge(found, Container(fd, str(target), compression), attachments)
     if merged.held:

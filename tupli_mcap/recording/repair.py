@@ -23,7 +23,7 @@ from tupli_mcap.recording.repair_journal import add_journal
 from tupli_mcap.recording.repair_plan import Plan, make_plan
 from tupli_mcap.recording.repair_segments import Channels
 from tupli_mcap.recording.repair_write import RepairWriter
-from tupli_mcap.recording.replacing import replacing
+from tupli_mcap.recording.replacing import replacing, tidy
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.survey import Damage, attachment_name
@@ -154,6 +154,7 @@ def recover_recording(
         if dry_run:
             with _nowhere() as fd:
                 return _recover(opened, fd, compression)
+        tidy(goal.parent)
         with replacing(goal) as (fd, temporary):
             report = _recover(opened, fd, compression)
             if report.kind == "recording" and not _signature_fits(temporary):

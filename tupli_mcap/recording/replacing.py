@@ -11,7 +11,7 @@ from tupli_mcap import files
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.system import refused
 
-__all__ = ["replacing"]
+__all__ = ["replacing", "tidy"]
 
 
 @contextlib.contextmanager
@@ -30,3 +30,9 @@ def replacing(goal: Path, permissions: int = 0o666) -> Iterator[tuple[int, Path]
                 os.close(fd)
     except OSError as err:
         raise RecordingError(f"{goal} cannot be written: {refused(err)}") from err
+
+
+def tidy(directory: Path) -> None:
+    """Removes what killed processes have left in a directory that is about to be written to."""
+    with contextlib.suppress(OSError):  # whoever writes there will say it
+        files.remove_left(files.left_in(directory))

@@ -278,7 +278,8 @@ class FileStorage(TupliStorage):
         self._recordings.reindex()
 
     def compact(self) -> int:
-        """Rewrite recordings that hold deleted episodes; returns the number of bytes freed.
+        """Rewrite recordings that hold deleted episodes, and remove the temporary files of killed processes; returns
+        the number of bytes freed.
 
         Recordings that are being written are left alone. Episodes that stay keep their ids.
         """

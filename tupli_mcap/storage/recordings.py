@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+from tupli_mcap import files
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
@@ -420,11 +421,12 @@ class RecordingFiles:
         return found
 
     def compact(self) -> int:
-        """Rewrite the recordings that hold deleted episodes; returns how many bytes that freed.
+        """Rewrite the recordings that hold deleted episodes, and remove the temporary files of killed processes;
+        returns how many bytes that freed.
 
         Those that are being written are left alone. Episodes that stay keep their ids.
         """
-        freed = 0
+        freed = files.remove_left(files.left_below(self._root))
         for item in sorted(scan(self._root)):
             path = self._root / item.relative
             with self._lock:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-import re
 import sqlite3
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.findings import Findings, VerifyReport
@@ -29,7 +30,6 @@ from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
 __all__ = ["StorageReport", "verify_paths", "verify_storage"]
 
 _PIECE = 1 << 20
-_TEMPORARY = re.compile(r"\..*\.tmp|.*\.journal\.tmp")
 _PARTS = ("benchmarks", "artifacts", "recordings", "catalog.sqlite", "storage.json")
 
 
@@ -68,8 +68,10 @@ def verify_storage(storage: FileStorage | Path) -> StorageReport:
 def verify_paths(paths: Iterable[Path]) -> Iterator[VerifyReport]:
     """Verifies files and directories, one after another; a bad one stops nothing.
 
-    A path that does not exist is a report with a problem.
+    A path that does not exist is a report with a problem. What killed processes have left beside the files is
+    reported last.
     """
+    beside: dict[Path, None] = {}
     for path in paths:
         if path.is_dir():
             try:
@@ -85,6 +87,9 @@ def verify_paths(paths: Iterable[Path]) -> Iterator[VerifyReport]:
             yield from _directory(path)
         else:
             yield _recording(path)
+            beside[path.parent] = None
+    for directory in beside:
+        yield from _left_in(directory)
 
 
 def _recording(path: Path) -> VerifyReport:
@@ -153,6 +158,21 @@ def _directory(root: Path) -> Iterator[VerifyReport]:
         yield report
 
 
+def _left_in(directory: Path) -> Iterator[VerifyReport]:
+    """A report on what killed processes have left in a directory, if there is any."""
+    report = VerifyReport(str(directory), kind="storage")
+    with contextlib.suppress(OSError):  # there is no such directory, or nobody may list it
+        for path in files.left_in(directory):
+            _left(path.name, Findings(report))
+    if report.problems:
+        yield report
+
+
+def _left(name: str, findings: Findings) -> None:
+    advice = "delete it; in a storage, tupli-mcap compact removes such files"
+    findings.note("leftover", f"{name} was left by a process that was killed", advice)
+
+
 def _guarded(check: Callable[[Path, Findings], None], root: Path, findings: Findings) -> None:
     try:
         check(root, findings)
@@ -162,11 +182,11 @@ def _guarded(check: Callable[[Path, Findings], None], root: Path, findings: Find
 
 def _leftovers(root: Path, findings: Findings) -> None:
     """Files that belong to nothing: of processes that were killed, or of recordings that are gone."""
+    for path in files.left_below(root):
+        _left(str(path.relative_to(root)), findings)
     for path in sorted(root.rglob("*")):
         name, relative = path.name, str(path.relative_to(root))
-        if _TEMPORARY.fullmatch(name):
-            findings.note("leftover", f"{relative} was left by a process that was killed", "delete it")
-        elif name.endswith(".mcap.journal") and not path.with_name(name.removesuffix(".journal")).exists():
+        if name.endswith(".mcap.journal") and not path.with_name(name.removesuffix(".journal")).exists():
             what = f"{relative} is the journal of a recording that is not here"
             findings.note(
                 "leftover", what, "bring its recording back beside it; it holds that one's last steps"
@@ -195,7 +215,7 @@ def _artifacts(root: Path, findings: Findings) -> None:
     directory = root / "artifacts"
     if not directory.is_dir():
         return
-    files = ArtifactFiles(directory, Lock(root / ".lock"))
+    artifacts = ArtifactFiles(directory, Lock(root / ".lock"))
     for path in sorted(directory.iterdir()):
         if path.name.endswith(".json") and is_hash(path.stem) and not path.with_suffix("").exists():
             findings.error(
@@ -211,7 +231,7 @@ def _artifacts(root: Path, findings: Findings) -> None:
             what = f"artifact {path.name} has bytes with SHA-256 {found}"
             findings.error("artifact", what, advice="store it again, or import its bundle")
         try:
-            files.item(path.name)
+            artifacts.item(path.name)
         except (TupliError, FileNotFoundError) as err:
             findings.error("artifact", str(err), advice="store it again with its metadata")
 
@@ -229,13 +249,13 @@ def _benchmarks(root: Path, findings: Findings) -> None:
     directory = root / "benchmarks"
     if not directory.is_dir():
         return
-    files = BenchmarkFiles(directory, Lock(root / ".lock"))
+    benchmarks = BenchmarkFiles(directory, Lock(root / ".lock"))
     for path in sorted(directory.glob("*.json")):
         if not is_hash(path.stem):
             continue
         try:
-            files.load(path.stem)
-            for artifact in files.artifacts(path.stem):
+            benchmarks.load(path.stem)
+            for artifact in benchmarks.artifacts(path.stem):
                 if not (root / "artifacts" / artifact).is_file():
                     what = f"benchmark {path.stem} lacks its artifact {artifact}"
                     findings.error("benchmark", what, advice="store the artifact again, or import its bundle")
