@@ -1,16 +1,11 @@
-"""Episodes of a vector environment: one stream a sub-environment, under every autoreset mode.
-
-NEXT_STEP: after an end, the next call resets the sub-environment and ignores its action: a hole, no step.
-SAME_STEP: the call that ends an episode already returns the next one's first state; the final one is in `final_obs`.
-DISABLED: the caller resets, all or by `reset_mask`.
-"""
+"""Episodes of a vector environment: one stream a sub-environment, under every autoreset mode (`autoreset`)."""
 
 from __future__ import annotations
 
 import copy
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
@@ -20,19 +15,19 @@ from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.exact import decide_dtype, leaf_value, shorten
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.autoreset import Autoreset
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.single import decide_layout
 from tupli_mcap.recording.step_log import Encoder, StepLog, leaf_encoders
-from tupli_mcap.recording.vector_infos import info_of
+from tupli_mcap.recording.vector_infos import check_infos, final_states, info_of, reset_info_of
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
 
-__all__ = ["Autoreset", "VectorRecorder"]
+__all__ = ["VectorRecorder"]
 
 Array = np.ndarray[Any, Any]
 _BOOL = np.dtype(np.bool_)
-Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 
 
 class VectorRecorder:
@@ -51,7 +46,8 @@ class VectorRecorder:
         *,
         leaves_to_rows: bool = False,
     ) -> None:
-        self.leaves_to_rows = leaves_to_rows and autoreset == "NextStep"  # plain episodes
+        # plain episodes
+        self.leaves_to_rows = leaves_to_rows and autoreset.mode == "NextStep" and not autoreset.is_assumed
         self._told = False  # rows tell of all episodes
         self._writer = writer
         self._spaces = spaces
@@ -80,6 +76,7 @@ class VectorRecorder:
         self._refused = False
         self._final_encoders: list[tuple[Leaf, Encoder]] | None = None
         self._final_rows: dict[int, int] = {}  # of final states that are in no row of steps
+        self._late: list[tuple[int, int]] = []  # ends that wait for the batch after them
 
     @property
     def writer(self) -> RecordingWriter:
@@ -167,15 +164,25 @@ class VectorRecorder:
                 else "there was no reset yet"
             )
             raise StepError(f"{why}; call env.reset() to go on")
+        resets = self._autoreset
         try:
             rewards, terminals, timeouts = self._numbers_of(rewards, terminals, timeouts)
+            if infos.__class__ is not dict:
+                infos = check_infos(infos, self._n)
             if self._writer.vector is None:
                 self._begin(actions, states, rewards)
             done = terminals | timeouts
-            any_done = done.tobytes() != self._none
-            holes = self._ended if self._any_ended and self._autoreset == "NextStep" else None
+            flags = done.tobytes()
+            any_done = flags != self._none
+            finals = self._finals(done, states, infos) if any_done and (infos or not resets.is_plain) else {}
+            holes = self._ended if self._any_ended and resets.mode == "NextStep" else None
             active = None if holes is None else ~holes
-            finals = self._finals(done, infos) if any_done and self._autoreset == "SameStep" else {}
+            ended = done & active if any_done and active is not None else done
+            if holes is None:
+                if resets.watches_steps:
+                    resets.check_steps(self._ended, done, rewards)
+            elif resets.is_assumed or ended.tobytes() != flags:
+                self._check_resets(holes, done, rewards)
             self._store(actions, states, rewards, terminals, timeouts, active, finals, any_done)
         except StepError:
             self.refuse()
@@ -185,13 +192,15 @@ class VectorRecorder:
                 rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1, dtype=np.float64)
             )
             self._totals += totals if active is None else totals * active
+        self._ended = ended
+        if any_done:
+            resets.has_ended = True
         if active is None:
             self._lengths += self._ones
-            self._ended, self._any_ended = done, any_done
+            self._any_ended = any_done
             return self._everybody
         self._lengths += active
-        self._ended = done & active if any_done else done
-        self._any_ended = any_done and bool(np.count_nonzero(self._ended))
+        self._any_ended = any_done and bool(np.count_nonzero(ended))
         if self._told:
             self._begin_told(~active, infos)
         else:
@@ -224,9 +233,14 @@ class VectorRecorder:
         """Ends the episodes that ended in the batch just put; `infos` are that batch's."""
         if not self._any_ended or self._told:
             return
+        same_step = self._autoreset.mode == "SameStep"
         ended = self._ended.nonzero()[0].tolist()
-        self._end([(i, TERMINAL if terminals[i] else TIMEOUT) for i in ended])
-        if self._autoreset == "SameStep":
+        ends = [(i, TERMINAL if terminals[i] else TIMEOUT) for i in ended]
+        if self._autoreset.is_assumed:
+            self._late = ends
+        else:
+            self._end(ends, known=not same_step)
+        if same_step:
             self._note_resets(self._ended, infos)
             self._any_ended = False
 
@@ -278,19 +292,41 @@ class VectorRecorder:
             stacks=self._spaces.stacks,
         )  # fmt: skip
 
-    def _finals(self, done: Array, infos: Any) -> dict[int, Any]:
-        """The final states of a same-step autoreset."""
-        if isinstance(infos, Mapping):
-            given = infos.get("final_obs", infos.get("final_observation"))
-        else:
-            given = [(info or {}).get("final_obs") for info in infos]
-        if isinstance(given, dict):
-            given = self._each(self._observations, given)
-        if given is None:
-            raise StepError(
-                "expected infos['final_obs'] for episodes that end under same-step autoreset, found none"
+    def _finals(self, done: Array, states: Any, infos: Any) -> dict[int, Any]:
+        """The final states of a same-step autoreset, which may show only now."""
+        resets = self._autoreset
+        found = (
+            final_states(infos, done, lambda batch: self._each(self._observations, batch)) if infos else {}
+        )
+        if found and resets.mode != "SameStep":
+            after = self._each(self._observations, states)
+            changed = any(
+                self._encode_final(state) != self._encode_final(after[i]) for i, state in found.items()
             )
-        return {int(i): given[i] for i in np.flatnonzero(done)}
+            if resets.resets_already(changed=changed):
+                self.leaves_to_rows = False
+                self._settle()
+        if resets.mode != "SameStep":
+            resets.note_ends(known=True)
+            return {}
+        missing = [i for i in done.nonzero()[0].tolist() if i not in found]
+        if missing and not resets.needs_no_finals:
+            raise StepError(
+                f"expected the final state of sub-environment {missing[0]}, whose episode ended under same-step "
+                'autoreset, in infos["final_obs"], found none; if it is known to nobody, pass '
+                'autoreset_mode="SameStep"; if the next step resets, "NextStep"'
+            )
+        resets.note_ends(known=not missing)
+        return found
+
+    def _check_resets(self, holes: Array, done: Array, rewards: Array) -> None:
+        late, self._late = self._late, []
+        try:
+            self._autoreset.check_resets(holes, done, rewards)
+        except StepError:
+            self._end(late, known=False)
+            raise
+        self._end(late)
 
     def _start(self, active: Array | None) -> None:
         waiting = sorted(i for i in self._waiting if active is None or active[i])
@@ -343,7 +379,9 @@ class VectorRecorder:
             self._note_resets(holes, infos)
 
     def _settle(self) -> None:
-        """Writes what was left to the rows, so that everything is as if it had been written at once."""
+        """Writes what was left for later, so that everything is as if it had been written at once."""
+        late, self._late = self._late, []
+        self._end(late)
         store, events = self._writer.vector, self._writer.events
         if not self._told or not isinstance(store, VectorRows) or events is None:
             return
@@ -437,16 +475,18 @@ class VectorRecorder:
         return bytes(out[8:])
 
     def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
+        of = reset_info_of if self._autoreset.mode == "SameStep" else info_of
         plain = ResetFacts(None, None, "", "{}", time.time_ns())
         for i in holes.nonzero()[0].tolist():
-            info = info_of(infos, i, self._n) if infos else None
+            info = of(infos, i, self._n) if infos else None
             self._facts[i] = plain._replace(info=jsonvalue.dumps_any(info)) if info else plain
         self._fresh = True
 
     # ---- ends
 
-    def _end(self, ends: Iterable[tuple[int, int]]) -> None:
-        """Ends the running episodes of sub-environments: (sub-environment, how)."""
+    def _end(self, ends: Iterable[tuple[int, int]], *, known: bool = True) -> None:
+        """Ends the running episodes of sub-environments: (sub-environment, how). `known`: the running states are their
+        final ones."""
         writer, final_rows, now = self._writer, self._final_rows, None
         for i, how in ends:
             episode, self._episodes[i] = self._episodes[i], None
@@ -460,7 +500,7 @@ class VectorRecorder:
             if i in final_rows:
                 writer.end_episode(*facts, None, text, final_rows.pop(i), now)
             else:
-                writer.end_episode(*facts, self._pending_state(i), text, -1, now)
+                writer.end_episode(*facts, self._pending_state(i) if known else None, text, -1, now)
 
     def _pending_state(self, i: int) -> bytes:
         store: Any = self._writer.vector

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import time
+import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from gymnasium.vector.utils import iterate
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.autoreset import Autoreset
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.framing import CAMERA, VectorFrames, check_every, check_render_mode
@@ -45,7 +47,10 @@ class RecordEpisodes(gym.vector.VectorWrapper):
 
     Arguments are those of `tupli_mcap.RecordEpisodes`; the environment in the file is the first sub-environment.
     A metadata callback is copied for each sub-environment.
-    `autoreset_mode` is the environment's own (`env.metadata["autoreset_mode"]`, next-step where it says nothing).
+    `autoreset_mode` ("NextStep", "SameStep" or "Disabled") is by default what the environment declares
+    (`env.metadata["autoreset_mode"]`). Where it declares nothing, final states in its infos tell of same-step
+    autoreset; without them next-step autoreset is assumed, with a warning. A batch that contradicts the mode is
+    refused. With "SameStep" given, episodes whose final states are in no infos are recorded without.
     """
 
     def __init__(
@@ -80,7 +85,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         if every:
             check_render_mode(getattr(env, "render_mode", None))
             frame_format = check_format(frame_format)
-        self._autoreset = _autoreset(env, autoreset_mode)
+        self._autoreset = Autoreset.of(env, autoreset_mode)
         n = env.num_envs
         self._callbacks = (
             None if metadata_callback is None else [copy.deepcopy(metadata_callback) for _ in range(n)]
@@ -179,6 +184,9 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             raise
         refusal = self._finish_step(stepped, actions, result)
         work.state = DONE
+        if self._autoreset.doubt:
+            doubt, self._autoreset.doubt = self._autoreset.doubt, ""
+            warnings.warn(doubt, UserWarning, stacklevel=2)
         if refusal is not None:
             raise refusal
         return result
@@ -202,7 +210,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             _, _, terminals, timeouts, _ = result
             ended = np.logical_or(terminals, timeouts)
             self._frames.step(
-                self._recorder, stepped, ended, self.env.render, same_step=self._autoreset == "SameStep"
+                self._recorder, stepped, ended, self.env.render, same_step=self._autoreset.mode == "SameStep"
             )
 
     def _end(self, stepped: Any, actions: Any, result: Any) -> None:
@@ -321,7 +329,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         chosen = list(iterate(self.env.action_space, actions))
         for i in np.flatnonzero(stepped).tolist():
             info = info_of(infos, i, self.num_envs)
-            if (terminals[i] or timeouts[i]) and self._autoreset == "SameStep":
+            if (terminals[i] or timeouts[i]) and self._autoreset.mode == "SameStep":
                 info = final_info_of(infos, i, self.num_envs)
             step = Step(before[i], chosen[i], rewards[i], bool(terminals[i]), bool(timeouts[i]), info)
             entries[i] = self._entries(step)
@@ -378,10 +386,3 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         raise RecordingError(f"a wrapper that records to {self.path} cannot be pickled or copied; wrap there")
 
 
-def _autoreset(env: Any, given: str | None) -> Any:
-    mode = given if given is not None else (env.metadata or {}).get("autoreset_mode", "NextStep")
-    text = str(getattr(mode, "value", mode)).replace("_", "").lower()
-    for name in ("NextStep", "SameStep", "Disabled"):
-        if text == name.lower():
-            return name
-    raise StepError(f"autoreset_mode: expected NextStep, SameStep or Disabled, found {mode!r}")

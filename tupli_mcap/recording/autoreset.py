@@ -1,0 +1,161 @@
+"""Autoreset of a vector environment: what it says of it, and what its batches say.
+
+NEXT_STEP: after an end, the next call resets the sub-environment and ignores its action: a hole, no step.
+SAME_STEP: the call that ends an episode already returns the next one's first state; the final one is in its infos.
+DISABLED: the caller resets, all or by `reset_mask`.
+
+By the wrong mode, the next episode's first state is recorded as a final one, a reset as a step, or a step as a reset.
+An environment may say nothing of its mode, or something wrong, so:
+
+1. A final state in the infos of a batch that ends episodes says same-step. No end has been recorded yet: that mode is
+   gone on with. Else the batch is refused.
+2. A flag in the batch after an end says that this was a step, and no reset; where no mode is declared, a reward says so
+   too. That batch is refused. (Wrappers may give rewards to resets, so a declared mode counts more than a reward.)
+3. Where no mode is declared, an end is written with the batch after it: if that is refused, without a final state.
+4. Under same-step autoreset without final states, as the caller has asked for, a step after an end without reward and
+   flags says that this was a reset, if no other step went without a reward. That batch is refused.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+
+from tupli_mcap.errors import StepError
+from tupli_mcap.messages.exact import shorten
+
+__all__ = ["Autoreset"]
+
+Array = np.ndarray[Any, Any]
+Mode = Literal["NextStep", "SameStep", "Disabled"]
+_MODES: tuple[Mode, ...] = ("NextStep", "SameStep", "Disabled")
+_OTHERWISE = (
+    'pass autoreset_mode="SameStep" if it resets in the step that ends an episode, "Disabled" if you reset it'
+)
+
+
+class Autoreset:
+    """The mode of one vector environment, for all the recordings of a wrapper.
+
+    Attributes:
+        mode: what is recorded by; "SameStep" once rule 1 has found it out.
+        is_assumed: neither the environment nor the caller has said which mode it is.
+        needs_no_finals: the caller has said that it is same-step autoreset, whatever infos hold.
+        watches_steps: `check_steps` is to be asked, as no final state was seen yet.
+        is_plain: next-step autoreset, and not because it is assumed.
+        has_ended: ends are recorded by the mode.
+        doubt: what the caller should be told, if anything.
+    """
+
+    def __init__(self, mode: Mode, *, given: bool, assumed: bool = False) -> None:
+        self.mode = mode
+        self.is_assumed = assumed
+        self.needs_no_finals = self.watches_steps = given and mode == "SameStep"
+        self.doubt = ""
+        self.has_ended = False
+        self.is_plain = mode == "NextStep" and not assumed
+        self._given = given
+        self._has_told = False
+        self._rests = False  # a step that came after no end went without a reward
+
+    @classmethod
+    def of(cls, env: Any, given: Any) -> Autoreset:
+        """The one that the caller gives, or the environment declares; next-step is assumed.
+
+        Raises:
+            StepError: it is none of the three.
+        """
+        # those of Gymnasium 1.0 do not declare the only mode they have
+        known = isinstance(env.unwrapped, SyncVectorEnv | AsyncVectorEnv)
+        declared = (env.metadata or {}).get("autoreset_mode", "NextStep" if known else None)
+        found = declared if given is None else given
+        if found is None:
+            return cls("NextStep", given=False, assumed=True)
+        text = str(getattr(found, "value", found)).replace("_", "").lower()
+        for mode in _MODES:
+            if text == mode.lower():
+                return cls(mode, given=given is not None)
+        raise StepError(f"autoreset_mode: expected NextStep, SameStep or Disabled, found {found!r:.80}")
+
+    def resets_already(self, *, changed: bool) -> bool:
+        """For a batch with ends whose infos hold final states: whether that makes the mode same-step, from now on.
+
+        `changed`: the states it returned are others.
+
+        Raises:
+            StepError: that contradicts what was recorded, or what the caller has said.
+        """
+        if self.mode == "SameStep" or not (changed or self.is_assumed):
+            return False  # nothing contradicts what is declared
+        if self._given or self.has_ended:
+            raise StepError(
+                f"an episode ended with a final state in infos, as under same-step autoreset, and is recorded as under "
+                f'{self.mode}; pass autoreset_mode="SameStep"'
+            )
+        self.mode, self.is_assumed, self.is_plain = "SameStep", False, False
+        return True
+
+    def check_resets(self, holes: Array, done: Array, rewards: Array) -> None:
+        """For a batch in which the sub-environments `holes` should have been reset.
+
+        Raises:
+            StepError: they took a step.
+        """
+        steps = done & holes
+        if self.is_assumed:
+            steps = steps | (holes & _rewarded(rewards, holes))
+        if steps.any():
+            i = int(steps.argmax())
+            what = "another end" if done[i] else f"the reward {shorten(rewards[i])}"
+            raise StepError(
+                f"expected a reset of sub-environment {i} after its end, as next-step autoreset does it, found {what}; "
+                + _OTHERWISE
+            )
+
+    def check_steps(self, ended: Array, done: Array, rewards: Array) -> None:
+        """For a batch under same-step autoreset, after one in which the sub-environments `ended`.
+
+        Raises:
+            StepError: one of them was reset only now.
+        """
+        if not self._has_told:  # no final state was missing yet
+            ended = np.zeros_like(ended)
+        rests = ~(_rewarded(rewards, done) | done)
+        late = rests & ended
+        if late.any() and not self._rests:
+            i = int(late.argmax())
+            raise StepError(
+                f"expected a step of sub-environment {i} after its end, as same-step autoreset goes on, "
+                "found no reward, which all other steps had: a reset, as next-step autoreset does it; pass "
+                'autoreset_mode="NextStep", or let infos["final_obs"] hold the final states'
+            )
+        self._rests = self._rests or bool((rests & ~ended).any())
+
+    def note_ends(self, *, known: bool) -> None:
+        """Decides what the caller is told once ends are recorded. `known`: with their final states."""
+        if self._has_told:
+            return
+        if known:
+            self.watches_steps = False
+        else:
+            self._has_told = True
+            self.doubt = (
+                "same-step autoreset without final states in infos (final_obs): "
+                "episodes are recorded without them"
+            )
+        if self.is_assumed:
+            self._has_told = True
+            self.doubt = (
+                "the vector environment declares no autoreset mode, and is recorded as under next-step autoreset "
+                f'(pass autoreset_mode="NextStep" if that is right); {_OTHERWISE}'
+            )
+
+
+def _rewarded(rewards: Array, alike: Array) -> Array:
+    """Who has a reward other than 0. Rewards of another number are refused when they are stored."""
+    if rewards.shape[:1] != alike.shape:
+        return np.zeros_like(alike)
+    found: Array = np.asarray(rewards != 0, np.bool_).reshape(len(alike), -1).max(axis=1, initial=False)
+    return found
