@@ -299,6 +299,18 @@ def test_episodes_are_recorded_with_their_metadata(storage: FileStorage) -> None
         assert recording.benchmark.make_env().spec.id == "CartPole-v1"  # type: ignore[union-attr]
 
 
+def test_metadata_of_an_episode_begins_anew_after_recording_was_off(storage: FileStorage) -> None:
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), storage, metadata_callback=Returns())
+    env.store(name="cart")
+    for leave in (env.deactivate_recording, env.close, env.close):
+        env.activate_recording()
+        env.reset(seed=1)
+        for _ in range(5):
+            env.step(0)
+        leave()
+    assert [(h.n_tuples, h.metadata["cum_eps_reward"]) for h in storage.list_episodes()] == [(5, 5.0)] * 3
+
+
 def test_a_reset_before_store_is_recorded(storage: FileStorage) -> None:
     env = TupliEnvWrapper(gym.make("CartPole-v1"), storage)
     observation, _ = env.reset(seed=11, options={"low": -0.01, "high": 0.01})

@@ -50,8 +50,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: any environment whose spaces are Gymnasium's own.
-        path: the recording; `mode` "x" refuses to overwrite, "w" replaces, "a" continues a recording.
-        metadata_callback: called with every step (an RLTuple), returns the episode's metadata (a dict); reset after it.
+        path: the recording; `mode` "x" refuses to overwrite, "w" replaces, "a" continues it, or makes it.
+        metadata_callback: called with every step (an RLTuple), returns the episode's metadata (a dict); reset after
+            it, and before the first one.
         record_info: False, True (everything), a list of names, or a function from info to what is recorded.
         step_callback: called with every Step; returns entries to record with its info (log-probabilities, say).
         compression: "zstd", "lz4" or "none".
@@ -149,7 +150,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         self._plain = (
             not self._watches and flush_seconds is None and durability != "step" and not self.rotation.limited
         )
-        self._stepped = False
+        self._stepped = True  # the callback may hold what another recorder has left in it
         self._state: Any = None
         self._work = work = Work()
         writer: RecordingWriter | None = None
@@ -289,8 +290,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
                 self._rotate(state)
             self._recorder.reset(state, facts)
             self._start_frames()
-            if self._metadata_callback is not None and self._stepped:
-                work.ask(self._metadata_callback.reset)
+            if self._stepped:
+                work.ask(self._reset_callback)
         except BaseException as err:
             if work.is_whole_after(err):  # wherever the environment is now: the running episode is over
                 work.state = BEGUN
@@ -301,7 +302,6 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             else:
                 self._writer.stop(err)
             raise
-        self._stepped = False
         work.state = DONE
         return result
 
@@ -338,12 +338,14 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
     def _end(self, action: Any, result: Any) -> None:
         """The end of an episode that a step has ended."""
         _, _, terminal, timeout, _ = result
-        if not terminal and not timeout:
-            return
-        self._recorder.end(TERMINAL if terminal else TIMEOUT)
+        if terminal or timeout:
+            self._recorder.end(TERMINAL if terminal else TIMEOUT)
+            self._work.ask(self._reset_callback)
+
+    def _reset_callback(self) -> None:
         self._stepped = False
         if self._metadata_callback is not None:
-            self._work.ask(self._metadata_callback.reset)
+            self._metadata_callback.reset()
 
     def _go_on(self, action: Any, result: Any) -> None:
         """In another file, if this one is full; and with what is to be on the disk."""
@@ -369,6 +371,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         try:
             close_recordings(self._work, self._live)
             self._finalizer.detach()
+            if self._stepped:  # the episode was interrupted
+                self._reset_callback()
         finally:
             super().close()
 

@@ -384,5 +384,3 @@ class RecordEpisodes(gym.vector.VectorWrapper):
 
     def __getstate__(self) -> dict[str, Any]:
         raise RecordingError(f"a wrapper that records to {self.path} cannot be pickled or copied; wrap there")
-
-
