@@ -203,6 +203,11 @@ class TestRecord:
         ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 30, "--mode", "w")
         with Recording("a.mcap") as recording:
             assert recording.num_steps == 30
+        for n in (20, 40):
+            ok("record", "CartPole-v1", "-o", "new.mcap", "--steps", 20, "--mode", "a")
+            with Recording("new.mcap") as recording:
+                assert recording.num_steps == n
+                assert recording.benchmark.record.name == "CartPole-v1"
 
     def test_compression_and_infos(self, here: Path) -> None:
         ok("record", "FrozenLake-v1", "-o", "a.mcap", "--steps", 30, "--compression", "none", "--record-info")

@@ -31,6 +31,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
+from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
@@ -517,7 +518,40 @@ def test_metadata_callbacks(tmp_path: Path) -> None:
         assert episode.metadata["good"] is (len(episode) > 20)
 
 
+@pytest.mark.parametrize("mode", ["x", "a"])
+def test_a_callback_that_another_recorder_has_left_in_mid_episode(tmp_path: Path, mode: Any) -> None:
+    """Whether that recorder was closed, or not yet."""
+    callback = Totals()
+    unclosed = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "unclosed.mcap", metadata_callback=callback)
+    paths = [tmp_path / "0.mcap", tmp_path / ("1.mcap" if mode == "x" else "0.mcap")]
+    roll(unclosed, 3)
+    for path in paths:
+        with RecordEpisodes(gym.make("CartPole-v1"), path, mode=mode, metadata_callback=callback) as env:
+            roll(env, 5)
+        assert callback.total == 0
+    unclosed.close()
+    for path in [tmp_path / "unclosed.mcap", *paths]:
+        for episode in Recording(path).episodes:
+            assert (episode.end, episode.metadata["total"]) == ("interrupted", len(episode))
+
+
 # ---- files
+
+
+@pytest.mark.parametrize("limits", [{}, {"max_bytes": 10**6}])
+@pytest.mark.parametrize("vector", [False, True])
+def test_appending_makes_a_missing_file(tmp_path: Path, vector: bool, limits: dict[str, Any]) -> None:
+    path, steps = tmp_path / "r.mcap", np.zeros(2, np.int64) if vector else 0
+    for _ in range(2):
+        envs: Any = gym.make_vec("CartPole-v1", 2, "sync") if vector else gym.make("CartPole-v1")
+        wrap: Any = RecordVectorEpisodes if vector else RecordEpisodes
+        with wrap(envs, path, mode="a", **limits) as env:
+            env.reset(seed=1)
+            env.step(steps)
+    assert len(Recording(path)) == (4 if vector else 2)
+    assert Recording(path).benchmark.make_env().spec.id == "CartPole-v1"
+    with pytest.raises(RecordingError, match="its directory does not exist; make it"):
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "none" / "r.mcap", mode="a")
 
 
 def test_existing_files_and_bad_places_are_refused(tmp_path: Path) -> None:

@@ -230,6 +230,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
                     self._path,
                     metadata_callback=callback,
                     mode="a",
+                    benchmark_id=benchmark_id,
                     attachments={},
                     **self._recording_options,
                 )

@@ -87,7 +87,8 @@ def _record(
         ),
     ] = None,
     mode: Annotated[
-        _Mode, typer.Option(help="If the file exists: x refuses, w replaces, a appends.")
+        _Mode,
+        typer.Option(help="If the file exists: x refuses, w replaces, a appends (and makes a missing one)."),
     ] = _Mode.x,
     compression: Annotated[_Compression, typer.Option(help="Of the chunks.")] = _Compression.zstd,
     record_info: Annotated[

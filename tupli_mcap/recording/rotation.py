@@ -108,12 +108,15 @@ class Rotation:
         return self.paths[-1]
 
     def open_first(self, options: WriterOptions) -> RecordingWriter:
-        """A writer of the first file, or of the one to go on with.
+        """A writer of the first file, or of the one to go on with; mode "a" makes it where there is none.
 
         Raises:
             RecordingError: as `RecordingWriter`.
         """
-        return self._open(self._paths[0], options)
+        path = self._paths[0]
+        if options.mode == "a" and not os.path.lexists(path):
+            options = options._replace(mode="x")
+        return self._open(path, options)
 
     def _open(self, path: Path, options: WriterOptions) -> RecordingWriter:
         writer = RecordingWriter(path, options)
