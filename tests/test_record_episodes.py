@@ -27,10 +27,10 @@ from tupli_mcap import (
     RecordingError,
     SpaceError,
     StepError,
+    verify_recording,
     write_recording,
 )
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
-from tupli_mcap.vector import RecordEpisodes as RecordVector
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -877,6 +877,115 @@ def test_environments_that_reset_themselves(tmp_path: Path) -> None:
     assert [e.metadata["total"] for e in episodes] == [3, 3, 1]
 
 
+@pytest.mark.parametrize("space", [BOX, spaces.Text(3)], ids=["constant", "variable"])
+def test_a_signalling_nan_is_not_quieted_by_widening(tmp_path: Path, space: gym.Space[Any]) -> None:
+    rewards = np.array([0x3F800000, 0x7FC00001, 0x7F800001], np.uint32).view(
+        np.float32
+    )  # 1, quiet, signalling
+    observe = (lambda step: np.zeros(2, np.float32)) if space is BOX else str
+    for kind in ("single", "vector"):
+        env: Any = Scripted(observe, space, reward=lambda step: rewards[step - 1])
+        steps: Any = 0
+        if kind == "vector":
+            env = _Rewards(gym.vector.SyncVectorEnv([lambda: Scripted(observe, space)]), rewards)
+            steps = np.zeros(1, np.int64)
+        wrap: Any = RecordEpisodes if kind == "single" else RecordVectorEpisodes
+        with wrap(env, tmp_path / f"{kind}.mcap") as recorded:
+            recorded.reset()
+            recorded.step(steps)
+            recorded.step(steps)
+            with pytest.raises(StepError, match="reward: expected values that float64 holds exactly"):
+                recorded.step(steps)
+        kept = Recording(tmp_path / f"{kind}.mcap").read(fields=["rewards"]).rewards
+        assert kept.astype(np.float32).tobytes() == rewards[:2].tobytes()
+
+
+class _Rewards(gym.vector.VectorWrapper):  # type: ignore[type-arg]
+    """Gives float32 rewards, as they are: `SyncVectorEnv` makes float64 of them."""
+
+    def __init__(self, env: Any, rewards: Any) -> None:
+        super().__init__(env)
+        self._left = list(rewards)
+
+    def step(self, actions: Any) -> Any:
+        states, _, *rest = self.env.step(actions)
+        reward = np.empty(1, np.float32)
+        reward.view(np.uint32)[0] = np.asarray(self._left.pop(0)).view(np.uint32)
+        return (states, reward, *rest)
+
+
+@pytest.mark.parametrize("size", [3, 5000])
+@pytest.mark.parametrize("kind", ["single", "vector", "variable"])
+def test_bools_are_stored_as_0_and_1(tmp_path: Path, kind: str, size: int) -> None:
+    """NumPy takes any other byte of a view for True, too."""
+    bools = (np.arange(size) % 3).astype(np.uint8).view(np.bool_)
+    expected = np.arange(size) % 3 > 0
+    leaf = spaces.Box(0, 1, (size,), np.bool_)
+    space = spaces.Dict({"x": leaf, "note": spaces.Text(2)}) if kind == "variable" else leaf
+    value = {"x": bools, "note": "a"} if kind == "variable" else bools
+    env: Any = Scripted(lambda step: value, space, space)
+    if kind == "vector":
+        env = _Raw(
+            gym.vector.SyncVectorEnv([lambda: Scripted(lambda step: value, space, space)]), bools[None]
+        )
+    wrap: Any = RecordVectorEpisodes if kind == "vector" else RecordEpisodes
+    with wrap(env, tmp_path / "r.mcap") as recorded:
+        recorded.reset()
+        for _ in range(2):
+            recorded.step(bools[None] if kind == "vector" else value)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    for step in episode:
+        for found in (step.state, step.action):
+            assert (found["x"] if kind == "variable" else found).tobytes() == expected.tobytes()
+    final = episode.final_state["x"] if kind == "variable" else episode.final_state
+    assert final.tobytes() == expected.tobytes()
+    assert verify_recording(tmp_path / "r.mcap").ok
+
+
+class _Raw(gym.vector.VectorWrapper):  # type: ignore[type-arg]
+    """Gives these states, and flags that are views of other bytes."""
+
+    def __init__(self, env: Any, states: Any) -> None:
+        super().__init__(env)
+        self._states, self._steps = states, 0
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.env.reset(**kwargs)
+        return self._states, {}
+
+    def step(self, actions: Any) -> Any:
+        _, rewards, _, _, infos = self.env.step(actions)
+        self._steps += 1
+        flags = np.array([self._steps & 2], np.uint8).view(np.bool_)
+        return self._states, rewards, flags, flags, infos
+
+
+@pytest.mark.parametrize("space", [BOX, spaces.Text(3)], ids=["constant", "variable"])
+@pytest.mark.parametrize("flag", [None, "false", 2, -1, np.nan, [], np.array([True]), "", object])
+def test_flags_are_true_or_false(tmp_path: Path, flag: Any, space: gym.Space[Any]) -> None:
+    class Flags(Scripted):
+        flags: tuple[Any, Any] = (False, False)
+
+        def step(self, action: Any) -> Any:
+            return (*super().step(action)[:2], *self.flags, {})
+
+    env = Flags((lambda step: np.zeros(2, np.float32)) if space is BOX else str, space)
+    with RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
+        for good in (False, True, np.bool_(False), np.bool_(True), 0, 1, 1.0, np.int8(1), np.array(True)):
+            env.flags = good, np.bool_(False)
+            recorded.reset()
+            recorded.step(0)
+        for name, flags in (("terminal", (flag, False)), ("timeout", (False, flag))):
+            recorded.reset()
+            env.flags = flags
+            with pytest.raises(StepError, match=f"{name}: expected true or false, found "):
+                recorded.step(0)
+    ends = [e.end for e in Recording(tmp_path / "r.mcap").episodes]
+    assert ends == [
+        "interrupted", "terminal", "interrupted", "terminal", "interrupted", *["terminal"] * 4
+    ]  # fmt: skip
+
+
 def test_signalling_nans_are_not_quieted(tmp_path: Path) -> None:
     odd = np.array([0x7FA00001, 0], np.uint32).view(np.float32)
     env = Scripted(lambda step: odd if step == 2 else np.zeros(2), BOX)
@@ -916,7 +1025,7 @@ def test_a_closed_recorder_lets_go_of_its_journal_at_once(tmp_path: Path) -> Non
                 assert held()
             assert not held()
         envs = gym.vector.SyncVectorEnv([lambda: Counting()] * 2)
-        with RecordVector(envs, tmp_path / "vector.mcap") as vector:
+        with RecordVectorEpisodes(envs, tmp_path / "vector.mcap") as vector:
             vector.reset()
             vector.step([0, 0])
             assert held()

@@ -381,6 +381,23 @@ def test_flags_of_another_shape_are_refused(tmp_path: Path, flags: Any) -> None:
             env.step([0, 1, 2])
 
 
+@pytest.mark.parametrize("flag", [None, "false", 2, np.nan, -1])
+def test_flags_are_true_or_false(tmp_path: Path, flag: Any) -> None:
+    env = Batches(flags=lambda done: [0, 0, 1] if env.count == 1 else [flag, True, False])
+    with RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
+        recorded.reset()
+        recorded.step([0, 1, 2])
+        with pytest.raises(
+            StepError, match="terminal: expected true or false of each sub-environment, found "
+        ):
+            recorded.step([0, 1, 2])
+    assert [e.end for e in Recording(tmp_path / "r.mcap").episodes] == [
+        "interrupted",
+        "interrupted",
+        "terminal",
+    ]
+
+
 def test_the_first_batch_is_refused_as_others_are(tmp_path: Path) -> None:
     env = RecordEpisodes(Batches(flags=lambda done: done), tmp_path / "r.mcap")
     env.reset()

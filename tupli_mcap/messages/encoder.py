@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
-from tupli_mcap.messages.exact import check_structure, exact_array, leaf_value, shorten
+from tupli_mcap.messages.exact import check_structure, exact_array, exact_flag, leaf_value, shorten
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import DType, Leaf
 from tupli_mcap.messages.step import StepLayout
@@ -35,6 +35,7 @@ _TIME = Struct("<Q")
 HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 PREFIX = BODY + 8  # record header, CDR header, episode, step: the same for a whole episode
 _MAX_LEAVES = 4096  # compiling takes time and memory for each
+_BOOLS = b"\0\1"
 _LARGE = 2048  # bytes from which a leaf is copied as an array instead of through `bytes`
 _INT_FORMATS = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
@@ -169,7 +170,9 @@ def make_row_encoder(
         state.lines.append(f"image{i} = {check}({_access(source, 'state', leaf.keys)})")
         puts.append(f"{source.bind('put_image', images[i].put)}(image{i})")
         firsts.append(f"{source.bind('put_first', images[i].put_first)}(image{i})")
+    flags = [_flag(source, "terminal"), _flag(source, "timeout")]
     put_lines = [
+        *flags,
         *source.lines,
         *state.lines,
         f"pack(buffer, offset + {shifted.start}, {', '.join(shifted.args)})",
@@ -355,7 +358,7 @@ def _leaf(
     else:
         kind, shape = source.bind("dtype", dtype), source.bind("shape", leaf.shape)
         raw = f"{value}b"
-        large = nbytes >= _LARGE
+        large, is_bool = nbytes >= _LARGE, dtype.kind == "b"
         exact = source.bind("exact", _exact_plain(leaf, dtype) if large else _exact_bytes(leaf, dtype))
         fast = value if large else f"{value}.tobytes()"
         # of exactly this class: a subclass may mean something else by its bytes, as a masked array does
@@ -364,13 +367,25 @@ def _leaf(
             plain = f"({plain} or {value}.__class__ is {source.bind('scalar', dtype.type)})"
         source.lines.append(
             f"{raw} = {fast} if {plain} and {value}.dtype is {kind} and {value}.shape == {shape} else {exact}({value})"
+            if not (large and is_bool)
+            else f"{raw} = {exact}({value})"
         )
+        if is_bool and not large:  # made by a view, perhaps
+            source.lines.append(f"if {raw}.translate(None, {_BOOLS!r}): {raw} = {exact}({value})")
         if large:
             stores.append(
                 f"view[offset + {offset}:offset + {offset + nbytes}].view({kind}).reshape({shape})[...] = {raw}"
             )
         else:
             packed.add(offset, f"{nbytes}s", nbytes, raw)
+
+
+def _flag(source: _Source, name: str) -> str:
+    exact, kind = source.bind("exact", exact_flag), source.bind("kind", np.bool_)
+    return (
+        f"if {name} is not False and {name} is not True and {name}.__class__ is not {kind}: "
+        f"{name} = {exact}({name}, {name!r})"
+    )
 
 
 def _exact_int(leaf: Leaf, dtype: DType) -> Callable[[Any], int]:
@@ -383,7 +398,7 @@ def _exact_float(leaf: Leaf) -> Callable[[Any], float]:
     def exact(value: Any) -> float:
         if value.__class__ is int and -(2**53) <= value <= 2**53:
             return float(value)
-        if value.__class__ is np.float32:
+        if value.__class__ is np.float32 and value == value:  # widening may quiet a NaN
             return float(value)
         return float(exact_array(value, dtype, (), leaf.path))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -13,7 +14,15 @@ from gymnasium import spaces
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.leaves import ROS_TYPES, DType, Leaf
 
-__all__ = ["check_structure", "decide_dtype", "exact_array", "leaf_value", "shorten", "structure_check"]
+__all__ = [
+    "check_structure",
+    "decide_dtype",
+    "exact_array",
+    "exact_flag",
+    "leaf_value",
+    "shorten",
+    "structure_check",
+]
 
 _MANTISSA = {"float16": 11, "float32": 24, "float64": 53}
 
@@ -71,7 +80,7 @@ def _has_float(value: Sequence[Any]) -> bool:
 
 
 def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> np.ndarray[Any, Any]:
-    """`value` as an array of `dtype` and `shape`, equal to it in every element.
+    """`value` as an array of `dtype` and `shape`, equal to it in every element; bools are 0 or 1, as in messages.
 
     Raises:
         StepError: another shape, no numbers, or a value that `dtype` cannot hold exactly.
@@ -89,7 +98,8 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
             f"{path}: expected shape {shape}, found shape {array.shape}; nothing is reshaped in silence"
         )
     if array.dtype == dtype:
-        return array
+        # one made by a view may hold any byte
+        return array if dtype.kind != "b" else array.view(np.uint8) != 0
     with np.errstate(all="ignore"):
         cast = array.astype(dtype)
     if not _always_exact(array.dtype, dtype) and not _equal(array, cast):
@@ -98,6 +108,17 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
             "the recorded dtype is fixed by the first step, so cast in the environment or the policy"
         )
     return cast
+
+
+def exact_flag(value: Any, name: str) -> bool:
+    """A flag of a step; StepError unless it is a bool or the number 0 or 1 (None or a text is a mistake)."""
+    if value is True or value is False:
+        return value
+    with contextlib.suppress(ValueError, TypeError, RuntimeError):
+        array = np.asarray(value)
+        if array.shape == () and array.dtype.kind in "biuf" and array.item() in (0, 1):
+            return bool(array)
+    raise StepError(f"{name}: expected true or false, found {shorten(value)}")
 
 
 def _always_exact(source: DType, target: DType) -> bool:

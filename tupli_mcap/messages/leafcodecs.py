@@ -208,6 +208,4 @@ def expect_tuple(value: Any) -> None:
 
 def exact_bytes(value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
     """The little-endian bytes of a value that need not be of this dtype, or StepError."""
-    array = exact_array(value, dtype, shape, "")
-    # A bool made by a view may hold any byte, and readers drop a message where it is not 0 or 1.
-    return (array.view(np.uint8) != 0 if dtype.kind == "b" else array).tobytes()
+    return exact_array(value, dtype, shape, "").tobytes()

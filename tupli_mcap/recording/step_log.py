@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import StepError
-from tupli_mcap.messages.exact import exact_array, leaf_value, shorten, structure_check
+from tupli_mcap.messages.exact import exact_array, exact_flag, leaf_value, structure_check
 from tupli_mcap.messages.layout import BODY, CDR_HEADER
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
@@ -50,12 +50,13 @@ def _to_bytes(leaf: Leaf, dtype: np.dtype[Any]) -> Callable[[Any], bytes]:
     """The bytes of a leaf's values; StepError if one is not stored exactly."""
     shape, itemsize, signed = leaf.shape, dtype.itemsize, dtype.kind == "i"
     array, scalar = np.ndarray, dtype.type if shape == () else np.ndarray
+    fast = dtype.kind != "b"  # those may hold other bytes than 0 and 1
     integer = int if shape == () and dtype.kind in "iu" else None
     double = float if shape == () and dtype == np.float64 else None
 
     def convert(value: Any) -> bytes:
         kind = value.__class__
-        if (kind is array or kind is scalar) and value.dtype == dtype and value.shape == shape:
+        if fast and (kind is array or kind is scalar) and value.dtype == dtype and value.shape == shape:
             return value.tobytes()  # type: ignore[no-any-return]
         if kind is double:
             return _DOUBLE.pack(value)
@@ -161,12 +162,7 @@ class StepLog:
         out = bytearray(self._pending)
         self._encode(out, self._action, action)
         self._encode(out, self._reward, reward)
-        try:
-            out += bytes((bool(terminal), bool(timeout)))
-        except ValueError as err:
-            raise StepError(
-                f"expected terminal and timeout to be true or false, found {shorten((terminal, timeout))}"
-            ) from err
+        out += bytes((exact_flag(terminal, "terminal"), exact_flag(timeout, "timeout")))
         return PreparedStep(out, self._layout.reward_total(reward), self.prepare_state(state))
 
     def commit(self, prepared: PreparedStep) -> None:

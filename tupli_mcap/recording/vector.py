@@ -174,6 +174,8 @@ class VectorRecorder:
             done = terminals | timeouts
             flags = done.tobytes()
             any_done = flags != self._none
+            if any_done:
+                terminals, timeouts = self._plain(terminals, timeouts, done, flags)
             finals = self._finals(done, states, infos) if any_done and (infos or not resets.is_plain) else {}
             holes = self._ended if self._any_ended and resets.mode == "NextStep" else None
             active = None if holes is None else ~holes
@@ -215,10 +217,24 @@ class VectorRecorder:
         if values.__class__ is np.ndarray and values.dtype is _BOOL and values.shape == self._shape:
             flag: Array = values
             return flag
-        flag = np.asarray(values, dtype=np.bool_)
-        if flag.shape != self._shape:
-            raise StepError(f"{name}: expected shape {self._shape}, found shape {flag.shape}")
-        return flag
+        try:
+            given = np.asarray(values)
+        except (ValueError, TypeError, RuntimeError) as err:
+            raise StepError(f"{name}: expected {self._n} flags, found {shorten(values)}") from err
+        if given.shape != self._shape:
+            raise StepError(f"{name}: expected shape {self._shape}, found shape {given.shape}")
+        if given.dtype.kind not in "biuf" or not np.isin(given, (0, 1)).all():
+            raise StepError(
+                f"{name}: expected true or false of each sub-environment, found {shorten(values)}"
+            )
+        return given.astype(np.bool_)
+
+    def _plain(self, terminals: Array, timeouts: Array, done: Array, flags: bytes) -> tuple[Array, Array]:
+        """The flags of a batch with bytes of 0 and 1, as those of `done`; a bool made by a view may hold any byte."""
+        given = terminals.tobytes(), timeouts.tobytes()
+        if given in ((flags, self._none), (self._none, flags)):
+            return terminals, timeouts
+        return terminals & done, timeouts & done
 
     def running(self, i: int) -> tuple[int, int]:
         """The number of the running episode of a sub-environment and its steps so far; (-1, 0) if there is none."""

@@ -27,6 +27,7 @@ from tupli_mcap.recording.rows import HOLE, Array, StartChunks
 __all__ = ["HOLE", "VectorRows"]
 
 _ACTION, _REWARD, _STATE = range(3)
+_BOOL = np.dtype(np.bool_)  # those may hold other bytes than 0 and 1
 
 
 class _Field(NamedTuple):
@@ -119,7 +120,10 @@ class VectorRows:
         values, roots = [], (action, reward, state)
         for root, (leaf, view, dtype, shape, ahead) in self._fields:
             value = leaf_value(roots[root], leaf) if leaf.keys else roots[root]
-            if not (value.__class__ is np.ndarray and value.dtype is dtype and value.shape == shape):
+            if (
+                not (value.__class__ is np.ndarray and value.dtype is dtype and value.shape == shape)
+                or dtype is _BOOL
+            ):
                 value = exact_array(value, dtype, shape, leaf.path)
             if view is not None:
                 values.append((view, value, ahead))
