@@ -535,7 +535,67 @@ def test_a_callback_that_another_recorder_has_left_in_mid_episode(tmp_path: Path
             assert (episode.end, episode.metadata["total"]) == ("interrupted", len(episode))
 
 
+@pytest.mark.parametrize("given", ["text", 5, [1, 2], [(1, 2)]])
+def test_infos_and_entries_that_are_no_dicts(tmp_path: Path, given: Any) -> None:
+    """The step is recorded all the same."""
+    odd: Any = Scripted(lambda step: np.zeros(2, np.float32), BOX, info=lambda step: given)
+    cases: list[tuple[Any, dict[str, Any], str]] = [
+        (odd, {"record_info": True}, "info"),
+        (odd, {"record_info": ["a"]}, "info"),
+        (odd, {"record_info": lambda info: {}}, "info"),
+        (None, {"record_info": lambda info: given}, "record_info: what the function returns"),
+        (None, {"step_callback": lambda step: given}, "step_callback: what it returns"),
+    ]
+    for env, options, what in cases:
+        inner = Scripted(lambda step: np.zeros(2, np.float32), BOX) if env is None else env
+        with RecordEpisodes(inner, tmp_path / "r.mcap", mode="w", **options) as recorded:
+            recorded.reset()
+            with pytest.raises(RecordingError, match=f"^{what}: expected a dict, found "):
+                recorded.step(0)
+        assert Recording(tmp_path / "r.mcap").num_steps == 1
+
+
 # ---- files
+
+
+@pytest.mark.parametrize("options", [{}, {"mode": "w"}, {"mode": "a"}, {"max_bytes": 1000}])
+def test_a_nul_in_a_path_is_refused(options: dict[str, Any]) -> None:
+    for wrap, env in (
+        (RecordEpisodes, gym.make("CartPole-v1")),
+        (RecordVectorEpisodes, gym.make_vec("CartPole-v1", 2)),
+    ):
+        with pytest.raises(
+            RecordingError, match=r"expected a path to record to, found 'a\\x00b', which holds a NUL"
+        ):
+            wrap(env, "a\0b", **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_too_little_memory_to_compress_is_one_error(compression: str) -> None:
+    """In a process of its own that may take so much more, and no more."""
+    script = f"""
+import resource
+import numpy as np
+from tupli_mcap import RecordingError
+from tupli_mcap.recording.container import Container
+container = Container(-1, "r.mcap", {compression!r})
+data = [np.random.default_rng(i).bytes(1 << 17) for i in range(64)]
+container.pack_all(data[:2])
+used = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmSize")) * 1024
+for pack, value in ((container.pack, b"".join(data)), (container.pack_all, data)):
+    for more in range(0, 3 << 20, 1 << 18):
+        resource.setrlimit(resource.RLIMIT_AS, (used + more, resource.RLIM_INFINITY))
+        try:
+            pack(value)
+        except RecordingError as err:
+            print(err)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) > 12
+    told = r"r\.mcap: could not compress \d+ bytes: .+; what was recorded before stays readable"
+    assert all(re.fullmatch(told, line) for line in lines)
 
 
 @pytest.mark.parametrize("limits", [{}, {"max_bytes": 10**6}])

@@ -12,7 +12,7 @@ import os
 import struct
 import threading
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -60,6 +60,7 @@ _PIECES = 1024  # that a call of the system takes
 # Steps are recorded once and read hundreds of times. Beside level 1, rows of CartPole take 8% more room, are compressed
 # in 0.75 of the time and decompressed in 0.6 of it; walks of 17 float64 take 5% more, 0.4 and 0.2.
 _LEVEL = -1
+_CONTEXT = 4 << 20  # bytes: more than a compressor needs beside what it makes
 
 
 def _built(builder: RecordBuilder) -> bytes:
@@ -234,14 +235,29 @@ class Container:
         return Prepared(rows, len(head), data, crc32(data))
 
     def pack(self, data: Any) -> bytes:
-        """Compresses the records of a chunk."""
-        if self._compression == "zstd":
-            packed: bytes = self._zstd().compress(data)
-            return packed
-        if self._compression == "lz4":
-            framed: bytes = lz4.frame.compress(data)
-            return framed
-        return bytes(data)
+        """Compresses the records of a chunk.
+
+        Raises:
+            RecordingError: there is no memory for it.
+        """
+        with self._memory_for(len(data)):
+            if self._compression == "zstd":
+                packed: bytes = self._zstd().compress(data)
+                return packed
+            if self._compression == "lz4":
+                framed: bytes = lz4.frame.compress(data)
+                return framed
+            return bytes(data)
+
+    @contextlib.contextmanager
+    def _memory_for(self, size: int) -> Iterator[None]:
+        try:
+            yield
+        except (zstandard.ZstdError, RuntimeError, MemoryError) as err:
+            raise RecordingError(
+                f"{self._name}: could not compress {size} bytes: {str(err) or 'out of memory'}; "
+                "what was recorded before stays readable"
+            ) from err
 
     @property
     def packs_together(self) -> bool:
@@ -251,7 +267,11 @@ class Container:
     def pack_all(self, data: Sequence[Any]) -> list[Any]:
         """`pack` of several chunks, as bytes or buffers."""
         if len(data) > 1 and self.packs_together:  # each call makes compressors for its threads
-            parts = self._zstd().multi_compress_to_buffer(list(data))
+            size = sum(map(len, data))
+            with self._memory_for(size):
+                # zstandard ends the process (it frees a buffer twice) where it finds too little on its way
+                np.empty(size + _CONTEXT, np.uint8)
+                parts = self._zstd().multi_compress_to_buffer(list(data))
             return [parts[i] for i in range(len(parts))]
         return [self.pack(part) for part in data]
 

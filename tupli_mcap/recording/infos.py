@@ -14,17 +14,27 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.exact import shorten
 from tupli_mcap.messages.leaves import NameRegistry
 from tupli_mcap.recording.events import read_strings
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.writer import RecordingWriter
 
-__all__ = ["InfoDecoder", "InfoRecorder", "RecordInfo", "info_schema"]
+__all__ = ["InfoDecoder", "InfoRecorder", "RecordInfo", "entries_of", "info_schema"]
 
 RecordInfo = bool | Sequence[str] | Callable[[dict[str, Any]], Mapping[str, Any]]
 _HEAD = struct.Struct("<II")
 _FIELD = struct.Struct("<d?7x")
+
+
+def entries_of(given: Any, what: str) -> dict[str, Any]:
+    """A copy of a dict of entries, empty for None; RecordingError if it is something else."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise RecordingError(f"{what}: expected a dict, found {shorten(given)}")
+    return dict(given)
 
 
 class InfoRecorder:
@@ -53,12 +63,14 @@ class InfoRecorder:
 
     def chosen(self, info: Mapping[str, Any] | None) -> dict[str, Any]:
         """The entries of an environment's info that are to be recorded."""
-        info = info or {}
+        if self._select is False:
+            return {}
+        info = entries_of(info, "info")
         if callable(self._select):
-            return dict(self._select(dict(info)) or {})
+            return entries_of(self._select(info), "record_info: what the function returns")
         if self._select is True:
-            return dict(info)
-        return {name: info[name] for name in self._names if name in info}  # of no name where it is False
+            return info
+        return {name: info[name] for name in self._names if name in info}
 
     def put(self, writer: RecordingWriter, episode: int, step: int, info: Mapping[str, Any]) -> None:
         """Appends the entries of one step to the journal."""

@@ -44,7 +44,9 @@ class WriterOptions(NamedTuple):
 
 
 def check_local(path: str | os.PathLike[str]) -> None:
-    """Raises RecordingError if `path` is a URL, as it was given: as a `Path` it no longer looks like one."""
+    """Raises RecordingError if `path` is none, or a URL, as it was given: as a `Path` it no longer looks like one."""
+    if "\0" in os.fspath(path):
+        raise RecordingError(f"expected a path to record to, found {os.fspath(path)!r}, which holds a NUL")
     if "://" in os.fspath(path):
         raise RecordingError(
             f"{path}: expected a local path to record to, found a URL; record to a path, and copy the file"

@@ -20,7 +20,7 @@ from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.events import TERMINAL, TIMEOUT
 from tupli_mcap.recording.framing import CAMERA, FrameRecorder, check_every, check_render_mode
-from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
+from tupli_mcap.recording.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.recording.rotation import Rotation
@@ -321,11 +321,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             return
         self._stepped = True
         if self._infos is not None:
-            entries = ask(self._infos.chosen, info)
-            if self._step_callback is not None:
-                extra = ask(self._step_callback, Step(before, action, reward, terminal, timeout, info))
-                entries.update(extra or {})
-            self._recorder.put_info(entries)
+            step = Step(before, action, reward, terminal, timeout, info)
+            self._recorder.put_info(ask(self._entries, self._infos, step))
         if self._metadata_callback is not None:
             rl_tuple = RLTuple.model_construct(
                 state=before, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
@@ -334,6 +331,12 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         if self._frames is not None:
             number, step = self._recorder.running
             self._frames.step(0, number, step, bool(terminal or timeout), self.env.render)
+
+    def _entries(self, infos: InfoRecorder, step: Step) -> dict[str, Any]:
+        entries = infos.chosen(step.info)
+        if self._step_callback is not None:
+            entries.update(entries_of(self._step_callback(step), "step_callback: what it returns"))
+        return entries
 
     def _end(self, action: Any, result: Any) -> None:
         """The end of an episode that a step has ended."""

@@ -22,7 +22,7 @@ from tupli_mcap.recording.autoreset import Autoreset
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.framing import CAMERA, VectorFrames, check_every, check_render_mode
-from tupli_mcap.recording.infos import InfoRecorder, RecordInfo
+from tupli_mcap.recording.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.recording.rotation import Rotation
@@ -339,7 +339,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
     def _entries(self, step: Step) -> dict[str, Any]:
         entries = {} if self._infos is None else self._infos.chosen(step.info)
         if self._step_callback is not None:
-            entries.update(self._step_callback(step) or {})
+            entries.update(entries_of(self._step_callback(step), "step_callback: what it returns"))
         return entries
 
     def _call(self, i: int, step: Step) -> None:
