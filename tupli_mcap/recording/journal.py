@@ -340,7 +340,7 @@ def read_journal(path: Path, only: Collection[str] | None = None) -> JournalCont
                 raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {found}")
             file.seek(start)
             data[area.name] = found_bytes = np.empty(found, np.uint8)
-            read = file.readinto(memoryview(found_bytes))  # type: ignore[attr-defined]
+            read = file.readinto(found_bytes.data)  # type: ignore[attr-defined]
             if read != found:
                 raise FormatError(f"{path}: area {area.name!r} expected {found} bytes, found {read}")
     return JournalContents(info, {area.name: area for area in areas}, data)

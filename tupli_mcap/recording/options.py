@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -53,9 +54,19 @@ def check_local(path: str | os.PathLike[str]) -> None:
         )
 
 
+def _check_clock(path: str | os.PathLike[str]) -> None:
+    """Raises RecordingError if the clock is not within what rows hold: a `log_time` of 0 says that there is no row."""
+    now = time.time_ns()
+    if not 0 < now < 1 << 63:
+        raise RecordingError(
+            f"{path}: expected a clock between 1970 and 2262, found {now} ns since 1970; set the system's clock"
+        )
+
+
 def check_options(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:
     """The options, with a place for the journal that does not depend on the process's directory."""
     check_local(path)
+    _check_clock(path)
     size, seconds = options.chunk_size, options.flush_seconds
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= _MOST:
         raise RecordingError(f"chunk_size: expected an integer from 1 to {_MOST} (bytes), found {size!r:.80}")

@@ -321,8 +321,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             return
         self._stepped = True
         if self._infos is not None:
-            step = Step(before, action, reward, terminal, timeout, info)
-            self._recorder.put_info(ask(self._entries, self._infos, step))
+            taken = Step(before, action, reward, terminal, timeout, info)
+            self._recorder.put_info(ask(self._entries, self._infos, taken))
         if self._metadata_callback is not None:
             rl_tuple = RLTuple.model_construct(
                 state=before, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
