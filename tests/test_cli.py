@@ -651,12 +651,12 @@ class TestStorages:
     def test_list_benchmarks(self, filled: tuple[Path, str, str], here: Path) -> None:
         root, pole, wind = filled
         header, *rows = ok("list-benchmarks", "--storage", root).splitlines()
-        assert header.split() == ["ID", "NAME", "CREATED", "DESCRIPTION"]
+        assert header.split() == ["ID", "NAME", "ENVIRONMENT", "CREATED", "DESCRIPTION"]
         assert [row.split()[:2] for row in rows] == [[pole, "pole"], [wind, "wind"]]
-        (told,) = run(
-            "list-benchmarks", "--storage", root, "--filter", 'metadata.name = "wind"', "--json"
-        ).json
-        assert told["id"] == wind
+        assert rows[0].split()[2] == "CartPole-v1"
+        for name in ('metadata.name = "wind"', 'environment != "CartPole-v1"'):
+            (told,) = run("list-benchmarks", "--storage", root, "--filter", name, "--json").json
+            assert told["id"] == wind
 
     def test_list_artifacts(self, filled: tuple[Path, str, str], here: Path) -> None:
         out = ok("list-artifacts", "--storage", filled[0])

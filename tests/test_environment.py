@@ -21,9 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tupli_mcap import trust
-from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture, record_environment
-from tupli_mcap.environment._attributes import HAS_LAZY_DICTS, attributes
-from tupli_mcap.environment._pickling import attribute_names
+from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture
 from tupli_mcap.errors import FormatError, TupliError, UntrustedError
 
 
@@ -136,6 +134,70 @@ def test_what_a_spec_does_not_say_is_pickled(change: Any) -> None:
     assert built._max_episode_steps == env._max_episode_steps  # type: ignore[attr-defined]
 
 
+class Plant(Counter):
+    """Gives its attributes constants, arguments, and what it makes of them."""
+
+    gain = 1.0
+
+    def __init__(self, start: float = 0.0, *, limit: int = 9, scale: float = 2.0) -> None:
+        super().__init__(start)
+        self.limit = limit
+        scale = float(scale)
+        self.scale = scale
+        self.mass: float = 0.5
+        self.kind = "tank" if limit > 5 else "pipe"
+        self.__secret = None
+        self.low = self.high = 0
+        self.area = self.mass * limit
+
+    def widen(self) -> None:
+        self.mass = 1.5
+        self.area += 1
+
+
+def test_a_spec_is_enough_where_classes_say_how_attributes_came_about() -> None:
+    gym.register("TupliPlant-v0", entry_point=f"{__name__}:Plant")
+    try:
+
+        def captured(**changes: Any) -> EnvironmentRecord:
+            env = gym.make("TupliPlant-v0", limit=4, scale="3")
+            for name, value in changes.items():
+                setattr(env.unwrapped, name, value)
+            return capture(env, by_reference=True)
+
+        assert captured().spec is not None
+        for change in (
+            {"limit": 5}, {"limit": 4.0}, {"mass": 0.6}, {"gain": 1.0}, {"_Plant__secret": 3}, {"step": print},
+            {"colour": "red"},
+        ):  # fmt: skip
+            assert captured(**change).pickle is not None, change  # type: ignore[arg-type]
+        # What the code of the class itself gives, and what a constructor computes.
+        for change in (
+            {"mass": 1.5},
+            {"area": 7.0},
+            {"kind": "lake"},
+            {"scale": 1.0},
+            {"low": 2},
+            {"start": 5.0},
+        ):
+            assert captured(**change).spec is not None, change  # type: ignore[arg-type]
+    finally:
+        del gym.registry["TupliPlant-v0"]
+
+
+def test_a_wrapper_that_hides_itself_from_the_spec_is_pickled() -> None:
+    class Hidden(gym.RewardWrapper[Any, Any]):
+        spec = property(lambda self: self.env.spec)  # type: ignore[assignment]
+
+        def reward(self, reward: Any) -> Any:
+            return -reward
+
+    assert capture(Hidden(gym.make("CartPole-v1"))).pickle is not None
+    limited = gym.wrappers.TimeLimit(gym.make("CartPole-v1"), 1000)  # outside of the one of 500 steps
+    assert capture(limited).pickle is not None
+    assert capture(gym.make("CartPole-v1"), pickled=True).name == "CartPole-v1"
+
+
 def test_wrappers_that_a_spec_cannot_hold_are_pickled() -> None:
     env = gym.wrappers.TransformReward(gym.make("CartPole-v1"), lambda reward: reward * 2)
     record = capture(env)
@@ -185,9 +247,9 @@ def test_capturing_changes_nothing_in_the_environment() -> None:
 
 def test_snapshot_keeps_the_state_it_was_taken_in() -> None:
     env = Counter(start=4.0)
-    snapshot = Snapshot(env)
+    snapshot = Snapshot(env, copies=True)
     env.start = 9.0
-    copy = snapshot.restore()
+    copy = snapshot.copy()
     assert isinstance(copy, Counter)
     assert copy.start == 4.0
     assert build(snapshot.record(), trust=True).unwrapped.start == 4.0  # type: ignore[attr-defined]
@@ -196,16 +258,16 @@ def test_snapshot_keeps_the_state_it_was_taken_in() -> None:
 def test_an_environment_that_cannot_be_pickled_fails_only_when_needed() -> None:
     env = Counter()
     env.lock = threading.Lock()  # type: ignore[attr-defined]
-    snapshot = Snapshot(env)
+    snapshot = Snapshot(env, copies=True)
     with pytest.raises(TupliError, match=r"the environment .*Counter cannot be pickled \(TypeError: .*lock"):
         snapshot.record()
-    copy = snapshot.restore()
+    copy = snapshot.copy()
     assert copy.lock is env.lock  # type: ignore[attr-defined]
     copy.lock = None  # type: ignore[attr-defined]
-    assert record_environment(copy).pickle is not None
+    assert capture(copy).pickle is not None
 
 
-def test_copies_do_not_close_what_they_share() -> None:
+def test_what_cannot_be_captured_stays_open() -> None:
     env = Engine()
     env.__dict__.pop("_ezpickle_args")
     with pytest.raises(TupliError, match="cannot be"):
@@ -509,21 +571,27 @@ def test_all_that_a_spec_says_is_in_its_digest() -> None:
     )  # claims for people
 
 
-def test_own_environments_with_telling_arguments_are_signed(tmp_path: Path) -> None:
-    from tupli_mcap import RecordEpisodes, Recording
+def test_own_specs_with_telling_arguments_are_not_signed(tmp_path: Path) -> None:
+    """Only a benchmark that is stored, or a pickle that is asked for, is signed as this user's own."""
+    from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper
 
     gym.register("TupliTold-v0", entry_point="gymnasium.envs.toy_text.frozen_lake:FrozenLakeEnv")
     try:
         env = gym.make("TupliTold-v0", desc=["SF.", "FFG"])
-        with RecordEpisodes(env, tmp_path / "a.mcap") as recorded:
+        with FileStorage(tmp_path / "lab") as storage, RecordEpisodes(env, tmp_path / "a.mcap") as recorded:
+            wrapper = TupliEnvWrapper(gym.make("TupliTold-v0", desc=["SF.", "FFG"]), storage)
             recorded.reset(seed=0)
             recorded.step(0)
-        with Recording(tmp_path / "a.mcap") as recording:
-            assert recording.benchmark.record.spec is not None
-            recording.benchmark.make_env()
-            trust.untrust(recording.benchmark.record.digest)
-            with pytest.raises(UntrustedError, match="may name a file or code"):
+            recorded.flush()
+            with Recording(tmp_path / "a.mcap") as recording:
+                assert recording.benchmark.record.spec is not None
+                with pytest.raises(UntrustedError, match="may name a file or code"):
+                    recording.benchmark.make_env()
+                wrapper.store(name="lake")
                 recording.benchmark.make_env()
+                trust.untrust(recording.benchmark.record.digest)
+                with pytest.raises(UntrustedError, match="may name a file or code"):
+                    recording.benchmark.make_env()
     finally:
         del gym.registry["TupliTold-v0"]
 
@@ -556,7 +624,7 @@ def test_defects_in_benchmark_json_are_format_errors() -> None:
         (record.to_json(), None, "is missing beside it"),
         (record.to_json(), (record.pickle or b"")[:-1], "expected a pickled environment of"),
         (changed(digest="0" * 64), record.pickle, "expected an environment with digest 0000"),
-        (changed(pickle=None), None, "found neither"),
+        (changed(pickle=None), None, "expected an environment with digest"),
         (changed(spec={"id": "CartPole-v1"}), record.pickle, "found both"),
         (changed(spec=3), record.pickle, "environment.spec"),
         (changed(spec={"id": float("nan")}, pickle=None), None, "no strict JSON"),
@@ -584,54 +652,10 @@ GOOD = EnvironmentRecord(
 )
 
 
-class TestAttributesWithoutDict:
-    """Only Python 3.11 and 3.12 keep attributes outside a dict until they are asked for it."""
-
-    class Made:
-        kind = "made"
-
-        def __init__(self) -> None:
-            self.kind = "made"  # as the class has it
-            self.nothing = None
-            self.parts = [1]
-
-    NAMES = ("kind", "nothing", "parts")
-
-    @pytest.mark.skipif(not HAS_LAZY_DICTS, reason="there is always a dict, or asking for it costs nothing")
-    def test_they_are_those_of_the_dict(self) -> None:
-        made = self.Made()
-        found = attributes(made, self.NAMES)
-        assert found == {"kind": "made", "nothing": None, "parts": [1]}
-        assert found is not None
-        assert found["parts"] is made.parts
-        assert found == vars(made)
-        assert attributes(made, self.NAMES) is None, "asked for its dict now"
-
-    def test_other_attributes_are_noticed(self) -> None:
-        one, another, third = self.Made(), self.Made(), self.Made()
-        one.secret = None  # type: ignore[attr-defined]
-        assert attributes(one, self.NAMES) is None
-        del another.parts
-        assert attributes(another, self.NAMES) is None
-        del third.kind  # which the class has
-        assert attributes(third, self.NAMES) is None
-
-    @pytest.mark.skipif(not HAS_LAZY_DICTS, reason="there is always a dict, or asking for it costs nothing")
-    def test_an_environment_is_captured_without_asking_for_it(self) -> None:
-        made, touched = gym.make("CartPole-v1"), gym.make("CartPole-v1")
-        names = attribute_names(touched)
-        told = capture(made)
-        layers = [made]
-        while isinstance(layers[-1], gym.Wrapper):
-            layers.append(layers[-1].env)
-        for obj in [*layers, made.unwrapped.action_space, made.unwrapped.observation_space]:
-            assert attributes(obj, names[type(obj)]) is not None, type(obj)
-        assert told == capture(touched)
-
-    def test_what_was_changed_is_captured(self) -> None:
-        env = gym.make("CartPole-v1")
-        env.unwrapped.gravity = 5.0  # type: ignore[attr-defined]
-        env.unwrapped.secret = None  # type: ignore[attr-defined]
-        copy = build(capture(env), trust=True)
-        assert vars(copy.unwrapped)["gravity"] == 5.0
-        assert vars(copy.unwrapped)["secret"] is None
+def test_what_was_changed_is_captured() -> None:
+    env = gym.make("CartPole-v1")
+    env.unwrapped.gravity = 5.0  # type: ignore[attr-defined]
+    env.unwrapped.secret = None  # type: ignore[attr-defined]
+    copy = build(capture(env), trust=True)
+    assert vars(copy.unwrapped)["gravity"] == 5.0
+    assert vars(copy.unwrapped)["secret"] is None

@@ -176,17 +176,19 @@ def test_of_sub_environments_that_are_not_at_hand(mode: str, tmp_path: Path) -> 
     assert labels.dimensions == {"state": CART_POLE} and labels.values == {"action": PUSHES}
 
 
-@pytest.mark.parametrize(
-    ("name", "seconds"), [("CartPole-v1", 0.02), ("Pendulum-v1", 0.05), ("FrozenLake-v1", 1 / 4), ("", None)]
-)
-def test_how_long_a_step_takes_in_other_processes(name: str, seconds: float | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "seconds"), [("Pendulum-v1", 1 / 30), ("FrozenLake-v1", 1 / 4), ("", None)])
+def test_other_processes_are_not_asked_how_long_a_step_takes(
+    name: str, seconds: float | None, tmp_path: Path
+) -> None:
+    """It is one frame, as the metadata of the vector environment has it."""
+
     def make() -> gym.Env[Any, Any]:
         space = gym.spaces.Discrete(2)
         return gym.make(name) if name else Sampler(space, space)
 
     with RecordVector(gym.vector.AsyncVectorEnv([make] * 2), tmp_path / "r.mcap") as recorder:
         recorder.reset(seed=1)
-        for _ in range(3):  # none of them has ended of the question
+        for _ in range(3):
             recorder.step(recorder.action_space.sample())
     assert Recording(tmp_path / "r.mcap").labels.step_seconds == seconds
 

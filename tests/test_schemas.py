@@ -314,7 +314,7 @@ class TestJsonSchemas:
         changed = gym.make("CartPole-v1")
         changed.unwrapped.gravity = 1.0  # type: ignore[attr-defined]
         for name, inner in (("spec", env), ("pickle", changed)):
-            with RecordEpisodes(inner, tmp_path / f"{name}.mcap") as recorder:
+            with RecordEpisodes(inner, tmp_path / f"{name}.mcap", capture_env=name) as recorder:  # type: ignore[arg-type]
                 recorder.reset(seed=0)
                 recorder.step(0)
             with Recording(tmp_path / f"{name}.mcap") as recording:

@@ -441,6 +441,18 @@ def bundle(path: Path) -> list[Log]:
     return expected(env)
 
 
+def named(path: Path) -> list[Log]:
+    """A recording that names its environment, and has nothing to rebuild it from."""
+    env = Played(POLE, pole, [(3, "terminal")])
+    record = EnvironmentRecord(
+        "Pole-v0", classes=("poles:Limit", "poles:Pole"), versions={"gymnasium": "1.0"}
+    )
+    attachments = {"benchmark.json": ("application/json", record.to_json())}
+    with RecordEpisodes(env, path, compression="none", attachments=attachments) as recorder:
+        roll(recorder, env, [3, 1], action)
+    return expected(env)
+
+
 def frames(path: Path) -> list[Log]:
     """A picture of every second state and of each final one; an episode that was cut short, and one appended."""
     env = Painted(POLE, pole, [(3, "terminal"), (4, "timeout"), (9, "terminal")])
@@ -539,6 +551,7 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "unfinished_holes": unfinished_holes,
     "stacked_last": lambda path: stacked(path, -1),
     "png_stacks": png_stacks,
+    "named": named,
 }
 
 

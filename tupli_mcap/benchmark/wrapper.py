@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from tupli_mcap import trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
-from tupli_mcap.environment import Snapshot, build, record_environment
+from tupli_mcap.environment import Snapshot, build, capture, fingerprint
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError
 from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.storage import TupliStorage
@@ -58,27 +58,34 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     """Stores an environment as a benchmark and records what happens in it.
 
     The environment is captured as it is when it is wrapped: stepping it changes neither what is stored nor
-    its id. Once the benchmark has an id, every episode is recorded into one file of the storage, opened at
-    the first reset or step; finished episodes are listed by the storage at once. Recording can be switched
-    off and on.
+    its id. No other environment is made for it. Once the benchmark has an id, every episode is recorded into one
+    file of the storage, opened at the first reset or step; finished episodes are listed by the storage at once.
+    Recording can be switched off and on.
+
+    An environment is stored as its EnvSpec, which others build without trust, if its id is registered here, its
+    arguments are plain data, its wrappers are Gymnasium's or of its own package, it has not been reset, and its
+    attributes are those that its classes assign, with the constants and constructor arguments that they assign. Any
+    other is stored as a pickle. A changed value that the constructor computes is not noticed; `verify --replay`
+    finds it. So change a registered environment by its arguments, a wrapper or a subclass.
 
     Args:
         env: the environment; the wrapper never changes it.
-        storage: where the benchmark is kept.
+        storage: where the benchmark is kept; None is enough for `serialize_env`.
         benchmark_id: the id of the benchmark that `env` was loaded from.
         metadata_callback: called with every recorded step; its last result becomes the episode's metadata.
         rl_tuple_cls: the class of the tuples that the callback is given. Recorded are the values themselves.
         recording_options: for `RecordEpisodes`: record_info, step_callback, reward_space, compression,
             chunk_size, flush_seconds, durability, frames, frame_format, image_format, max_bytes, max_seconds.
 
-    Subclasses that keep data outside of the environment override `_serialize` and `_deserialize`.
+    Subclasses that keep data outside of the environment override `_serialize` and `_deserialize`. `_serialize` is
+    given a copy, made of the pickle when the environment is serialized; nobody closes it.
     Not thread-safe.
     """
 
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        storage: TupliStorage,
+        storage: TupliStorage | None,
         benchmark_id: str | None = None,
         metadata_callback: EpisodeMetadataCallback | None = None,
         rl_tuple_cls: type[RLTuple] = RLTuple,
@@ -91,16 +98,16 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
                 f"expected recording options among {', '.join(_RECORDING_OPTIONS)}, "
                 f"found {', '.join(sorted(unknown))}"
             )
-        if not isinstance(storage, TupliStorage):
+        if storage is not None and not isinstance(storage, TupliStorage):
             raise StorageError(
-                f"storage: expected a TupliStorage, such as FileStorage('lab'), found {storage!r:.80}"
+                f"storage: expected a TupliStorage, such as FileStorage('lab'), or None, found {storage!r:.80}"
             )
         self._recording_options = recording_options
-        self.storage = storage
+        self._storage = storage
         self.id = benchmark_id
         self.metadata_callback = metadata_callback
         self.rl_tuple_cls = rl_tuple_cls
-        self._snapshot = Snapshot(env, at_speed=True)
+        self._snapshot = Snapshot(env, copies=self._changes_copies)
         self._tap = Tap(env)
         self._recording = True
         self._recorder: RecordEpisodes | None = None
@@ -108,6 +115,17 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         self._pending: list[
             PendingReset
         ] = []  # resets that no step followed, each going on from the one before
+
+    @property
+    def storage(self) -> TupliStorage:
+        """Where the benchmark is kept; StorageError if there is no storage."""
+        if self._storage is None:
+            raise StorageError("this environment has no storage; wrap it with TupliEnvWrapper(env, storage)")
+        return self._storage
+
+    @storage.setter
+    def storage(self, storage: TupliStorage | None) -> None:
+        self._storage = storage
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
@@ -365,13 +383,16 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     def serialize_env(self, env: gym.Env[Any, Any], *, by_reference: bool = False) -> str:
         """An environment as text. `self.env` is taken as it was when it was wrapped; neither is changed."""
-        snapshot = self._snapshot if env is self.env else Snapshot(env)
-        copy = snapshot.restore()
-        try:
-            changed, artifacts = self._serialize(copy)
-            record = record_environment(changed, by_reference=by_reference)
-        finally:
-            snapshot.discard(copy)
+        snapshot = self._snapshot if env is self.env else Snapshot(env, copies=self._changes_copies)
+        if not self._changes_copies:
+            return pack(snapshot.record(by_reference=by_reference), [], facts_about(env))
+        copy = snapshot.copy()
+        before = fingerprint(copy)
+        changed, artifacts = self._serialize(copy)
+        if before is None or fingerprint(changed) != before:
+            record = capture(changed, by_reference=by_reference, pickled=True)
+        else:
+            record = snapshot.record(by_reference=by_reference)
         return pack(record, artifacts, facts_about(env))
 
     @classmethod
@@ -380,6 +401,11 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     ) -> gym.Env[Any, Any]:
         """The environment that `serialize_env` made a text of. Raises as `load` does."""
         return cls._deserialize(build(unpack(serialized_env).record, trust=trust), storage)
+
+    @property
+    def _changes_copies(self) -> bool:
+        """Whether `_serialize` is somebody's own, who is to be given a copy."""
+        return getattr(self._serialize, "__func__", None) is not TupliEnvWrapper._serialize
 
     def _serialize(self, env: gym.Env[Any, Any]) -> tuple[gym.Env[Any, Any], list[str]]:
         """To be overridden: move data out of an environment before it is stored.

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from tupli_mcap.recording.describe import RecordingDescription, Spread
     from tupli_mcap.schema import EpisodeHeader
+    from tupli_mcap.wrappers.benchmark import CaptureEnv
     from tupli_mcap.wrappers.rollout import RolloutSummary
 
 __all__ = ["print_episodes", "register"]
@@ -56,6 +57,17 @@ class _Compression(StrEnum):
     zstd = "zstd"
     lz4 = "lz4"
     none = "none"
+
+
+class _CaptureEnv(StrEnum):
+    spec = "spec"
+    pickle = "pickle"
+    none = "none"
+
+    @property
+    def argument(self) -> CaptureEnv:
+        """The same for `record_rollouts`."""
+        return None if self is _CaptureEnv.none else "pickle" if self is _CaptureEnv.pickle else "spec"
 
 
 def register(app: typer.Typer) -> None:
@@ -105,6 +117,9 @@ def _record(
         bool, typer.Option("--frames", help="Record what the environment renders (rgb_array) too.")
     ] = False,
     every: Annotated[int, typer.Option(min=1, help="With --frames: of every so many steps.")] = 1,
+    capture_env: Annotated[
+        _CaptureEnv, typer.Option(help="What the file carries of the environment.")
+    ] = _CaptureEnv.spec,
     max_bytes: Annotated[
         int | None, typer.Option(min=1, help="Go on in FILE_0001.mcap, … when so much is in a file.")
     ] = None,
@@ -144,6 +159,7 @@ def _record(
             durability=durability.value,
             live=live,
             frames=every if frames else False,
+            capture_env=capture_env.argument,
             max_bytes=max_bytes,
             max_seconds=max_seconds,
             progress=progress,

@@ -15,10 +15,22 @@ from tupli_mcap.cli.options import (
     filter_of,
     open_storage,
 )
-from tupli_mcap.cli.output import Column, bytes_of, counted, number, print_json, print_table, short_ids, when
+from tupli_mcap.cli.output import (
+    Column,
+    bytes_of,
+    counted,
+    number,
+    print_json,
+    print_table,
+    short_ids,
+    terminal_width,
+    when,
+)
 from tupli_mcap.cli.recordings import print_episodes
 
 __all__ = ["register"]
+
+_ROOMY = 80  # columns of a terminal on which benchmarks and their environments fit side by side
 
 
 def register(app: typer.Typer) -> None:
@@ -35,16 +47,18 @@ def _list_benchmarks(
 ) -> None:
     """List the benchmarks of a storage.
 
-    Filters compare id, created_at, metadata.name, metadata.difficulty, metadata.extra.<name>, ...
+    Filters compare id, environment, created_at, metadata.name, metadata.difficulty, metadata.extra.<name>, ...
     """
     with open_storage(storage_path) as storage:
         headers = storage.list_benchmarks(filter_of(filter_text))
     if as_json:
         print_json([header.model_dump() for header in headers])
         return
+    roomy = (terminal_width() or _ROOMY) >= _ROOMY
     columns = (
         Column("ID"),
         Column("NAME", shrink="end"),
+        *([Column("ENVIRONMENT", shrink="end")] if roomy else []),
         Column("VERSION"),
         Column("CREATED"),
         Column("DESCRIPTION", shrink="end"),
@@ -53,6 +67,7 @@ def _list_benchmarks(
         (
             short_ids(h.id),
             h.metadata.name,
+            *([h.environment] if roomy else []),
             h.metadata.version or "",
             when(h.created_at),
             h.metadata.description,

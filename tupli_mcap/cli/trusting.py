@@ -138,6 +138,7 @@ def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
     runs = {
         "spec": "the registered environment, by its spec",
         "pickle": f"{bytes_of(code.size)} of pickled Python code",
+        "names": "nothing: the file only names it",
     }
     if code.kind == "spec" and code.foreign:
         runs["spec"] = "code that its spec names"

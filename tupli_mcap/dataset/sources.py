@@ -272,10 +272,10 @@ def _metadata(text: str, name: str, number: int) -> dict[str, Any]:
 
 def _benchmark_header(recording: Recording) -> BenchmarkHeader:
     """What a recording says of its benchmark; without one, the id is empty."""
-    metadata = BenchmarkMetadata(name="")
+    metadata, environment = BenchmarkMetadata(name=""), ""
     if "benchmark.json" in recording.attachments:
         record = recording.benchmark.record
-        metadata = BenchmarkMetadata(name=record.name)
+        metadata, environment = BenchmarkMetadata(name=record.name), record.name
         told = (record.benchmark or {}).get("metadata")
         if isinstance(told, dict):
             with contextlib.suppress(ValidationError, FormatError):  # somebody else's words
@@ -286,4 +286,5 @@ def _benchmark_header(recording: Recording) -> BenchmarkHeader:
         created_at=f"{np.datetime64(recording.created_ns // 1000, 'us')}+00:00",
         hash=recording.benchmark_id,
         metadata=metadata,
+        environment=environment,
     )

@@ -2,7 +2,7 @@
 
 from tupli_mcap.environment._arguments import more_than_data
 from tupli_mcap.environment._build import build, reasons_for_distrust
-from tupli_mcap.environment._capture import Snapshot, capture, record_environment
+from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, note
 from tupli_mcap.environment._docs import documented_labels
 from tupli_mcap.environment._imports import WHAT_LOADING_DOES, PickleImports, named_imports
 from tupli_mcap.environment._pickling import rebuild_ezpickled
@@ -17,10 +17,11 @@ __all__ = [
     "canonical_json",
     "capture",
     "documented_labels",
+    "fingerprint",
     "more_than_data",
     "named_imports",
+    "note",
     "reasons_for_distrust",
     "rebuild_ezpickled",
-    "record_environment",
     "sha256",
 ]

@@ -41,8 +41,15 @@ def build(
 
     Raises:
         UntrustedError: Code would run that nobody here has trusted; nothing has been executed.
-        TupliError: The environment does not build: a package is missing, another Python version made it.
+        TupliError: The environment does not build: the record only names it, a package is missing, another Python
+            version made it.
     """
+    if record.spec is None and record.pickle is None:
+        raise TupliError(
+            f"the environment {record.name[:200]!r} cannot be rebuilt: expected a spec or a pickle, found only the "
+            f"names of its classes ({', '.join(record.classes)[:300]}); record with capture_env='pickle', or make the "
+            "environment yourself and pass it on as env=... where that is taken"
+        )
     reasons = reasons_for_distrust(record)
     window = record.spec is not None and _may_open_a_window(record.spec)
     trusted = trust or (bool(reasons or window) and _trust.is_trusted(record.digest))
@@ -154,9 +161,11 @@ def reasons_for_distrust(record: EnvironmentRecord) -> list[str]:
     """What rebuilding an environment would run that this machine does not know; empty if it needs no trust."""
     if record.spec is not None:
         return [*foreign_code(record.spec), *foreign_arguments(record.spec)]
-    size = len(record.pickle or b"")
+    if record.pickle is None:
+        return []
+    size = len(record.pickle)
     said = f" (it says: {', '.join(record.classes)[:300]})" if record.classes else ""
-    return [f"{size} bytes of pickled Python code with SHA-256 {sha256(record.pickle or b'')}{said}"]
+    return [f"{size} bytes of pickled Python code with SHA-256 {sha256(record.pickle)}{said}"]
 
 
 def _unpickle(record: EnvironmentRecord) -> gym.Env[Any, Any]:

@@ -1,4 +1,4 @@
-"""From a live environment to an `EnvironmentRecord`."""
+"""From a live environment to an `EnvironmentRecord`. No other environment is made, stepped, reset or closed."""
 
 from __future__ import annotations
 
@@ -11,53 +11,115 @@ import platform
 import random
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from tupli_mcap.environment._attributes import HAS_LAZY_DICTS, attributes
-from tupli_mcap.environment._build import foreign_code, make_from_spec
+from tupli_mcap.environment._build import foreign_code
+from tupli_mcap.environment._changes import is_changed
 from tupli_mcap.environment._local_code import is_local
-from tupli_mcap.environment._pickling import InProcessCopy, Names, attribute_names, dump, state
+from tupli_mcap.environment._pickling import InProcessCopy, dump
 from tupli_mcap.environment._record import EnvironmentRecord, canonical_json
 from tupli_mcap.errors import TupliError
 
-__all__ = ["Snapshot", "capture"]
+__all__ = ["Snapshot", "capture", "fingerprint", "note"]
+
+# Python 3.11 and 3.12 keep attributes outside a dict until somebody asks for one, and reach them slower from then on.
+_HAS_LAZY_DICTS = (3, 11) <= sys.version_info < (3, 13)
+_OF_MAKE_VEC = ("num_envs", "vectorization_mode", "vector_kwargs", "wrappers")  # among a spec's arguments
 
 
-def capture(env: gym.Env[Any, Any], *, by_reference: bool = False) -> EnvironmentRecord:
-    """What is needed to rebuild an environment as it is now, see `record_environment`; `env` is not changed.
+def note(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> EnvironmentRecord:
+    """What an environment says of itself: its EnvSpec, where JSON has a form for it, and the names of its classes.
+
+    Whether the spec rebuilds it as it is now is not asked. Of a vector environment it is the first sub-environment if
+    that lives in this process; of others it is the spec they were made from by `gymnasium.make_vec`, if
+    `gymnasium.make` takes it, and else the id.
+    """
+    if not isinstance(env, gym.vector.VectorEnv):
+        return _noted(env, *_told(env))
+    inner = getattr(env.unwrapped, "envs", None)
+    if inner and isinstance(inner[0], gym.Env):
+        return note(inner[0])
+    return _noted(env, *_told_of_many(env.unwrapped))
+
+
+def capture(
+    env: gym.Env[Any, Any], *, by_reference: bool = False, pickled: bool = False
+) -> EnvironmentRecord:
+    """What is needed to rebuild an environment as it is now; `env` is not changed.
+
+    That is its EnvSpec if its id is registered here, its arguments are plain data, its wrappers are Gymnasium's or
+    of its own package, it has not been reset, and nothing in it has been changed as far as `is_changed` tells. Else,
+    or if `pickled`, it is the pickle. Classes from the user's own files (`__main__`, notebooks, tests, scripts) are
+    pickled by value, so that the record works where those files are missing, and need no spec then; `by_reference=True`
+    keeps that code out of it.
 
     Raises:
         TupliError: The environment cannot be pickled.
     """
-    return Snapshot(env, at_speed=True).record(by_reference=by_reference)
+    name, spec = _told(env)
+    noted = _noted(env, name, spec)
+    suits = spec is not None and not pickled and (by_reference or not _needs_local_code(spec))
+    if spec is not None and suits and _is_as_made(env, spec):
+        return noted
+    try:
+        data = dump(env, by_reference=by_reference)
+    except Exception as err:
+        hint = (
+            "" if by_reference else ", or try by_reference=True, which stores the names of its classes only"
+        )
+        raise TupliError(
+            f"the environment {noted.classes[-1]} cannot be pickled ({_brief(err)}): wrap it before rendering or "
+            f"opening files, give its class __getstate__ and __setstate__{hint}"
+        ) from err
+    return dataclasses.replace(noted, spec=None, pickle=data)
+
+
+def fingerprint(env: gym.Env[Any, Any]) -> bytes | None:
+    """Bytes that change when an environment does; None if it cannot be told."""
+    try:
+        return dump(env, by_reference=True)
+    except Exception:  # noqa: BLE001 - any class may fail to pickle in its own way
+        return None
 
 
 class Snapshot:
-    """The state of an environment at one moment, kept in this process.
+    """An environment at one moment, captured both by value and by reference.
 
-    Taking one costs about as much as pickling the environment, changes nothing in it and draws from no random
-    generator. An environment that cannot be pickled is only complained about when the snapshot is used;
-    objects in it that cannot be pickled (open files, windows) are shared with copies. `at_speed` leaves the original
-    as quick as it is (Python 3.11 and 3.12), which takes another one, made from its spec.
+    Taking one costs about as much as pickling the environment, and changes nothing in it. An environment that cannot be
+    pickled is only complained about when the snapshot is used. `copies` makes `copy` possible: objects that
+    cannot be pickled (open files, windows) are then shared with the copies.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], *, at_speed: bool = False) -> None:
+    def __init__(self, env: gym.Env[Any, Any], *, copies: bool = False) -> None:
         self._name = type(env.unwrapped).__qualname__
+        self._records = {flag: _attempt(env, by_reference=flag) for flag in (False, True)}
         self._copy: InProcessCopy | None = None
         self._failure: Exception | None = None
-        names = _names_in(env) if at_speed else {}
-        try:
-            self._copy = InProcessCopy(env, names)
-        except Exception as err:  # noqa: BLE001 - any class may fail to pickle in its own way
-            self._failure = err
-        _renew_attributes(env, names)
+        if copies:
+            try:
+                self._copy = InProcessCopy(env)
+            except Exception as err:  # noqa: BLE001 - any class may fail to pickle in its own way
+                self._failure = err
+        _renew_attributes(env)
 
-    def restore(self) -> gym.Env[Any, Any]:
-        """A new environment of the same classes in the captured state.
+    def record(self, *, by_reference: bool = False) -> EnvironmentRecord:
+        """The environment as data, see `capture`.
+
+        Raises:
+            TupliError: It cannot be pickled.
+        """
+        found = self._records[by_reference]
+        if isinstance(found, TupliError):
+            raise found
+        return found
+
+    def copy(self) -> gym.Env[Any, Any]:
+        """A new environment of the same classes in the captured state; nobody closes it, as that may close what the
+        original uses.
 
         Raises:
             TupliError: The environment cannot be pickled.
@@ -70,160 +132,121 @@ class Snapshot:
             ) from self._failure
         try:
             with _quiet():
-                env = self._copy.restore()
+                return self._copy.restore()
         except Exception as err:
             raise TupliError(
                 f"the environment {self._name} cannot be captured: its pickle does not load ({_brief(err)})"
             ) from err
-        _forget_cached_specs(env)
-        return env
-
-    def record(self, *, by_reference: bool = False) -> EnvironmentRecord:
-        """The captured environment as data, see `record_environment`.
-
-        Raises:
-            TupliError: The environment cannot be pickled.
-        """
-        env = self.restore()
-        try:
-            return record_environment(env, by_reference=by_reference)
-        finally:
-            self.discard(env)
-
-    def discard(self, copy: gym.Env[Any, Any]) -> None:
-        """Close a copy that `restore` made, unless that would close what the original still uses."""
-        if self._copy is not None and not self._copy.shares:
-            _close(copy)
 
 
-def record_environment(env: gym.Env[Any, Any], *, by_reference: bool = False) -> EnvironmentRecord:
-    """Describe an environment that is ours to use: the caller gives up `env`.
-
-    Its EnvSpec is taken where `gymnasium.make` of it gives the same classes in the same state, the pickle
-    otherwise. Classes from the user's own files (`__main__`, notebooks, tests, scripts) are pickled by value,
-    so that the record works where those files are missing; `by_reference=True` keeps that code out of it.
-    """
-    layers = list(_layers(env))
-    classes = tuple(_class_name(layer) for layer in layers)
-    versions = dict(_versions(frozenset(name.partition(":")[0].partition(".")[0] for name in classes)))
-    spec = _exact_spec(env, by_reference=by_reference)
-    if spec is not None:
-        return EnvironmentRecord(name=spec["id"], spec=spec, classes=classes, versions=versions)
-    _forget_cached_specs(env)
+def _attempt(env: gym.Env[Any, Any], *, by_reference: bool) -> EnvironmentRecord | TupliError:
     try:
-        data = dump(env, by_reference=by_reference)
-    except Exception as err:
-        hint = (
-            "" if by_reference else ", or try by_reference=True, which stores the names of its classes only"
-        )
-        raise TupliError(
-            f"the environment {classes[-1]} cannot be pickled ({_brief(err)}): wrap it before rendering or "
-            f"opening files, give its class __getstate__ and __setstate__{hint}"
-        ) from err
-    return EnvironmentRecord(name=classes[-1], pickle=data, classes=classes, versions=versions)
+        return capture(env, by_reference=by_reference)
+    except TupliError as err:
+        return err.with_traceback(None)
 
 
-def _exact_spec(env: gym.Env[Any, Any], *, by_reference: bool) -> dict[str, Any] | None:
-    """The EnvSpec as JSON-able object, or None where it would not rebuild this very environment."""
+def _noted(env: Any, name: str | None, spec: dict[str, Any] | None) -> EnvironmentRecord:
+    classes = tuple(_class_name(layer) for layer in _layers(env))
+    packages = frozenset(one.partition(":")[0].partition(".")[0] for one in classes)
+    versions = dict(_versions(packages))
+    return EnvironmentRecord(name=name or classes[-1], spec=spec, classes=classes, versions=versions)
+
+
+def _told(env: gym.Env[Any, Any]) -> tuple[str | None, dict[str, Any] | None]:
+    """The id of an environment and its EnvSpec as JSON-able object, None where there is none."""
+    base: Any = getattr(env.unwrapped, "spec", None)
+    name = getattr(base, "id", None)
+    if not isinstance(name, str):
+        return None, None
+    wrappers = [layer for layer in _layers(env) if isinstance(layer, gym.Wrapper)]
+    before = [getattr(wrapper, "_cached_spec", None) for wrapper in wrappers]
     try:
+        # First: reading the spec of a wrapper copies the arguments of those below it, whatever they are.
+        canonical_json([base.kwargs, [getattr(wrapper, "_saved_kwargs", None) for wrapper in wrappers]])
         with _quiet():
-            spec = _spec_object(env)
-            if spec is None or foreign_code(spec) or (not by_reference and _needs_local_code(spec)):
-                return None
-            fresh = make_from_spec(spec)
-            try:
-                same = _same(env, fresh)
-            finally:
-                _close(fresh)
-    except Exception:  # noqa: BLE001 - whatever goes wrong here, the pickle is the answer
-        return None
-    return spec if same else None
+            return name, _plain_spec(env.spec)
+    except Exception:  # noqa: BLE001 - an attribute or property of anybody's class; callables and arrays have no JSON
+        return name, None
+    finally:
+        for wrapper, cached in zip(wrappers, before, strict=True):
+            wrapper._cached_spec = (
+                cached  # that somebody has read the spec is no part of an environment's state
+            )
 
 
-def _spec_object(env: gym.Env[Any, Any]) -> dict[str, Any] | None:
-    spec = env.spec
-    if spec is None:
-        return None
+def _told_of_many(envs: Any) -> tuple[str | None, dict[str, Any] | None]:
+    """The same of a vector environment, for one of its sub-environments."""
+    spec: Any = getattr(envs, "spec", None)
+    name = getattr(spec, "id", None)
+    if not isinstance(name, str):
+        return None, None
+    if type(envs) is not gym.vector.AsyncVectorEnv or "wrappers" in spec.kwargs:
+        return name, None
+    kwargs = {key: value for key, value in spec.kwargs.items() if key not in _OF_MAKE_VEC}
+    try:
+        return name, _plain_spec(dataclasses.replace(spec, kwargs=kwargs))
+    except Exception:  # noqa: BLE001 - callables and arrays have no JSON
+        return name, None
+
+
+def _plain_spec(spec: Any) -> dict[str, Any]:
+    """Raises ValueError or TypeError where JSON has no form for it."""
     names = [field.name for field in dataclasses.fields(spec) if field.init]
     names.remove("vector_entry_point")  # how others are made, and changing with gymnasium's versions
     told = {name: getattr(spec, name) for name in names}
     told["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]
-    # Callables, arrays and NaN have no JSON: raises, and the environment is pickled.
     plain: dict[str, Any] = json.loads(canonical_json(told))
     return plain
 
 
-def _needs_local_code(spec: dict[str, Any]) -> bool:
+def _is_as_made(env: gym.Env[Any, Any], spec: Mapping[str, Any]) -> bool:
+    """Whether `gymnasium.make` of a spec gives such an environment, as far as can be told without doing it."""
+    *wrappers, base = _layers(env)
+    if foreign_code(spec) or any(wrapper["kwargs"] is None for wrapper in spec["additional_wrappers"]):
+        return False
+    if [_class_name(wrapper) for wrapper in reversed(wrappers)] != _wrappers_of(spec):
+        return False
+    told = [wrapper._has_reset for wrapper in wrappers if isinstance(wrapper, gym.wrappers.OrderEnforcing)]
+    if any(told) or (not told and getattr(base, "_np_random", None) is not None):
+        return False  # it has been reset
+    if is_changed(base, base.spec.kwargs if base.spec is not None else {}):
+        return False
+    return not any(is_changed(wrapper, getattr(wrapper, "_saved_kwargs", {})) for wrapper in wrappers)
+
+
+def _wrappers_of(spec: Mapping[str, Any]) -> list[str]:
+    """The wrappers that `gymnasium.make` puts around the environment of a spec, from the inside out."""
+    made: list[Any] = [] if spec["disable_env_checker"] else [gym.wrappers.PassiveEnvChecker]
+    made += [gym.wrappers.OrderEnforcing] if spec["order_enforce"] else []
+    made += [] if spec["max_episode_steps"] is None else [gym.wrappers.TimeLimit]
+    names = [f"{wrapper.__module__}:{wrapper.__qualname__}" for wrapper in made]
+    return [*names, *(wrapper["entry_point"] for wrapper in spec["additional_wrappers"])]
+
+
+def _needs_local_code(spec: Mapping[str, Any]) -> bool:
     entry_points = [spec["entry_point"], *(wrapper["entry_point"] for wrapper in spec["additional_wrappers"])]
-    return any(is_local(entry_point.partition(":")[0]) for entry_point in entry_points)
+    return any(is_local(str(entry_point).partition(":")[0]) for entry_point in entry_points)
 
 
-def _same(env: gym.Env[Any, Any], fresh: gym.Env[Any, Any]) -> bool:
-    """Whether two environments have the same class chain and the same state, spec and spaces included."""
-    if [type(layer) for layer in _layers(env)] != [type(layer) for layer in _layers(fresh)]:
-        return False
-    if _spec_object(env) != _spec_object(fresh):
-        return False
-    # Both went through a pickle, so that the one is no more "used" than the other.
-    _forget_cached_specs(env)
-    snapshot = Snapshot(fresh)
-    fresh_copy = snapshot.restore()
-    try:
-        return state(env) == state(fresh_copy)
-    finally:
-        snapshot.discard(fresh_copy)
-
-
-def _layers(env: gym.Env[Any, Any]) -> Iterator[gym.Env[Any, Any]]:
+def _layers(env: Any) -> Iterator[Any]:
     while True:
         yield env
-        if not isinstance(env, gym.Wrapper):
+        if not isinstance(env, gym.Wrapper | gym.vector.VectorWrapper):
             return
         env = env.env
 
 
-def _names_in(env: gym.Env[Any, Any]) -> Names:
-    """The names of attributes in a new environment of the same spec; none where there is no such environment."""
-    if not HAS_LAZY_DICTS:
-        return {}
-    try:
-        with _quiet():
-            spec = _spec_object(env)
-            _forget_cached_specs(env)
-            if spec is None or foreign_code(spec):
-                return {}
-            fresh = make_from_spec(spec)
-            try:
-                return attribute_names(fresh)
-            finally:
-                _close(fresh)
-    except Exception:  # noqa: BLE001 - attributes are slower to reach then, no more
-        return {}
-
-
-def _renew_attributes(env: gym.Env[Any, Any], names: Names) -> None:
-    """An equal new dict makes attributes quicker to reach, where the old one had to be asked for."""
-    if not HAS_LAZY_DICTS:
+def _renew_attributes(env: gym.Env[Any, Any]) -> None:
+    """An equal new dict makes attributes quicker to reach, where the old one has been asked for."""
+    if not _HAS_LAZY_DICTS:
         return
     for layer in _layers(env):
-        if attributes(layer, names.get(type(layer), ())) is None:
-            with contextlib.suppress(AttributeError, TypeError):
-                layer.__dict__ = dict(layer.__dict__)
+        with contextlib.suppress(AttributeError, TypeError):
+            layer.__dict__ = dict(layer.__dict__)
 
 
-def _forget_cached_specs(env: gym.Env[Any, Any]) -> None:
-    """Whether somebody has asked for `env.spec` is no part of an environment's state."""
-    for layer in _layers(env):
-        if isinstance(layer, gym.Wrapper):
-            layer._cached_spec = None
-
-
-def _close(env: gym.Env[Any, Any]) -> None:
-    with contextlib.suppress(Exception):  # a copy nobody sees
-        env.close()
-
-
-def _class_name(env: gym.Env[Any, Any]) -> str:
+def _class_name(env: Any) -> str:
     return f"{type(env).__module__}:{type(env).__qualname__}"
 
 

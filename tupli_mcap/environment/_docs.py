@@ -116,7 +116,7 @@ def _step_seconds(env: Any) -> float | None:
     """`dt` of MuJoCo, Pendulum and Acrobot, `tau` of CartPole, else one frame as it is rendered."""
     for name in ("dt", "tau"):
         with contextlib.suppress(Exception):  # a property may do anything
-            value = _asked(env, name) if isinstance(env, gym.vector.AsyncVectorEnv) else getattr(env, name)
+            value = getattr(env, name)
             if isinstance(value, int | float) and 0 < value < math.inf:
                 return float(value)
     with contextlib.suppress(Exception):
@@ -124,13 +124,3 @@ def _step_seconds(env: Any) -> float | None:
         if isinstance(fps, int | float) and 0 < fps < math.inf:
             return 1 / float(fps)
     return None
-
-
-def _asked(envs: gym.vector.AsyncVectorEnv, name: str) -> Any:
-    """An attribute of the first sub-environment; None if it has none.
-
-    Their processes end when they are asked for what they have not: it is asked first whether they have it.
-    """
-    if not all(envs.call("has_wrapper_attr", name)):
-        return None
-    return envs.get_attr(name)[0]

@@ -1,26 +1,22 @@
-"""Pickling environments: copies within this process, comparable states, and bytes for another process."""
+"""Pickling environments: copies within this process, and bytes for another process."""
 
 from __future__ import annotations
 
-import copyreg
 import io
 import pickle
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable
 from types import FunctionType
 from typing import Any, cast
 
 import cloudpickle
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import EzPickle
 
-from tupli_mcap.environment._attributes import attributes, has_lazy_dict
 from tupli_mcap.environment._local_code import by_value
 
-__all__ = ["InProcessCopy", "Names", "attribute_names", "dump", "load", "rebuild_ezpickled", "state"]
+__all__ = ["InProcessCopy", "dump", "load", "rebuild_ezpickled"]
 
-Names = Mapping[type, Collection[str]]  # of attributes, by class
 _PROTOCOL = 5
 _PLAIN_ATOMS = (type(None), bool, int, float, complex, str, bytes)
 _MAX_PLAIN_DEPTH = 20
@@ -30,29 +26,19 @@ class InProcessCopy:
     """An environment pickled for this process only.
 
     Classes are kept as they are, by reference, so that any class can be copied (locally defined ones too)
-    and copies are instances of the very same classes. So are objects that cannot be pickled (open files):
-    `shares` tells whether copies have such objects in common with the original. Objects that have just the attributes
-    that `names` has for their class are not asked for their `__dict__`.
+    and copies are instances of the very same classes. So are objects that cannot be pickled (open files), which copies
+    have in common with the original.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], names: Names | None = None) -> None:
-        self.shares = False
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
         try:
-            self._data, self._kept = _dump_in_process(_InProcessPickler, env, names)
+            self._data, self._kept = _dump_in_process(_InProcessPickler, env)
         except Exception:  # noqa: BLE001 - any class may fail to pickle in its own way
             self._data, self._kept = _dump_in_process(_SharingPickler, env)
-            self.shares = True
 
     def restore(self) -> gym.Env[Any, Any]:
         """A new environment in the state that was captured."""
         return cast("gym.Env[Any, Any]", _InProcessUnpickler(io.BytesIO(self._data), self._kept).load())
-
-
-def attribute_names(env: gym.Env[Any, Any]) -> Names:
-    """The names of the attributes of an environment and of what it holds. Asks all of them for their `__dict__`."""
-    made = _NamesPickler(io.BytesIO())
-    made.dump(env)
-    return made.names
 
 
 def dump(env: gym.Env[Any, Any], *, by_reference: bool) -> bytes:
@@ -69,15 +55,6 @@ def dump(env: gym.Env[Any, Any], *, by_reference: bool) -> bytes:
 def load(data: bytes) -> Any:
     """Unpickle what `dump` made. This runs code from the bytes: call it on trusted ones only."""
     return _Unpickler(io.BytesIO(data)).load()
-
-
-def state(env: gym.Env[Any, Any]) -> tuple[bytes, list[Any]]:
-    """The state of an environment, equal for equal environments within this process.
-
-    Left out are what the comparison of specs covers (EnvSpec objects), what does not belong to the
-    environment's dynamics (the random state of spaces) and which of two equal strings is the same object.
-    """
-    return _dump_in_process(_StatePickler, env)
 
 
 def rebuild_ezpickled(
@@ -97,19 +74,20 @@ rebuild_ezpickled.__module__ = "tupli_mcap.environment"
 
 class _EnvPickler(cloudpickle.Pickler):  # type: ignore[misc]
     """cloudpickle, but objects that pickle as their constructor's arguments keep their plain attributes as
-    well: `env.unwrapped.gravity = 5` is part of the environment."""
-
-    def attributes_of(self, obj: Any) -> dict[str, Any]:
-        """A dict of its own of the attributes of an object."""
-        return dict(vars(obj))
+    well: `env.unwrapped.gravity = 5` is part of the environment. That somebody has read a wrapper's spec is not."""
 
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, EzPickle) and type(obj).__getstate__ is EzPickle.__getstate__:
-            own = self.attributes_of(obj)
+            own = {name: value for name, value in vars(obj).items() if name != "_cached_spec"}
             if "_ezpickle_args" in own:
                 args, kwargs = own.pop("_ezpickle_args"), own.pop("_ezpickle_kwargs")
                 plain = {name: value for name, value in own.items() if _is_plain(value)}
                 return rebuild_ezpickled, (type(obj), args, kwargs, plain)
+        if isinstance(obj, gym.Wrapper):
+            reduced = obj.__reduce_ex__(_PROTOCOL)
+            if isinstance(reduced, tuple) and isinstance(state := (*reduced, None, None)[2], dict):
+                return *reduced[:2], {**state, "_cached_spec": None}, *reduced[3:]
+            return reduced
         return super().reducer_override(obj)
 
 
@@ -123,23 +101,10 @@ class _ByReferencePickler(_EnvPickler):
 
 
 class _InProcessPickler(_EnvPickler):
-    def __init__(self, buffer: io.BytesIO, names: Names | None = None) -> None:
+    def __init__(self, buffer: io.BytesIO) -> None:
         super().__init__(buffer, _PROTOCOL)
-        self._names = names or {}
         self.kept: list[Any] = []
         self._numbers: dict[int, int] = {}
-
-    def attributes_of(self, obj: Any) -> dict[str, Any]:
-        names = self._names.get(type(obj))
-        found = None if names is None else attributes(obj, names)
-        return super().attributes_of(obj) if found is None else found
-
-    def reducer_override(self, obj: Any) -> Any:
-        reduced = super().reducer_override(obj)
-        if reduced is NotImplemented and type(obj) in self._names and _is_reduced_plainly(type(obj)):
-            # as `object.__reduce_ex__` has it, which asks for the `__dict__`
-            return copyreg.__newobj__, (type(obj),), self.attributes_of(obj)  # type: ignore[attr-defined]
-        return reduced
 
     def persistent_id(self, obj: Any) -> Any:
         return self._keep(obj) if isinstance(obj, type) else None
@@ -149,19 +114,6 @@ class _InProcessPickler(_EnvPickler):
             self._numbers[id(obj)] = len(self.kept)
             self.kept.append(obj)  # which also keeps its id from being used again
         return self._numbers[id(obj)]
-
-
-class _NamesPickler(_InProcessPickler):
-    """Notes the names of the attributes of what it pickles, by class."""
-
-    def __init__(self, buffer: io.BytesIO) -> None:
-        super().__init__(buffer)
-        self.names: dict[type, tuple[str, ...]] = {}
-
-    def reducer_override(self, obj: Any) -> Any:
-        if has_lazy_dict(type(obj)):
-            self.names[type(obj)] = tuple(vars(obj))
-        return super().reducer_override(obj)
 
 
 class _SharingPickler(_InProcessPickler):
@@ -181,28 +133,9 @@ class _SharingPickler(_InProcessPickler):
         return True
 
 
-class _StatePickler(_InProcessPickler):
-    def persistent_id(self, obj: Any) -> Any:
-        if isinstance(obj, str):
-            return "".join(("s", obj))  # a new object each time, which the pickler cannot refer back to
-        if isinstance(obj, np.dtype):
-            return f"d{obj!r}"
-        return super().persistent_id(obj)
-
-    def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, EnvSpec):
-            return EnvSpec, ("ignored-v0",)
-        if isinstance(obj, gym.Space):
-            attributes = {name: value for name, value in vars(obj).items() if name != "_np_random"}
-            return _StatePickler, (type(obj), attributes)
-        return super().reducer_override(obj)
-
-
-def _dump_in_process(
-    pickler: type[_InProcessPickler], env: gym.Env[Any, Any], names: Names | None = None
-) -> tuple[bytes, list[Any]]:
+def _dump_in_process(pickler: type[_InProcessPickler], env: gym.Env[Any, Any]) -> tuple[bytes, list[Any]]:
     buffer = io.BytesIO()
-    made = pickler(buffer, names)
+    made = pickler(buffer)
     made.dump(env)
     return buffer.getvalue(), made.kept
 
@@ -230,17 +163,6 @@ class _Unpickler(pickle.Unpickler):
 def _untracked(make: Callable[..., Any]) -> Callable[..., Any]:
     # The last two arguments of both functions are the class's tracker id and `extra`.
     return lambda *args: make(*args[:-2], None, args[-1])
-
-
-def _is_reduced_plainly(cls: type) -> bool:
-    """Whether instances are pickled as their class and their attributes."""
-    names = ("__reduce_ex__", "__reduce__", "__getstate__")
-    return (
-        all(getattr(cls, name) is getattr(object, name) for name in names)
-        and not any(hasattr(cls, name) for name in ("__getnewargs__", "__getnewargs_ex__"))
-        and not issubclass(cls, list | dict)
-        and cls not in copyreg.dispatch_table
-    )
 
 
 def _is_plain(value: Any, depth: int = 0) -> bool:

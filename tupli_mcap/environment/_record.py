@@ -71,10 +71,11 @@ class _Document(BaseModel):
 
 @dataclass(frozen=True)
 class EnvironmentRecord:
-    """An environment as data. Exactly one of `spec` and `pickle` is set.
+    """An environment as data. At most one of `spec` and `pickle` is set; without either it cannot be rebuilt.
 
-    name: the registered id, or the class as `module:Class`; for people.
-    spec: the gymnasium EnvSpec as JSON-able object, where it rebuilds the environment exactly.
+    name: the registered id, or the class as `module:Class` where there is none; for people.
+    spec: the gymnasium EnvSpec as JSON-able object. Of a recording it is what the environment said of itself; of a
+    benchmark, what rebuilds it.
     pickle: the environment as cloudpickle bytes, which run code when loaded.
     classes: the environment's classes as `module:Class`, outermost wrapper first; a claim, for messages only.
     versions: of Python and of the packages that were at work; for messages only.
@@ -90,17 +91,19 @@ class EnvironmentRecord:
     benchmark: Mapping[str, Any] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if (self.spec is None) == (self.pickle is None):
+        if self.spec is not None and self.pickle is not None:
             raise ValueError("an environment record has either a spec or a pickle")
 
     @functools.cached_property
     def digest(self) -> str:
-        """SHA-256 (64 hex digits) over what rebuilding executes: the spec, or the pickle. Computed, never
-        believed."""
+        """SHA-256 (64 hex digits) over what rebuilding executes: the spec, or the pickle; over the names where there is
+        neither. Computed, never believed."""
         if self.spec is not None:
             told = {k: v for k, v in self.spec.items() if k not in _SPEC_DEFAULTS or v != _SPEC_DEFAULTS[k]}
             return sha256(canonical_json({"spec": told}))
-        return sha256(canonical_json({"pickle": sha256(self.pickle or b"")}))
+        if self.pickle is not None:
+            return sha256(canonical_json({"pickle": sha256(self.pickle)}))
+        return sha256(canonical_json({"classes": list(self.classes), "name": self.name}))
 
     def to_json(self, benchmark: Mapping[str, Any] | None = None) -> bytes:
         """The content of `benchmark.json`; the pickle is kept beside it, as `env.cloudpickle`.
@@ -147,11 +150,12 @@ class EnvironmentRecord:
             place = ".".join(str(part) for part in first["loc"]) or "the document"
             raise FormatError(f"{where}: no benchmark document: {place}: {first['msg']}") from err
         environment = document.environment
-        _check_pickle(environment.pickle, pickle, environment.spec is not None, where)
+        if environment.pickle is not None:
+            _check_pickle(environment.pickle, pickle, environment.spec is not None, where)
         record = cls(
             name=environment.name,
             spec=environment.spec,
-            pickle=None if environment.spec is not None else pickle,
+            pickle=None if environment.pickle is None else pickle,
             classes=tuple(environment.classes),
             versions=environment.versions,
             benchmark=document.benchmark,
@@ -167,13 +171,9 @@ class EnvironmentRecord:
         return record
 
 
-def _check_pickle(said: _Pickle | None, found: bytes | None, has_spec: bool, where: str) -> None:
+def _check_pickle(said: _Pickle, found: bytes | None, has_spec: bool, where: str) -> None:
     if has_spec:
-        if said is not None:
-            raise FormatError(f"{where}: an environment has either a spec or a pickle, found both")
-        return
-    if said is None:
-        raise FormatError(f"{where}: an environment has a spec or a pickle, found neither")
+        raise FormatError(f"{where}: an environment has either a spec or a pickle, found both")
     if found is None:
         raise FormatError(f"{where}: the pickled environment (SHA-256 {said.sha256}) is missing beside it")
     if len(found) != said.size or sha256(found) != said.sha256:

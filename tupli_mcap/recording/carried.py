@@ -52,8 +52,8 @@ class EntryPoint(NamedTuple):
 class CarriedCode(NamedTuple):
     """An environment in a recording, as the file tells of it (`name`, `classes` and `versions` are claims).
 
-    kind: "spec" (its JSON text is `spec`, the code it names `entry_points`) or "pickle" (of `size` bytes, whose
-        instructions name `imports`; it may import and run anything).
+    kind: "spec" (its JSON text is `spec`, the code it names `entry_points`), "pickle" (of `size` bytes, whose
+        instructions name `imports`; it may import and run anything) or "names" (nothing that rebuilds it).
     foreign: what would run that this machine does not know; empty if building it needs no trust.
     options: what options of its resets hold that is more than data, which replaying would hand to the environment.
     needs_trust: whether it is built, and given all options, only where somebody trusts it. trusted: whether this user
@@ -64,7 +64,7 @@ class CarriedCode(NamedTuple):
     """
 
     name: str
-    kind: Literal["spec", "pickle"]
+    kind: Literal["spec", "pickle", "names"]
     spec: str
     entry_points: list[EntryPoint]
     size: int
@@ -99,7 +99,7 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
     foreign = reasons_for_distrust(record)
     return CarriedCode(
         name=record.name,
-        kind="pickle" if spec is None else "spec",
+        kind="spec" if spec is not None else "pickle" if record.pickle is not None else "names",
         spec="" if spec is None else json.dumps(spec),
         entry_points=[] if spec is None else _entry_points(spec),
         size=len(record.pickle or b""),

@@ -73,10 +73,11 @@ class BenchmarkQuery(BaseModel):
 
 
 class BenchmarkHeader(DBItem):
-    """A stored benchmark without its environment."""
+    """A stored benchmark without its environment, of which it has the name: the Gymnasium id, or else the class."""
 
     hash: str
     metadata: BenchmarkMetadata
+    environment: str = ""
 
 
 class Benchmark(BenchmarkHeader):

@@ -37,11 +37,11 @@ class BenchmarkFiles:
             header = BenchmarkHeader.create_new(
                 id=uri, hash=query.hash, metadata=metadata, created_by=created_by
             )
-            document["benchmark"] = {**(document.get("benchmark") or {}), **plain(header)}
+            document["benchmark"] = {**(document.get("benchmark") or {}), **_entry(header)}
             if pickle is not None:
                 write_bytes(self._pickle_path(uri), pickle)
             write_bytes(path, to_json(document))  # last: the benchmark is there once this is
-        return header
+        return header.model_copy(update={"environment": _name_in(document)})
 
     def load(self, uri: str) -> Benchmark:
         document = self._read(uri)
@@ -125,7 +125,7 @@ class BenchmarkFiles:
             raise FormatError(f"{self._path(uri)}: expected a benchmark: {first_defect(err)}") from err
         if header.id != uri:
             raise FormatError(f"{self._path(uri)}: expected benchmark {uri}, found {header.id[:80]!r}")
-        return header
+        return header.model_copy(update={"environment": _name_in(document)})
 
     def _find(self, uri: str) -> Path:
         if not self.exists(uri):
@@ -139,6 +139,18 @@ class BenchmarkFiles:
 
     def _pickle_path(self, uri: str) -> Path:
         return self._directory / f"{uri}.cloudpickle"
+
+
+def _entry(header: BenchmarkHeader) -> dict[str, Any]:
+    """A header as the `benchmark` entry of a document, whose `environment` entry has the name."""
+    return {key: value for key, value in plain(header).items() if key != "environment"}
+
+
+def _name_in(document: dict[str, Any]) -> str:
+    """What a document calls its environment."""
+    environment = document.get("environment")
+    name = environment.get("name") if isinstance(environment, dict) else ""
+    return name if isinstance(name, str) else ""
 
 
 def _document(query: BenchmarkQuery) -> tuple[str, dict[str, Any], bytes | None]:

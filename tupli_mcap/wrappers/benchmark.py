@@ -1,42 +1,87 @@
-"""What a plain recording says of its environment: `benchmark.json`, and the pickle where a spec is not enough."""
+"""What a plain recording says of its environment: `benchmark.json`, and the pickle where it is asked for."""
 
 from __future__ import annotations
 
 import contextlib
-from typing import Any
+import time
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import gymnasium as gym
 
 from tupli_mcap import trust
-from tupli_mcap.environment import capture, reasons_for_distrust
-from tupli_mcap.errors import TupliError
+from tupli_mcap.environment import capture, note
+from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.recording.writer import RecordingWriter
 
-__all__ = ["benchmark_attachments", "vector_benchmark_attachments"]
+__all__ = ["CaptureEnv", "Captured"]
 
+CaptureEnv = Literal["spec", "pickle"] | None
+
+_PICKLE = "env.cloudpickle"
 _MAX_PICKLE = 16 << 20
 
 
-def benchmark_attachments(env: gym.Env[Any, Any]) -> dict[str, tuple[str, bytes]]:
-    """The environment as attachments; empty if it cannot be captured, or only as a pickle of more than 16 MiB.
+class Captured:
+    """The environment of a recording as attachments, unless others are `given`.
 
-    What others would have to trust is signed as this user's own, so that it can be rebuilt here without a question.
+    Attributes:
+        attachments: name -> (media type, bytes).
+        documented: whether the recording may say what the environment's documentation says.
+
+    Raises:
+        RecordingError: `capture_env` is something else, or the environment is no pickle of up to 16 MiB.
     """
-    try:
-        record = capture(env)
-    except TupliError:
-        return {}
-    attachments = {"benchmark.json": ("application/json", record.to_json())}
-    if record.pickle is not None:
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
+        capture_env: CaptureEnv,
+        given: Mapping[str, tuple[str, bytes]] | None,
+    ) -> None:
+        if capture_env not in ("spec", "pickle", None):
+            raise RecordingError(
+                f"capture_env: expected 'spec', 'pickle' or None (nothing), found {capture_env!r:.80}"
+            )
+        self.attachments = {} if given is None else dict(given)
+        self.documented = capture_env is not None or given is not None
+        self._digest = ""  # of a pickle that the recording would carry
+        self._began = 0
+        if given is not None or capture_env is None:
+            return
+        record = note(env) if capture_env == "spec" else capture(_single(env), pickled=True)
+        self.attachments["benchmark.json"] = ("application/json", record.to_json())
+        if record.pickle is None:
+            return
         if len(record.pickle) > _MAX_PICKLE:
-            return {}
-        attachments["env.cloudpickle"] = ("application/octet-stream", record.pickle)
-    if reasons_for_distrust(record):
-        with contextlib.suppress(TupliError):  # recording goes on where no signature can be kept
-            trust.trust(record.digest)
-    return attachments
+            raise RecordingError(
+                f"capture_env='pickle': expected at most {_MAX_PICKLE} bytes in a recording, found an environment of "
+                f"{len(record.pickle)}; use capture_env='spec', or TupliEnvWrapper, whose storage keeps it once"
+            )
+        self.attachments[_PICKLE] = ("application/octet-stream", record.pickle)
+        self._digest, self._began = record.digest, time.time_ns()
+
+    def trust_stored(self, writer: RecordingWriter) -> None:
+        """Signs a pickle that the writer has just stored as this user's own, to be rebuilt without a question.
+
+        A recording that is gone on with keeps the environment it has.
+        """
+        carried = [one for one in writer.container.attachment_indexes if one.name == _PICKLE]
+        if self._digest and any(one.create_time >= self._began for one in carried):
+            with contextlib.suppress(TupliError):  # recording goes on where no signature can be kept
+                if not trust.is_trusted(self._digest):
+                    trust.trust(self._digest)
 
 
-def vector_benchmark_attachments(env: gym.vector.VectorEnv[Any, Any, Any]) -> dict[str, tuple[str, bytes]]:
-    """The first sub-environment as attachments; empty where it is in another process or there is none."""
+def _single(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> gym.Env[Any, Any]:
+    """The environment, or the first sub-environment of several."""
+    if not isinstance(env, gym.vector.VectorEnv):
+        return env
     envs = getattr(env.unwrapped, "envs", None)
-    return benchmark_attachments(envs[0]) if envs and isinstance(envs[0], gym.Env) else {}
+    if envs and isinstance(envs[0], gym.Env):
+        first: gym.Env[Any, Any] = envs[0]
+        return first
+    raise RecordingError(
+        "capture_env='pickle': expected sub-environments in this process, found none in "
+        f"{type(env.unwrapped).__name__}; use capture_env='spec'"
+    )

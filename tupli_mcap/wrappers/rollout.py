@@ -21,7 +21,7 @@ from tupli_mcap.recording.framing import RENDER_MODE
 from tupli_mcap.recording.infos import RecordInfo
 from tupli_mcap.recording.options import Mode
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.wrappers.benchmark import benchmark_attachments
+from tupli_mcap.wrappers.benchmark import CaptureEnv
 from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
@@ -64,6 +64,7 @@ def record_rollouts(
     durability: Durability = "os",
     live: str | None = None,
     frames: bool | int = False,
+    capture_env: CaptureEnv = "spec",
     max_bytes: int | None = None,
     max_seconds: float | None = None,
     progress: Callable[[int], None] | None = None,
@@ -77,7 +78,8 @@ def record_rollouts(
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
-        mode, compression, record_info, durability, live, max_bytes, max_seconds: as `RecordEpisodes` has them.
+        mode, compression, record_info, durability, live, capture_env, max_bytes, max_seconds: as `RecordEpisodes` has
+            them.
         frames: as `RecordEpisodes` has it; the environment is made with render_mode="rgb_array".
         progress: called with the number of steps so far, a few hundred times.
 
@@ -93,7 +95,6 @@ def record_rollouts(
     wrapped: RecordEpisodes | RecordVectorEpisodes
     with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if frames else None)) as made:
         if isinstance(made, gym.vector.VectorEnv):
-            attachments = benchmark_attachments(made.envs[0]) if hasattr(made, "envs") else {}
             vector = RecordVectorEpisodes(
                 made,
                 path,
@@ -103,7 +104,7 @@ def record_rollouts(
                 durability=durability,
                 live=live,
                 frames=frames,
-                attachments=attachments,
+                capture_env=capture_env,
                 max_bytes=max_bytes,
                 max_seconds=max_seconds,
             )
@@ -120,6 +121,7 @@ def record_rollouts(
                 durability=durability,
                 live=live,
                 frames=frames,
+                capture_env=capture_env,
                 max_bytes=max_bytes,
                 max_seconds=max_seconds,
             )

@@ -28,7 +28,7 @@ from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.recording.work import ASKING, BEGUN, DONE, Work
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
-from tupli_mcap.wrappers.benchmark import benchmark_attachments
+from tupli_mcap.wrappers.benchmark import Captured, CaptureEnv
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
@@ -58,7 +58,11 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         compression: "zstd", "lz4" or "none".
         reward_space: for rewards that are arrays.
         benchmark_id: the benchmark the episodes belong to.
-        attachments: name -> (media type, bytes), written before the first step; by default the environment.
+        capture_env: what the file says of the environment. "spec": the EnvSpec (id, arguments, wrappers) if it has one,
+            the names of its classes, versions of packages. "pickle": its pickle instead of the EnvSpec, code that this
+            user's own recordings run without a question. None: nothing, names from its documentation left out too.
+            Whether a spec rebuilds it as it was is found out by `verify --replay`. No other environment is made.
+        attachments: name -> (media type, bytes), written before the first step instead of what `capture_env` says.
         labels: names for viewers and plots, by leaf: {"state": ["x", "angle"], "action": ["left", "right"]}, one a
             dimension, or one a value of a Discrete. By default what the environment's documentation says.
         flush_seconds: also write chunks this many seconds after the last ones, full or not.
@@ -73,6 +77,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         image_format: of the images in states, both exact. "raw": pixels, which the chunk's compression makes small;
             "png": each image, and each frame of a stack, as a PNG (extra `frames`): smaller for photographs, larger for
             drawn screens, and 4 to 35 times slower to record.
+        stack_size: how many frames an observation stacks, each of which is then stored once. By default what
+            `FrameStackObservation`, or another wrapper with `stack_size` or `num_stack`, says in this process.
         live: shows the rollout while it is recorded: "rerun" (starts the viewer if none listens at 127.0.0.1:9876),
             "rerun+http://host:port/proxy" (one that is running), "foxglove" or "foxglove://127.0.0.1:8765" (a server
             to connect Foxglove to). A viewer that is missing, slow or closed changes nothing about the recording.
@@ -101,6 +107,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         mode: Mode = "x",
         reward_space: gym.Space[Any] | None = None,
         benchmark_id: str = "",
+        capture_env: CaptureEnv = "spec",
         attachments: Mapping[str, tuple[str, bytes]] | None = None,
         labels: Mapping[str, Sequence[str]] | None = None,
         flush_seconds: float | None = None,
@@ -110,6 +117,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         frames: bool | int = False,
         frame_format: FrameFormat = "png",
         image_format: ImageFormat = "raw",
+        stack_size: int | None = None,
         live: str | None = None,
         max_bytes: int | None = None,
         max_seconds: float | None = None,
@@ -123,21 +131,20 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             frame_format = check_format(frame_format)
         self._metadata_callback = metadata_callback
         self._step_callback = step_callback
-        if attachments is None:
-            attachments = benchmark_attachments(env)
+        captured = Captured(env, capture_env, attachments)
         wanted = record_info is not False or step_callback is not None
         self._infos = InfoRecorder(record_info) if wanted else None
         self._spaces = spaces = StepLayout(
             env.observation_space, env.action_space, reward_space
         )  # refused before a file is made
-        self._spaces = spaces = with_stacks(env, spaces)
+        self._spaces = spaces = with_stacks(env, spaces, stack_size)
         spaces.to_metadata()
         self.rotation = Rotation(path, mode, max_bytes, max_seconds)
         self._options = WriterOptions(
             compression,
             mode,
             benchmark_id,
-            with_labels(attachments, env, spaces, labels),
+            with_labels(captured, env, spaces, labels),
             journal_dir,
             chunk_size,
             flush_seconds,
@@ -158,6 +165,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             self._writer = writer = self.rotation.open_first(self._options)
             self._recorder = SingleRecorder(self._writer, spaces, self._infos, leaves_to_rows=self._plain)
             work.recorders.append(self._recorder)
+            captured.trust_stored(writer)
             self._writer.check_spaces(spaces, 1, vector=False)
             self._recorder.resets_itself = _resets_itself(env)
             self._frames = FrameRecorder(self._writer, 1, every, frame_format, work.ask) if every else None

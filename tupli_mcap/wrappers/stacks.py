@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import replace
 from typing import Any
 
@@ -17,14 +16,14 @@ __all__ = ["format_version", "with_stacks"]
 _SIZES = ("stack_size", "num_stack")  # of FrameStackObservation, and of Gymnasium's FrameStack before it
 
 
-def with_stacks(env: Any, spaces: StepLayout) -> StepLayout:
+def with_stacks(env: Any, spaces: StepLayout, stack_size: int | None = None) -> StepLayout:
     """`spaces`, with the leaves that a wrapper around `env` stacks: the first axis, or else the last one, is as long as
-    an attribute `stack_size` or `num_stack` of it says.
+    `stack_size`, or as an attribute `stack_size` or `num_stack` of it says.
 
     A wrapper outside of it may change what it gives: then, too, what is stored is what the environment returned.
     """
     leaves = [leaf for leaf in spaces.state if any(map(can_stack, _both(leaf)))]
-    sizes = _sizes(env) if leaves else set()
+    sizes = (_sizes(env) if stack_size is None else {stack_size}) if leaves else set()
     stacks: list[Stack] = []
     for leaf in leaves:
         found = next((one for one in _both(leaf) if one.stored_shape[0] in sizes), None)
@@ -41,11 +40,9 @@ def _both(leaf: Leaf) -> tuple[Leaf, Leaf]:
 
 
 def _sizes(env: Any) -> set[Any]:
-    """How many frames the windows of an environment have."""
+    """How many frames the windows of an environment have; nothing is known of one in another process."""
     if isinstance(env, gym.vector.VectorEnv | gym.vector.VectorWrapper):
         base = env.unwrapped
-        if type(base) is gym.vector.AsyncVectorEnv:
-            return _sizes_elsewhere(base)
         if type(base).__module__ == "ale_py.vector_env":  # which stacks by itself, frames first
             return set((base.single_observation_space.shape or ())[:1])
         inner = getattr(base, "envs", None)
@@ -54,16 +51,6 @@ def _sizes(env: Any) -> set[Any]:
     while isinstance(env, gym.Wrapper):
         found |= {vars(env)[name] for name in _SIZES if isinstance(vars(env).get(name), int)}
         env = env.env
-    return found
-
-
-def _sizes_elsewhere(env: gym.vector.AsyncVectorEnv) -> set[Any]:
-    """The same of environments in other processes."""
-    found: set[Any] = set()
-    with contextlib.suppress(gym.error.Error):  # it is closed, or busy
-        for name in _SIZES:
-            if all(env.call("has_wrapper_attr", name)):  # else the question would end its process
-                found |= {size for size in env.get_attr(name) if isinstance(size, int)}
     return found
 
 

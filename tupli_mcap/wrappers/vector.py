@@ -31,7 +31,7 @@ from tupli_mcap.recording.vector_infos import final_info_of, info_of
 from tupli_mcap.recording.work import ASKING, BEGUN, DONE, Work
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
-from tupli_mcap.wrappers.benchmark import vector_benchmark_attachments
+from tupli_mcap.wrappers.benchmark import Captured, CaptureEnv
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
 from tupli_mcap.wrappers.single import close_recordings, live_session, metadata_of
@@ -45,7 +45,8 @@ StepCallback = Callable[[Step], Mapping[str, Any] | None]
 class RecordEpisodes(gym.vector.VectorWrapper):
     """Records every sub-environment of a vector environment (Sync, Async, custom) into the MCAP file `path`.
 
-    Arguments are those of `tupli_mcap.RecordEpisodes`; the environment in the file is the first sub-environment.
+    Arguments are those of `tupli_mcap.RecordEpisodes`; the environment in the file is the first sub-environment, and
+    where that lives in another process, what `gymnasium.make_vec` has noted of it.
     A metadata callback is copied for each sub-environment.
     `autoreset_mode` ("NextStep", "SameStep" or "Disabled") is by default what the environment declares
     (`env.metadata["autoreset_mode"]`). Where it declares nothing, final states in its infos tell of same-step
@@ -65,6 +66,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         mode: Mode = "x",
         reward_space: gym.Space[Any] | None = None,
         benchmark_id: str = "",
+        capture_env: CaptureEnv = "spec",
         attachments: Mapping[str, tuple[str, bytes]] | None = None,
         labels: Mapping[str, Sequence[str]] | None = None,
         flush_seconds: float | None = None,
@@ -76,6 +78,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         frames: bool | int = False,
         frame_format: FrameFormat = "png",
         image_format: ImageFormat = "raw",
+        stack_size: int | None = None,
         max_bytes: int | None = None,
         max_seconds: float | None = None,
     ) -> None:
@@ -93,8 +96,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         self._step_callback = step_callback
         wanted = record_info is not False or step_callback is not None
         self._infos = InfoRecorder(record_info) if wanted else None
-        if attachments is None:
-            attachments = vector_benchmark_attachments(env)
+        captured = Captured(env, capture_env, attachments)
         if reward_space is not None and reward_space.shape is None:
             raise SpaceError(
                 f"reward: expected a space of arrays for a vector environment, found {reward_space}"
@@ -102,14 +104,14 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         self._spaces = spaces = StepLayout(
             env.single_observation_space, env.single_action_space, reward_space
         )
-        self._spaces = spaces = with_stacks(env, spaces)
+        self._spaces = spaces = with_stacks(env, spaces, stack_size)
         spaces.to_metadata()
         self.rotation = Rotation(path, mode, max_bytes, max_seconds)
         self._options = WriterOptions(
             compression,
             mode,
             benchmark_id,
-            with_labels(attachments, env, spaces, labels),
+            with_labels(captured, env, spaces, labels),
             journal_dir,
             chunk_size,
             flush_seconds,
@@ -139,6 +141,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
                 leaves_to_rows=plain and not self.rotation.limited,
             )  # fmt: skip
             work.recorders.append(self._recorder)
+            captured.trust_stored(writer)
             self._writer.check_spaces(spaces, n, vector=True)
             self._frames = VectorFrames(self._writer, n, every, frame_format, work.ask) if every else None
             self._live = live_session(self._writer, live, env)

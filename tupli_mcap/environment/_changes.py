@@ -1,0 +1,129 @@
+"""Whether an environment still is as its constructors left it, told from the code of its classes.
+
+No other environment is made to compare it with. What code says of the attributes of an object is this: which
+names it assigns, and that some of them are only ever given constants or arguments of the constructor. Changed is an
+object with another attribute, or with another value under such a name. A value that the constructor computes is
+not judged, nor is what lies inside of an attribute.
+"""
+
+from __future__ import annotations
+
+import dis
+import functools
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from types import CodeType
+from typing import Any, NamedTuple
+
+__all__ = ["is_changed"]
+
+_ATOMS = (type(None), bool, int, float, complex, str, bytes)
+_SET_BY_MAKE = frozenset(("spec",))  # by gymnasium.make
+
+
+class _Argument(NamedTuple):
+    """The value of a name is the constructor's argument of that name."""
+
+    name: str
+
+
+class _Computed:
+    """The value of a name may be any."""
+
+
+_COMPUTED = _Computed()
+
+
+def is_changed(obj: Any, arguments: Mapping[str, Any]) -> bool:
+    """Whether somebody else has set an attribute of an object that was made with these arguments."""
+    cls: type = type(obj)
+    assigned, given = _assigned(cls), _bound(cls, arguments)
+    for name, value in vars(obj).items():
+        if name in _SET_BY_MAKE:
+            continue
+        sources = assigned.get(name)
+        if sources is None:
+            return True
+        expected = [given.get(s.name, _COMPUTED) if isinstance(s, _Argument) else s for s in sources]
+        if all(type(one) in _ATOMS for one in expected) and not any(_same(value, one) for one in expected):
+            return True
+    return False
+
+
+def _same(value: object, expected: object) -> bool:
+    return type(value) is type(expected) and bool(value == expected)
+
+
+def _bound(cls: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of a constructor by name, defaults included; empty where they do not fit."""
+    try:
+        bound = inspect.signature(cls.__init__).bind_partial(None, **arguments)  # type: ignore[misc]
+    except (TypeError, ValueError):
+        return {}
+    bound.apply_defaults()
+    return dict(bound.arguments)
+
+
+@functools.lru_cache(maxsize=256)
+def _assigned(cls: type) -> Mapping[str, list[Any]]:
+    """What the code of a class and its bases gives to each attribute it assigns."""
+    found: dict[str, list[Any]] = {}
+    for base in cls.__mro__:
+        for name, member in vars(base).items():
+            if isinstance(member, functools.cached_property):
+                found.setdefault(name, []).append(_COMPUTED)
+            for function in _functions(member):
+                own = function is cls.__init__  # type: ignore[misc]
+                for code in _codes(function.__code__):
+                    for attribute, source in _stores(code):
+                        usable = own or not isinstance(source, _Argument)
+                        found.setdefault(attribute, []).append(source if usable else _COMPUTED)
+    return found
+
+
+def _functions(member: Any) -> Iterator[Callable[..., Any]]:
+    """The functions written in Python behind a member of a class."""
+    if isinstance(member, property):
+        parts: tuple[Any, ...] = (member.fget, member.fset, member.fdel)
+    elif isinstance(member, functools.cached_property):
+        parts = (member.func,)
+    else:
+        parts = (getattr(member, "__func__", member),)
+    for part in parts:
+        if inspect.isfunction(part):
+            yield part
+            if hasattr(part, "__wrapped__"):
+                yield from _functions(inspect.unwrap(part))
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
+
+
+def _stores(code: CodeType) -> Iterator[tuple[str, Any]]:
+    """Each attribute that a function assigns, and what it is given."""
+    instructions = [one for one in dis.get_instructions(code) if one.opname != "CACHE"]
+    rebound = {one.argval for one in instructions if one.opname in ("STORE_FAST", "DELETE_FAST")}
+    known = {*code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]} - rebound
+    for i, one in enumerate(instructions):
+        if one.opname == "STORE_ATTR":
+            yield one.argval, _source(instructions[max(0, i - 2) : i + 1], known)
+
+
+def _source(last: list[dis.Instruction], arguments: set[str]) -> Any:
+    """What a STORE_ATTR stores, from it and the instructions before it: a value, then the object, then the store."""
+    target = last[-2] if len(last) > 1 else last[-1]
+    if any(one.is_jump_target for one in last[-2:]) or not target.opname.startswith("LOAD_FAST"):
+        return _COMPUTED  # one of several values, or of an object that is not a plain name
+    if isinstance(target.argval, tuple):  # two loads in one instruction
+        name: Any = target.argval[0]
+        return _Argument(name) if name in arguments else _COMPUTED
+    value = last[0]
+    if len(last) == 3 and value.opname in ("LOAD_CONST", "LOAD_SMALL_INT"):
+        return value.argval
+    if len(last) == 3 and value.opname.startswith("LOAD_FAST") and value.argval in arguments:
+        return _Argument(value.argval)
+    return _COMPUTED
