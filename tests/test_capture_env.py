@@ -223,6 +223,27 @@ def test_an_unregistered_environment_is_named(tmp_path: Path) -> None:
     assert result.exit_code == 1
 
 
+def test_a_registered_class_is_noted_by_its_name(tmp_path: Path) -> None:
+    gym.register("tests/Class-v0", entry_point=Robot, kwargs={"port": 3})
+    try:
+        record_in(gym.make("tests/Class-v0"), tmp_path / "r.mcap")
+        record = noted(tmp_path / "r.mcap")
+        assert record.spec is not None and record.spec["entry_point"] == f"{__name__}:Robot"
+        assert build(record).unwrapped.port == 3  # type: ignore[attr-defined]
+        assert (
+            "Robot (as registered here)"
+            in CliRunner().invoke(app, ["trust", "--show", str(tmp_path / "r.mcap")]).output
+        )
+        gym.registry["tests/Class-v0"].entry_point = EzRobot
+        with pytest.raises(
+            UntrustedError,
+            match="the entry point .*:Robot' of 'tests/Class-v0', registered here as .*EzRobot",
+        ):
+            build(record)
+    finally:
+        del gym.registry["tests/Class-v0"]
+
+
 def test_nothing_is_noted_where_nothing_is_to_be(tmp_path: Path) -> None:
     record_in(gym.make("CartPole-v1"), tmp_path / "r.mcap", capture_env=None)
     with Recording(tmp_path / "r.mcap") as recording:

@@ -838,7 +838,13 @@ def test_every_kind_of_source(tmp_path: Path) -> None:
 
 
 def test_nothing_of_a_file_is_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = record(tmp_path / "a.mcap", Sampler(UNIT, spaces.Discrete(3)), 50)
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(Sampler(UNIT, spaces.Discrete(3)), path, capture_env="pickle") as env:
+        env.reset(seed=1)
+        for _ in range(50):
+            _, _, terminal, timeout, _ = env.step(env.action_space.sample())
+            if terminal or timeout:
+                env.reset()
     with Recording(path) as recording:
         assert "env.cloudpickle" in recording.attachments
     before = {item: item.stat() for item in tmp_path.iterdir()}

@@ -536,7 +536,7 @@ def test_headers_of_a_chunk_are_read_once_not_for_each_episode(
 
 
 def test_no_step_saved_is_a_failure(tmp_path: Path) -> None:
-    path = record(tmp_path / "a.mcap", steps=60)
+    path = record(tmp_path / "a.mcap", steps=60, capture_env="pickle")
     for found in chunks(path, "/step"):
         hit(path, found)
     result = CliRunner().invoke(app, ["recover", str(path)])
@@ -575,7 +575,7 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("lost", ["benchmark.json", "env.cloudpickle"])
 def test_appending_makes_no_environment_of_two_halves(lost: str, tmp_path: Path) -> None:
-    path = record(tmp_path / "a.mcap", steps=60)
+    path = record(tmp_path / "a.mcap", steps=60, capture_env="pickle")
     hit(path, next(item for item in places(path) if item.attachment and item.attachment.name == lost))
     report, recording = recovered(path)
     recording.close()
@@ -583,7 +583,7 @@ def test_appending_makes_no_environment_of_two_halves(lost: str, tmp_path: Path)
     target = Path(str(report.target))
     other = Sampler(BOX, spaces.Discrete(3), length=40)
     other.steps = 1234567  # its pickle differs
-    with RecordEpisodes(other, target, mode="a") as env:
+    with RecordEpisodes(other, target, mode="a", capture_env="pickle") as env:
         roll(env, 20)
     found = verify_recording(target)
     assert (found.errors, found.steps) == ([], 80)

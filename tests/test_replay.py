@@ -35,7 +35,7 @@ from tupli_mcap import (
     write_recording,
 )
 from tupli_mcap.cli.app import app
-from tupli_mcap.environment import EnvironmentRecord
+from tupli_mcap.environment import EnvironmentRecord, note
 from tupli_mcap.recording.attach import add_attachments
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.signature import sign_recording
@@ -61,7 +61,9 @@ def roll(env: gym.Env[Any, Any], steps: int, seed: int | None = 1) -> None:
 def record(
     path: Path, env: gym.Env[Any, Any], steps: int = 100, seed: int | None = 1, mode: Any = "x"
 ) -> Path:
-    with RecordEpisodes(env, path, mode=mode) as recorder:
+    """With the EnvSpec of Gymnasium's own environments, and of others the pickle."""
+    own = all(name.startswith("gymnasium.") for name in note(env).classes)
+    with RecordEpisodes(env, path, mode=mode, capture_env="spec" if own else "pickle") as recorder:
         roll(recorder, steps, seed)
     return path
 
@@ -493,7 +495,7 @@ class Drifting(gym.Wrapper[Any, Any, Any, Any]):
 def test_a_pickled_environment_goes_on_from_its_captured_state(tmp_path: Path) -> None:
     inner = Drifting(gym.make("FrozenLake-v1"))
     roll(inner, 17, seed=4)
-    with RecordEpisodes(inner, tmp_path / "a.mcap") as env:
+    with RecordEpisodes(inner, tmp_path / "a.mcap", capture_env="pickle") as env:
         for seed in (None, 5, 5, None, 6):
             env.reset(seed=seed)
             done = False
@@ -641,7 +643,7 @@ class Choosy(gym.Env[Any, Any]):
 
 
 def test_actions_may_have_been_pythons_numbers(tmp_path: Path) -> None:
-    with RecordEpisodes(Choosy(), tmp_path / "a.mcap") as env:
+    with RecordEpisodes(Choosy(), tmp_path / "a.mcap", capture_env="pickle") as env:
         for seed in (1, None, 2):
             env.reset(seed=seed)
             for action in (0, 1, 1):

@@ -1,7 +1,7 @@
 """An environment as data: captured from a live one, rebuilt from a record, executed only where trusted."""
 
 from tupli_mcap.environment._arguments import more_than_data
-from tupli_mcap.environment._build import build, reasons_for_distrust
+from tupli_mcap.environment._build import build, entry_point_name, reasons_for_distrust
 from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, note
 from tupli_mcap.environment._docs import documented_labels
 from tupli_mcap.environment._imports import WHAT_LOADING_DOES, PickleImports, named_imports
@@ -17,6 +17,7 @@ __all__ = [
     "canonical_json",
     "capture",
     "documented_labels",
+    "entry_point_name",
     "fingerprint",
     "more_than_data",
     "named_imports",

@@ -18,7 +18,7 @@ from tupli_mcap.environment._pickling import load
 from tupli_mcap.environment._record import EnvironmentRecord, sha256
 from tupli_mcap.errors import TupliError, UntrustedError
 
-__all__ = ["build", "foreign_code", "make_from_spec", "reasons_for_distrust"]
+__all__ = ["build", "entry_point_name", "foreign_code", "make_from_spec", "reasons_for_distrust"]
 
 # What these render opens no window.
 _PICTURES = frozenset(
@@ -98,9 +98,19 @@ def make_from_spec(spec: Mapping[str, Any], render_mode: str | None = None) -> g
     known = gym.registry.get(told["id"])
     # Of no account to a single environment: this machine's own.
     told["vector_entry_point"] = None if known is None else known.vector_entry_point
+    if known is not None and told.get("entry_point") == entry_point_name(known.entry_point):
+        told["entry_point"] = known.entry_point
     wrappers = tuple(WrapperSpec(**wrapper) for wrapper in told.pop("additional_wrappers", ()))
     made = EnvSpec(**told, additional_wrappers=wrappers)
     return gym.make(made) if render_mode is None else gym.make(made, render_mode=render_mode)
+
+
+def entry_point_name(entry_point: Any) -> Any:
+    """What a spec in a file calls an entry point: `module:name` of a class or function that was registered itself."""
+    if not callable(entry_point):
+        return entry_point
+    named = entry_point if hasattr(entry_point, "__qualname__") else type(entry_point)
+    return f"{named.__module__}:{named.__qualname__}"
 
 
 def foreign_code(spec: Mapping[str, Any]) -> list[str]:
@@ -116,15 +126,14 @@ def foreign_code(spec: Mapping[str, Any]) -> list[str]:
         )
         return [reason]
     reasons = []
-    if spec.get("entry_point") != known.entry_point:
+    here = entry_point_name(known.entry_point)
+    if spec.get("entry_point") != here:
         found = str(spec.get("entry_point"))[:200]
-        reasons.append(
-            f"the entry point {found!r} of {name!r}, registered here as {str(known.entry_point)[:200]!r}"
-        )
+        reasons.append(f"the entry point {found!r} of {name!r}, registered here as {str(here)[:200]!r}")
     wrappers = spec.get("additional_wrappers", [])
     if not isinstance(wrappers, list):
         return [*reasons, f"additional wrappers of type {type(wrappers).__name__}"]
-    package = _top_level(known.entry_point)
+    package = _top_level(here)
     for wrapper in wrappers:
         entry_point = wrapper.get("entry_point") if isinstance(wrapper, dict) else None
         if not _is_known_wrapper(entry_point, package):

@@ -17,7 +17,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from tupli_mcap.environment._build import foreign_code
+from tupli_mcap.environment._build import entry_point_name, foreign_code
 from tupli_mcap.environment._changes import is_changed
 from tupli_mcap.environment._local_code import is_local
 from tupli_mcap.environment._pickling import InProcessCopy, dump
@@ -195,6 +195,7 @@ def _plain_spec(spec: Any) -> dict[str, Any]:
     names = [field.name for field in dataclasses.fields(spec) if field.init]
     names.remove("vector_entry_point")  # how others are made, and changing with gymnasium's versions
     told = {name: getattr(spec, name) for name in names}
+    told["entry_point"] = entry_point_name(spec.entry_point)
     told["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]
     plain: dict[str, Any] = json.loads(canonical_json(told))
     return plain
@@ -203,6 +204,8 @@ def _plain_spec(spec: Any) -> dict[str, Any]:
 def _is_as_made(env: gym.Env[Any, Any], spec: Mapping[str, Any]) -> bool:
     """Whether `gymnasium.make` of a spec gives such an environment, as far as can be told without doing it."""
     *wrappers, base = _layers(env)
+    if not isinstance(base.spec.entry_point, str):
+        return False  # several functions may have the same name
     if foreign_code(spec) or any(wrapper["kwargs"] is None for wrapper in spec["additional_wrappers"]):
         return False
     if [_class_name(wrapper) for wrapper in reversed(wrappers)] != _wrappers_of(spec):
@@ -210,7 +213,7 @@ def _is_as_made(env: gym.Env[Any, Any], spec: Mapping[str, Any]) -> bool:
     told = [wrapper._has_reset for wrapper in wrappers if isinstance(wrapper, gym.wrappers.OrderEnforcing)]
     if any(told) or (not told and getattr(base, "_np_random", None) is not None):
         return False  # it has been reset
-    if is_changed(base, base.spec.kwargs if base.spec is not None else {}):
+    if is_changed(base, base.spec.kwargs):
         return False
     return not any(is_changed(wrapper, getattr(wrapper, "_saved_kwargs", {})) for wrapper in wrappers)
 

@@ -15,6 +15,7 @@ from tupli_mcap import trust
 from tupli_mcap.environment import (
     PickleImports,
     canonical_json,
+    entry_point_name,
     more_than_data,
     named_imports,
     reasons_for_distrust,
@@ -119,7 +120,7 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
 
 def _entry_points(spec: dict[str, Any]) -> list[EntryPoint]:
     known = gym.registry.get(str(spec.get("id")))
-    here = None if known is None else str(known.entry_point)
+    here = None if known is None else str(entry_point_name(known.entry_point))
     found = [EntryPoint("environment", str(spec.get("entry_point")), here)]
     wrappers = spec.get("additional_wrappers")
     for wrapper in wrappers if isinstance(wrappers, list) else ():
