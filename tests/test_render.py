@@ -323,7 +323,7 @@ class TestTrust:
     def test_what_would_run_is_said_and_nothing_is(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        path = recorded(tmp_path / "r.mcap", Drawing())
+        path = recorded(tmp_path / "r.mcap", Drawing(), capture_env="pickle")
         render(path, tmp_path / "mine.mcap")  # this user made it
         shows(tmp_path / "mine.mcap", [0, 1, 2])
         monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "stranger"))
@@ -352,7 +352,7 @@ class TestBadInput:
     def test_an_environment_that_draws_nothing(self, tmp_path: Path) -> None:
         space = gym.spaces.Discrete(3)
         told = "cannot be rendered with render_mode='rgb_array'"
-        path = recorded(tmp_path / "r.mcap", Sampler(space, space))
+        path = recorded(tmp_path / "r.mcap", Sampler(space, space), capture_env="pickle")
         with pytest.raises(RecordingError, match=f"{told}: its render_mode is None"):
             render(path, tmp_path / "new.mcap")
         spec = gym.spec("tests/Blank-v0")
