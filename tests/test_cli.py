@@ -654,9 +654,13 @@ class TestStorages:
         assert header.split() == ["ID", "NAME", "ENVIRONMENT", "CREATED", "DESCRIPTION"]
         assert [row.split()[:2] for row in rows] == [[pole, "pole"], [wind, "wind"]]
         assert rows[0].split()[2] == "CartPole-v1"
-        for name in ('metadata.name = "wind"', 'environment != "CartPole-v1"'):
-            (told,) = run("list-benchmarks", "--storage", root, "--filter", name, "--json").json
-            assert told["id"] == wind
+        (told,) = run(
+            "list-benchmarks", "--storage", root, "--filter", 'metadata.name = "wind"', "--json"
+        ).json
+        assert (told["id"], told["environment"]) == (wind, "CartPole-v1")  # a wrapper around it, pickled
+        for name, count in (("CartPole-v1", 2), ("Pendulum-v1", 0)):
+            chosen = f'environment = "{name}"'
+            assert len(run("list-benchmarks", "--storage", root, "--filter", chosen, "--json").json) == count
 
     def test_list_artifacts(self, filled: tuple[Path, str, str], here: Path) -> None:
         out = ok("list-artifacts", "--storage", filled[0])
