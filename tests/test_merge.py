@@ -10,7 +10,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import same
+from counting import grows
+from environments import Sampler, same
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from typer.testing import CliRunner
@@ -28,6 +29,7 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.source import PathSource
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -256,6 +258,39 @@ class TestMerge:
             made = merged.benchmark.make_env()
             assert made.spec is not None
             assert made.spec.id == "CartPole-v1"
+
+    def test_messages_are_found_once_not_for_each_episode(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The starts of all episodes lie in one chunk: each is taken without looking at the others."""
+        listed = 0
+
+        class Places(np.ndarray[Any, Any]):
+            def tolist(self) -> Any:
+                nonlocal listed
+                listed += len(self)
+                return super().tolist()
+
+        def records(self: ChunkStore, *args: Any, **options: Any) -> Any:
+            data, places = found(self, *args, **options)
+            return data, places.view(Places)
+
+        def places_listed(episodes: int) -> int:
+            nonlocal listed
+            path = tmp_path / f"{episodes}.mcap"
+            with RecordEpisodes(
+                Sampler(spaces.Box(-1, 1, (2,)), spaces.Discrete(2), length=1), path, attachments={}
+            ) as env:
+                for seed in range(episodes):
+                    env.reset(seed=seed)
+                    env.step(0)
+            listed = 0
+            merge_recordings([path], tmp_path / f"{episodes} merged.mcap")
+            return listed
+
+        found = ChunkStore.records
+        monkeypatch.setattr(ChunkStore, "records", records)
+        assert grows(places_listed, 100) < 1.2
 
     def test_what_does_not_fit_is_refused(self, tmp_path: Path) -> None:
         one, text = record(tmp_path / "1.mcap"), record(tmp_path / "t.mcap", "text")

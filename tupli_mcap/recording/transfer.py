@@ -200,8 +200,9 @@ class Transfer:
     def _messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
         """(log_time, body) of messages of a channel."""
         for span in self._store.spans(channel, first, count):
-            data = memoryview(self._store.load(span.chunk))
-            for start, end in self._store.messages(span.chunk)[span.begin : span.end]:
+            loaded, records = self._store.records(span.chunk)
+            data = memoryview(loaded)
+            for start, end in records[span.begin : span.end].tolist():
                 yield int.from_bytes(data[start + 15 : start + 23], "little"), bytes(data[start + BODY : end])
 
     def _copy_places(self, channel: int, places: Array, *, numbered: bool) -> None:
