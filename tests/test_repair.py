@@ -5,15 +5,20 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import struct
+import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from counting import calls, grows, tallied
 from environments import Sampler, roll
 from gymnasium import spaces
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
@@ -33,11 +38,13 @@ from tupli_mcap.cli.app import app
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import RecoveryReport
 from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.recording.container import MAGIC
 from tupli_mcap.recording.headers import message_headers
-from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
 from tupli_mcap.recording.signature import SIGNATURE_NAME, check_signature, sign_recording
 from tupli_mcap.recording.source import PathSource
 from tupli_mcap.recording.survey import Damage, Found, Survey
+from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 Steps = dict[tuple[int, int], str]
@@ -337,6 +344,41 @@ def test_what_else_is_damaged_is_said(tmp_path: Path) -> None:
     assert any("new uuid" in note for note in report.notes)
 
 
+def test_damaged_metadata_are_made_anew(tmp_path: Path) -> None:
+    """One wrong character is enough: nothing is guessed, and nothing is tried out."""
+    path = record(tmp_path / "a.mcap")
+    with Recording(path) as recording:
+        wanted, uuid = steps_of(recording), recording.uuid
+    flip(path, path.read_bytes().index(uuid.encode()) + 5)
+    with pytest.raises(FormatError, match="'tupli_mcap.recording' is damaged: expected crc"):
+        Recording(path)
+    with tallied(zlib, "crc32", lambda data, *_: len(data)) as sizes:
+        report = recover_recording(path)
+    assert sum(sizes) < 100 * path.stat().st_size
+    with Recording(report.target or "") as recording:
+        assert steps_of(recording) == wanted
+        assert recording.uuid != uuid
+    assert report.notes == ["the recording's metadata are lost: it has a new uuid and names no benchmark"]
+    assert ["metadata" in place.why for place in report.damaged] == [True]
+    assert verify_recording(report.target or "").problems == []
+
+
+@pytest.mark.parametrize("name", ["unfinished", "unfinished_frames"])
+def test_a_journal_is_found_by_the_uuid_in_damaged_metadata(name: str, tmp_path: Path) -> None:
+    path = place(name, tmp_path)
+    with Recording(path) as recording:
+        wanted, uuid = steps_of(recording), recording.uuid
+    flip(path, path.read_bytes().index(b"created_ns") + 20)
+    report, recording = recovered(path)
+    with recording:
+        assert (steps_of(recording), recording.uuid) == (wanted, uuid)
+    assert report.journal == "used"
+    assert report.notes == [
+        "of the recording's metadata, format_version, library, created_ns, benchmark_id are lost"
+    ]
+    assert verify_recording(report.target or "").problems == []
+
+
 def damage_tool() -> Any:
     spec = importlib.util.spec_from_file_location("damage", Path(__file__).parents[1] / "tools" / "damage.py")
     assert spec is not None
@@ -441,6 +483,101 @@ def test_a_bad_chunk_of_another_file_is_passed(layout: str, tmp_path: Path) -> N
     assert set(report.messages_lost) == {"/a", "/b"}
     with path.open("rb") as file, pytest.raises(Exception, match="."):
         list(StreamReader(file, validate_crcs=True).records)
+
+
+# ---- work grows as the file does
+
+
+def index_heads(count: int) -> bytes:
+    """The headers of as many episode indexes, each of which claims all that follows."""
+    name, kind = INDEX_NAME.encode(), INDEX_MEDIA_TYPE.encode()
+    head = 9 + 20 + len(name) + 4 + len(kind) + 8
+    made = bytearray(MAGIC)
+    for left in range(count * head + 4, 4, -head):
+        made += struct.pack("<BQQQI", 9, left - 9, 1, 1, len(name)) + name
+        made += struct.pack("<I", len(kind)) + kind + struct.pack("<Q", left - head - 4)
+    return bytes(made) + b"crc?"
+
+
+def record_heads(count: int) -> bytes:
+    """The headers of as many Metadata records, each of which claims all that follows."""
+    return MAGIC + b"".join(
+        struct.pack("<BQI", 12, 30 * left - 9, 0xFFFF) + bytes(17) for left in range(count, 0, -1)
+    )
+
+
+def records_between_damage(count: int) -> bytes:
+    """Pairs of empty Metadata records, and bytes that are no record before each."""
+    return MAGIC + (b"\xee" * 9 + 2 * (struct.pack("<BQ", 12, 8) + bytes(8))) * count
+
+
+@pytest.mark.parametrize(
+    ("make", "work"),
+    [
+        (index_heads, lambda path: read_tail(PathSource(path))),
+        (record_heads, verify_recording),
+        (record_heads, partial(recover_recording, dry_run=True)),
+        (records_between_damage, verify_recording),
+    ],
+)
+def test_a_file_is_not_read_again_for_each_claim_in_it(
+    make: Callable[[int], bytes], work: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    def bytes_read(count: int) -> int:
+        path = tmp_path / "a.mcap"
+        path.write_bytes(make(count))
+        with tallied(PathSource, "read", lambda _, __, length: length) as sizes:
+            work(path)
+        return sum(sizes)
+
+    assert grows(bytes_read, 1500) < 1.3
+
+
+def turn_round(path: Path) -> None:
+    """Lets the chunks of a recording, with their indexes, lie in the file the other way round; its end is lost."""
+    data = path.read_bytes()
+    found = [item for item in places(path) if item.opcode in (Opcode.CHUNK, Opcode.MESSAGE_INDEX)]
+    pairs = [(a.offset, b.offset + b.length) for a, b in zip(found[::2], found[1::2], strict=True)]
+    path.write_bytes(data[: pairs[0][0]] + b"".join(data[first:stop] for first, stop in reversed(pairs)))
+
+
+def test_chunks_may_come_in_any_order(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    with Recording(path) as recording:
+        wanted = list(as_read(recording))
+    turn_round(path)
+    report, recording = recovered(path)
+    with recording:
+        assert_same(list(as_read(recording)), wanted)
+    assert report.damaged == []
+
+
+def test_a_chunk_that_comes_late_is_not_held_against_all_others(tmp_path: Path) -> None:
+    def done(count: int) -> int:
+        path = tmp_path / f"{count}.mcap"
+        env = Sampler(BOX, spaces.Discrete(3), length=40)
+        with RecordEpisodes(env, path, chunk_size=200, attachments={}) as recorder:  # a row each
+            roll(recorder, count)
+        turn_round(path)
+        return calls(lambda: recover_recording(path, dry_run=True))
+
+    assert grows(done, 150) < 1.3
+
+
+def test_rows_are_taken_once(tmp_path: Path) -> None:
+    """Of two chunks with the same rows the first one in the file counts, and the other one is named."""
+    path = record(tmp_path / "a.mcap")
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+    data = path.read_bytes()
+    twice = chunks(path, "/step")[1]
+    stop = next(item for item in places(path) if item.offset > twice.offset + twice.length).offset
+    path.write_bytes(data[:stop] + data[twice.offset : stop] + data[stop:])
+    report, recording = recovered(path)
+    with recording:
+        assert steps_of(recording) == wanted
+    (place,) = (place for place in report.damaged if "rows that another one holds" in place.why)
+    assert place.offset == stop
 
 
 # ---- targets, errors, the command

@@ -16,6 +16,7 @@ __all__ = ["attachment_index", "checked_attachment", "message_index"]
 
 _ATTACHMENT_HEAD = struct.Struct("<QQI")  # log_time, create_time, length of the name
 _PIECE = 1 << 20
+_MOST_TEXT = 1 << 17  # bytes of name and media type
 
 
 def message_index(body: memoryview) -> tuple[int, np.ndarray[Any, np.dtype[np.uint64]]]:
@@ -55,19 +56,26 @@ def checked_attachment(
 
 
 def attachment_index(source: Source, offset: int, length: int) -> AttachmentIndex:
-    """What an attachment's header says; FormatError if it does not add up to its length."""
-    head = source.read(offset + 9, min(length, _ATTACHMENT_HEAD.size + (1 << 17)))
-    try:
-        log_time, create_time, size = _ATTACHMENT_HEAD.unpack_from(head)
-        at = _ATTACHMENT_HEAD.size
-        name = head[at : at + size].decode()
-        at += size
-        size = int.from_bytes(head[at : at + 4], "little")
-        media_type = head[at + 4 : at + 4 + size].decode()
-        at += 4 + size
-    except (struct.error, UnicodeDecodeError) as err:
-        raise FormatError("the attachment's header is damaged") from err
-    data_size = int.from_bytes(head[at : at + 8], "little")
-    if at + 8 > len(head) or at + 8 + data_size + 4 != length:
+    """What an attachment's header says; FormatError if it does not add up to its length.
+
+    The sizes are read before the texts: where many places look like an attachment, each takes a few bytes.
+    """
+    start, left = offset + 9, length - _ATTACHMENT_HEAD.size - 4 - 8 - 4  # for the texts and the data
+    if left < 0:
+        raise FormatError("the attachment's header is damaged")
+    log_time, create_time, name_size = _ATTACHMENT_HEAD.unpack(source.read(start, _ATTACHMENT_HEAD.size))
+    if name_size > min(left, _MOST_TEXT):
         raise FormatError("the attachment's sizes do not add up")
+    at = start + _ATTACHMENT_HEAD.size + name_size
+    type_size = int.from_bytes(source.read(at, 4), "little")
+    if name_size + type_size > min(left, _MOST_TEXT):
+        raise FormatError("the attachment's sizes do not add up")
+    data_size = int.from_bytes(source.read(at + 4 + type_size, 8), "little")
+    if name_size + type_size + data_size != left:
+        raise FormatError("the attachment's sizes do not add up")
+    try:
+        name = bytes(source.read(at - name_size, name_size)).decode()
+        media_type = bytes(source.read(at + 4, type_size)).decode()
+    except UnicodeDecodeError as err:
+        raise FormatError("the attachment's header is damaged") from err
     return AttachmentIndex(offset, 9 + length, log_time, create_time, data_size, name, media_type)

@@ -7,10 +7,9 @@ from collections.abc import Collection, Mapping
 
 from tupli_mcap.errors import FormatError
 
-__all__ = ["check_crc", "mended", "with_crc"]
+__all__ = ["check_crc", "with_crc"]
 
 _KEY = "crc"
-_MOST_TO_MEND = 1000  # characters: each is tried, in every way
 
 
 def with_crc(values: Mapping[str, str]) -> dict[str, str]:
@@ -43,25 +42,3 @@ def _crc(pairs: Mapping[str, str]) -> str:
     """In the order of the keys, each text as MCAP stores it: its length (u32) and its bytes."""
     texts = [text.encode() for pair in sorted(pairs.items()) for text in pair]
     return f"{zlib.crc32(b''.join(len(text).to_bytes(4, 'little') + text for text in texts)):08x}"
-
-
-def mended(values: Mapping[str, str]) -> dict[str, str] | None:
-    """The pairs without `crc`, one damaged character of a value (or of `crc`) put right; None if that is not it.
-
-    Of all texts that differ in one character, 1 in 150,000 has the checksum by chance at most.
-    """
-    pairs = {key: value for key, value in values.items() if key != _KEY}
-    told = values.get(_KEY, "")
-    found = _crc(pairs)
-    if len(told) == len(found) and sum(a != b for a, b in zip(told, found, strict=True)) <= 1:
-        return pairs
-    if sum(len(value) for value in pairs.values()) > _MOST_TO_MEND:
-        return None
-    for key, value in pairs.items():
-        for i, old in enumerate(value):
-            for code in range(32, 127):
-                if chr(code) != old:
-                    tried = {**pairs, key: f"{value[:i]}{chr(code)}{value[i + 1 :]}"}
-                    if _crc(tried) == told:
-                        return tried
-    return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, overload
 
@@ -14,7 +14,7 @@ from mcap.records import AttachmentIndex, Channel, Metadata, Schema
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.checked import message_index
-from tupli_mcap.recording.checksums import check_crc, mended
+from tupli_mcap.recording.checksums import check_crc
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore, Span
 from tupli_mcap.recording.container import CHUNK_ROWS, MAGIC, PROFILE
 from tupli_mcap.recording.contents import CHANNEL_KEYS, RECORDING_KEYS, RECORDING_METADATA, is_ours
@@ -28,6 +28,7 @@ from tupli_mcap.recording.tail import Tail
 
 __all__ = ["Gathered", "Piece", "Pieces", "gather", "is_recording", "may_be_recording"]
 
+Array = np.ndarray[Any, Any]
 _CACHE = 64 << 20
 _HEADERS = 16  # chunks whose headers are kept: a message at a time is taken from them
 _HEAD = 4096  # the recording's metadata record begins within so many bytes
@@ -50,9 +51,11 @@ class _Place(NamedTuple):
     """Where a chunk's messages are."""
 
     offset: int
+    length: int
     chunk: Chunk  # without its data
     size: int
     skip: int
+    repaired: str  # what is wrong in its header
 
 
 class Pieces(Sequence[bytes]):
@@ -66,6 +69,13 @@ class Pieces(Sequence[bytes]):
     def add(self, place: _Place | bytes) -> int:
         self._places.append(place)
         return len(self._places) - 1
+
+    def place(self, piece: Piece) -> _Place:
+        """Where the chunk is that a piece was in."""
+        place = self._places[piece.number]
+        if isinstance(place, bytes):
+            raise TypeError("the piece is not of a chunk")
+        return place
 
     def __len__(self) -> int:
         return len(self._places)
@@ -115,19 +125,28 @@ class Gathered:
     notes: list[str] = field(default_factory=list)
     awaited: ChunkRecords | None = None  # the last chunk's, whose message index comes next
 
-    def add(self, channel: int, piece: Piece) -> bool:
-        """Takes rows that are not there yet; False if some of them are."""
-        pieces = self.pieces.setdefault(channel, [])
-        if any(piece.first < other.stop and other.first < piece.stop for other in pieces[-1:]):
-            return False
-        if pieces and pieces[-1].first > piece.first:
-            if any(piece.first < other.stop and other.first < piece.stop for other in pieces):
-                return False
-            pieces.append(piece)
-            pieces.sort()
-            return True
-        pieces.append(piece)
-        return True
+    def add(self, channel: int, pieces: Iterable[Piece]) -> list[Piece]:
+        """Takes rows, and returns the pieces that are not taken: one that begins earlier holds a row of theirs.
+
+        Where two begin with the same row, the one that was loaded first is taken.
+        """
+        kept, left = [], []
+        stop = 0
+        for piece in sorted([*self.pieces.get(channel, []), *pieces], key=lambda p: (p.first, p.number)):
+            if piece.first < stop:
+                left.append(piece)
+            else:
+                kept.append(piece)
+                stop = piece.stop
+        if kept:
+            self.pieces[channel] = kept
+        return left
+
+    def lacks(self, channel: int, rows: Array) -> Array:
+        """Which of some row numbers (int64) are not here, as a mask."""
+        ranges = np.array([(-1, -1), *self.ranges(channel)], np.int64)
+        stops: Array = ranges[np.searchsorted(ranges[:, 0], rows, side="right") - 1, 1]
+        return rows >= stops
 
     def store(self) -> PackedStore:
         """The rows, numbered without gaps."""
@@ -186,19 +205,22 @@ def gather(source: Source, tail: Tail) -> Gathered:
     if tail.summary is not None:
         gathered.schemas |= tail.summary.schemas
         gathered.channels |= tail.summary.channels
-    for found in Survey(source, known=tail.known_chunks(), end=_end(source, tail)):
+    pieces: dict[int, list[Piece]] = {}
+    for found in Survey(source, known=tail.known_chunks(), end=tail.data_end):
         if isinstance(found, Damage):
             gathered.damages.append(found)
+        elif found.chunk is not None:
+            _take_chunk(gathered, found, found.chunk, pieces)
         else:
             _take(gathered, found)
+    for channel, mine in pieces.items():
+        _take_rows(gathered, channel, mine)
+    gathered.damages.sort(key=lambda damage: damage.offset)
     return gathered
 
 
-def _end(source: Source, tail: Tail) -> int | None:
-    return source.size if tail.data_end is None else tail.data_end
-
-
 def _take(gathered: Gathered, found: Found) -> None:
+    """Takes a record that is no chunk."""
     name = gathered.source.name
     awaited, gathered.awaited = gathered.awaited, None
     if found.opcode == Opcode.MESSAGE_INDEX and awaited is not None:
@@ -207,9 +229,7 @@ def _take(gathered: Gathered, found: Found) -> None:
             end = found.offset + found.length
             why = "the message index says other than its chunk holds"
             gathered.damages.append(Damage(found.offset, end, why, Opcode.MESSAGE_INDEX))
-    if found.chunk is not None:
-        _take_chunk(gathered, found, found.chunk)
-    elif found.attachment is not None:
+    if found.attachment is not None:
         if found.attachment.name != INDEX_NAME:
             gathered.attachments[found.attachment.name] = found.attachment
     elif found.opcode == Opcode.HEADER:
@@ -230,13 +250,9 @@ def _take(gathered: Gathered, found: Found) -> None:
 def _take_metadata(gathered: Gathered, values: dict[str, str], found: Found) -> None:
     try:
         gathered.metadata = check_crc(values, RECORDING_KEYS, "the recording's metadata")
-        return
     except FormatError as err:
         end = found.offset + found.length
         gathered.damages.append(Damage(found.offset, end, str(err), Opcode.METADATA))
-    gathered.metadata = mended(values) if "crc" in values else None
-    if gathered.metadata is not None:
-        gathered.notes.append("one character of the recording's metadata was put right by their checksum")
 
 
 def _is_whole(gathered: Gathered, channel: Channel, found: Found) -> bool:
@@ -251,7 +267,9 @@ def _is_whole(gathered: Gathered, channel: Channel, found: Found) -> bool:
     return True
 
 
-def _take_chunk(gathered: Gathered, found: Found, chunk: Chunk) -> None:
+def _take_chunk(gathered: Gathered, found: Found, chunk: Chunk, pieces: dict[int, list[Piece]]) -> None:
+    """Adds a chunk to the `pieces` of its channel."""
+    gathered.awaited = None
     try:
         records = chunk_records(chunk.data, "the chunk")
         if not chunk.crc:
@@ -265,15 +283,23 @@ def _take_chunk(gathered: Gathered, found: Found, chunk: Chunk) -> None:
         gathered.channels |= {channel.id: channel for channel in records.channels}
     gathered.awaited = records
     size = len(chunk.data)
-    place = _Place(found.offset, chunk._replace(data=memoryview(b"")), size, records.skip)
-    piece = Piece(records.first, len(records.headers), size - records.skip, gathered.loaded.add(place))
-    if not gathered.add(records.channel, piece):
-        end = found.offset + found.length
-        gathered.damages.append(
-            Damage(found.offset, end, "the chunk holds rows that another one holds", Opcode.CHUNK)
-        )
-    elif found.repaired:
-        gathered.damages.append(Damage(found.offset, found.offset + 49, found.repaired, -1))
+    empty = chunk._replace(data=memoryview(b""))
+    place = _Place(found.offset, found.length, empty, size, records.skip, found.repaired)
+    number = gathered.loaded.add(place)
+    piece = Piece(records.first, len(records.headers), size - records.skip, number)
+    pieces.setdefault(records.channel, []).append(piece)
+
+
+def _take_rows(gathered: Gathered, channel: int, pieces: list[Piece]) -> None:
+    """Takes the chunks of a channel, in whatever order they lie in the file."""
+    left = set(gathered.add(channel, pieces))
+    for piece in pieces:
+        place = gathered.loaded.place(piece)
+        if piece in left:
+            why = "the chunk holds rows that another one holds"
+            gathered.damages.append(Damage(place.offset, place.offset + place.length, why, Opcode.CHUNK))
+        elif place.repaired:
+            gathered.damages.append(Damage(place.offset, place.offset + 49, place.repaired, -1))
 
 
 def may_be_recording(source: Source, tail: Tail) -> bool:

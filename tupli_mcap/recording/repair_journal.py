@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +25,6 @@ from tupli_mcap.recording.salvage import Salvage, log_records, running_record, s
 __all__ = ["add_journal"]
 
 Array = np.ndarray[Any, Any]
-_END = 1 << 40  # beyond any row number
 
 
 def add_journal(gathered: Gathered) -> None:
@@ -69,9 +71,7 @@ def _belongs(gathered: Gathered, journal: JournalContents) -> bool:
     for damage in gathered.damages:
         data = gathered.source.read(damage.offset, min(damage.end - damage.offset, 1 << 16))
         if len(uuid) == 32 and uuid.encode() in data:
-            gathered.metadata = {"uuid": uuid, "format_version": "1", "library": "", "created_ns": "0"}
-            gathered.metadata["benchmark_id"] = ""
-            gathered.notes.append("the recording's metadata are lost but for its uuid; it names no benchmark")
+            gathered.metadata = {"uuid": uuid}
             return True
     return False
 
@@ -124,35 +124,28 @@ def _stop(gathered: Gathered, channel: int) -> int:
     return pieces[-1].stop if pieces else 0
 
 
-def _missing(gathered: Gathered, channel: int) -> list[tuple[int, int]]:
-    """The rows of a channel that are not here, as ranges; the last one has no end."""
-    at, missing = 0, []
-    for first, stop in gathered.ranges(channel):
-        if first > at:
-            missing.append((at, first))
-        at = stop
-    return [*missing, (at, _END)]
-
-
-def _add(gathered: Gathered, channel: int, first: int, count: int, data: bytes) -> None:
-    if count:
-        gathered.add(channel, Piece(first, count, len(data), gathered.loaded.add(data)))
+def _piece(gathered: Gathered, first: int, rows: int, data: bytes) -> Piece:
+    return Piece(first, rows, len(data), gathered.loaded.add(data))
 
 
 def _add_log(gathered: Gathered, journal: JournalContents, area: LogArea) -> dict[int, int]:
     """Takes the records of a log; returns the row after its last one, by channel."""
-    everything = log_records(journal, area, None)
-    for channel in {entry[0] for entry in everything}:
-        mine = {entry[1]: entry[3] for entry in everything if entry[0] == channel}
-        for low, high in _missing(gathered, channel):
-            run: list[bytes] = []
-            numbers = sorted(n for n in mine if low <= n < high)
-            for i, number in enumerate(numbers):
-                run.append(mine[number])
-                if i + 1 == len(numbers) or numbers[i + 1] != number + 1:
-                    _add(gathered, channel, number + 1 - len(run), len(run), b"".join(run))
-                    run = []
-    return {channel: sequence + 1 for channel, sequence, _, _ in everything}
+    stops: dict[int, int] = {}
+    for channel, group in itertools.groupby(log_records(journal, area, None), key=lambda entry: entry[0]):
+        mine = list(group)
+        numbers = np.array([entry[1] for entry in mine], np.int64)
+        stops[channel] = int(numbers[-1]) + 1
+        chosen = np.flatnonzero(gathered.lacks(channel, numbers))
+        runs = np.split(chosen, np.flatnonzero(np.diff(numbers[chosen]) != 1) + 1)
+        gathered.add(
+            channel,
+            [
+                _piece(gathered, mine[run[0]][1], len(run), b"".join(mine[i][3] for i in run.tolist()))
+                for run in runs
+                if len(run)
+            ],
+        )
+    return stops
 
 
 def _starts(gathered: Gathered, channels: Channels) -> dict[tuple[int, int], int]:
@@ -182,16 +175,17 @@ def _add_rows(
         raise FormatError("the journal has no rows 'steps'")
     dtype = layout.step_message.dtype
     salvage = Salvage(journal, area, env, dtype, channel)
-    for low, high in _missing(gathered, channel):
-        for rows in salvage.runs(low, high):
-            first = int(rows["#sequence"][0])
-            last = _row_before(gathered, channel, first, dtype)
-            RowDeriver(*last).fill(rows)
-            begun = starts.get((env, int(rows["episode"][0])))
-            if begun is not None and begun <= first:
-                same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
-                rows["step"][:same] = first - begun + np.arange(same)
-            _add(gathered, channel, first, len(rows), rows.view(np.uint8).tobytes())
+    pieces = []
+    for rows in salvage.runs(partial(gathered.lacks, channel)):
+        first = int(rows["#sequence"][0])
+        last = _row_before(gathered, channel, first, dtype)
+        RowDeriver(*last).fill(rows)
+        begun = starts.get((env, int(rows["episode"][0])))
+        if begun is not None and begun <= first:
+            same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
+            rows["step"][:same] = first - begun + np.arange(same)
+        pieces.append(_piece(gathered, first, len(rows), rows.view(np.uint8).tobytes()))
+    gathered.add(channel, pieces)
     stop = _stop(gathered, channel)
     finals = {(env, hole.row): hole for hole in salvage.finals(layout.state_end) if hole.row <= stop}
     gathered.finals |= finals
@@ -202,19 +196,22 @@ def _add_rows(
 
 def _row_before(gathered: Gathered, channel: int, first: int, dtype: np.dtype[Any]) -> tuple[int, int, int]:
     """Episode, step and time (ns) of the row before one, where it is here."""
-    for piece in gathered.pieces.get(channel, []):
-        if piece.stop == first:
-            row = np.frombuffer(gathered.loaded[piece.number], dtype)[-1]
-            return int(row["episode"]), int(row["step"]), int(row["#log_time"])
-    return -1, -1, 0
+    pieces = gathered.pieces.get(channel, [])
+    at = bisect.bisect_left(pieces, first, key=lambda piece: piece.stop)
+    if at == len(pieces) or pieces[at].stop != first:
+        return -1, -1, 0
+    row = np.frombuffer(gathered.loaded[pieces[at].number], dtype)[-1]
+    return int(row["episode"]), int(row["step"]), int(row["#log_time"])
 
 
 def _add_images(gathered: Gathered, salvage: Salvage, leaf: Leaf, channel: int, stop: int) -> bytes | None:
     """Takes the images of steps before `stop`; returns the running state's."""
-    for low, high in _missing(gathered, channel):
-        for rows in salvage.runs(low, min(high, stop)):
-            rows["#publish_time"] = rows["#log_time"]
-            _add(gathered, channel, int(rows["#sequence"][0]), len(rows), rows.view(np.uint8).tobytes())
+    pieces = []
+    for rows in salvage.runs(lambda numbers: gathered.lacks(channel, numbers) & (numbers < stop)):
+        rows["#publish_time"] = rows["#log_time"]
+        data = rows.view(np.uint8).tobytes()
+        pieces.append(_piece(gathered, int(rows["#sequence"][0]), len(rows), data))
+    gathered.add(channel, pieces)
     running = salvage.row(stop)
     data: bytes | None = None if running is None else leaf.as_values(running["data"]).tobytes()
     return data

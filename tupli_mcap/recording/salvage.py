@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -99,9 +99,9 @@ class Salvage:
         chosen = slice(start, start + good)
         return self.rows[self._halves[chosen], self._places[chosen]].copy()
 
-    def runs(self, first: int, stop: int) -> list[Array]:
-        """Copies of the committed rows with `first` <= sequence < `stop`, in runs of consecutive ones."""
-        wanted = np.flatnonzero((self._sequences >= first) & (self._sequences < stop))
+    def runs(self, wanted_of: Callable[[Array], Array]) -> list[Array]:
+        """Copies of committed rows, in runs of consecutive ones: those whose sequences `wanted_of` says (as a mask)."""
+        wanted = np.flatnonzero(wanted_of(self._sequences))
         sequences, places = np.unique(self._sequences[wanted], return_index=True)
         chosen = wanted[places]
         if self._torn:

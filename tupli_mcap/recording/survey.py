@@ -7,6 +7,7 @@ is read by what the episode index says of it. One record is in memory at a time,
 
 from __future__ import annotations
 
+import bisect
 import re
 import struct
 import zlib
@@ -29,6 +30,8 @@ __all__ = ["Chunk", "Damage", "Found", "KnownChunk", "Survey", "attachment_name"
 _RECORD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
 _PIECE = 1 << 20
+_FIRST_PIECE = 1 << 12
+_PARSING = 16  # times as long as a checksum of as many bytes takes
 _MAX_RATIO = 1 << 16  # zstd cannot compress further
 _SUMMARY = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 _END = (Opcode.DATA_END, Opcode.FOOTER, Opcode.SUMMARY_OFFSET, *_SUMMARY)
@@ -148,12 +151,12 @@ class Survey:
         elif opcode == Opcode.ATTACHMENT:
             return self._attachment(position, length)
         else:
-            checked = self._other(opcode, position, length)
-            if isinstance(checked, Found):
-                if searching and opcode != Opcode.FOOTER and not self._stands_at(position + 9 + length):
-                    return "no record follows it"
+            if searching and opcode != Opcode.FOOTER and not self._stands_at(position + 9 + length):
+                why = "no record follows it"
+            elif isinstance(checked := self._other(opcode, position, length), Found):
                 return checked
-            why = checked
+            else:
+                why = checked
         hidden = self._chunk(position)  # its opcode or its length may be what is damaged
         return hidden if isinstance(hidden, Found) else why
 
@@ -165,6 +168,8 @@ class Survey:
                 return f"the record with opcode {opcode} claims {length} bytes"
         elif opcode < 0x80 or not self._stands_at(position + 9 + length):
             return f"expected a record, found opcode {opcode}"
+        if self._budget < 0:
+            return "too much of the file has been checked in vain"
         body = memoryview(self._source.read(position + 9, length))
         try:
             if opcode in _PARSED:
@@ -172,6 +177,7 @@ class Survey:
             elif opcode == Opcode.MESSAGE_INDEX:
                 message_index(body)
         except FormatError as err:
+            self._budget -= _PARSING * length
             return str(err).removeprefix(f"{self._source.name}: ")
         return Found(opcode, position, 9 + length, body)
 
@@ -316,30 +322,24 @@ class Survey:
 
     def _search(self, position: int) -> int:
         """The next offset where a record stands that can be checked."""
-        limit = next((offset for offset in self._known_offsets if offset >= position), self._end)
-        while position < limit:
-            size = min(_PIECE + 8, self._end - position)
-            window = self._source.read(position, size)
-            for match in _CANDIDATE.finditer(window, 0, max(size - 8, 0) + 8):
+        at = bisect.bisect_left(self._known_offsets, position)
+        limit = self._known_offsets[at] if at < len(self._known_offsets) else self._end
+        piece = _FIRST_PIECE
+        while position < limit and self._budget >= 0:
+            window = self._source.read(position, min(piece + 8, self._end - position))
+            for match in _CANDIDATE.finditer(window):
                 candidate = position + match.start()
-                if candidate >= min(limit, position + _PIECE) or self._budget < 0:
+                if candidate >= min(limit, position + piece) or self._budget < 0:
                     break
                 if self._stands_at(candidate) and self._certain(candidate):
                     return candidate
-            position += _PIECE
+            position += piece
+            piece = min(2 * piece, _PIECE)  # what is found near costs no more than the way to it
         return limit
 
     def _certain(self, position: int) -> bool:
-        if self._adds_up(position):  # a chunk or an attachment, whether good or damaged
-            return True
-        found = self.at(position, searching=True)
-        if isinstance(found, str):
-            return False
-        if found.opcode == Opcode.MESSAGE:
-            return self._stands_at(found.offset + found.length)
-        if found.opcode == Opcode.CHUNK:
-            return True
-        return True
+        # what adds up is a chunk or an attachment, whether good or damaged
+        return self._adds_up(position) or isinstance(self.at(position, searching=True), Found)
 
 
 def attachment_name(source: Source, damage: Damage) -> str | None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.checked import checked_attachment
+from tupli_mcap.recording.checked import attachment_index, checked_attachment
 from tupli_mcap.recording.container import COMPRESSIONS, MAGIC
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
 from tupli_mcap.recording.source import Source
@@ -97,27 +98,39 @@ def _statistics(source: Source, summary: Summary) -> Statistics | None:
 
 
 def _find_index(source: Source) -> AttachmentIndex | None:
-    """The last attachment with the index's name and a good CRC, looked for from the end."""
-    end = source.size
+    """The last attachment with the index's name and a good CRC, looked for from the end.
+
+    Those that turn out to be damaged have together no more bytes than the file: attachments do not overlap. Where more
+    is claimed, the search ends, so that not each of many claims takes a checksum over all of the file.
+    """
+    end = budget = source.size
     while end > 0:
         start = max(0, end - _WINDOW)
         window = source.read(start, min(_WINDOW + len(_NAME), source.size - start))
         at = window.rfind(_NAME)
         while at >= 0:
             place = start + at - _BEFORE_NAME
-            if place >= 0 and (found := _index_at(source, place)) is not None:
-                return found
+            length = _length_at(source, place)
+            if length:
+                with contextlib.suppress(FormatError):
+                    return checked_attachment(source, place, length)
+                budget -= length
+                if budget < 0:
+                    return None
             at = window.rfind(_NAME, 0, at)
         end = start
     return None
 
 
-def _index_at(source: Source, place: int) -> AttachmentIndex | None:
+def _length_at(source: Source, place: int) -> int:
+    """The length of the record at a place whose header is that of an episode index; 0 where there is none."""
+    if place < 0:
+        return 0
     length = int.from_bytes(source.read(place + 1, 8), "little")
     if source.read(place, 1) != b"\x09" or length > source.size - place - 9:
-        return None
+        return 0
     try:
-        found = checked_attachment(source, place, length)
+        found = attachment_index(source, place, length)
     except FormatError:
-        return None
-    return found if (found.name, found.media_type) == (INDEX_NAME, INDEX_MEDIA_TYPE) else None
+        return 0
+    return length if (found.name, found.media_type) == (INDEX_NAME, INDEX_MEDIA_TYPE) else 0
