@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -154,7 +155,7 @@ class _Runs:
         self.steps, self.available = steps, available
         # starts made for episodes that have steps and none, and the times of their first steps
         self.unstarted: list[tuple[EpisodeStart, int]] = []
-        self._begun: dict[tuple[int, int], Run] = {}
+        self._begun: dict[int, list[Run]] = {}  # of episodes without an end, by sub-environment, in order
         for env, channel in enumerate(steps):
             last = -1
             for run in runs(store, layout, channel, 0, available[env]):
@@ -162,18 +163,21 @@ class _Runs:
                     start = EpisodeStart(run.episode, env, run.row, False, False, "", "", "{}")
                     self.unstarted.append((start, run.first_time))
                 if run.episode not in episodes.ends:
-                    self._begun[env, run.row] = run
+                    self._begun.setdefault(env, []).append(run)
                 last = run.episode
 
     def of(self, start: EpisodeStart) -> Run | None:
-        """The rows of an episode without an end; None if it has no step."""
-        run = self._begun.get((start.env, start.first_row))
-        if run is None and start.env < len(self.steps):
-            # none, unless its start is wrong
-            count = max(0, self.available[start.env] - start.first_row)
-            rows = runs(self._store, self.layout, self.steps[start.env], start.first_row, count)
-            run = next(rows, None)
-        return run if run is not None and run.episode == start.episode else None
+        """The rows of an episode without an end, from where it starts; None if it has no step."""
+        mine = self._begun.get(start.env, [])
+        at = bisect.bisect_right(mine, start.first_row, key=lambda run: run.row) - 1
+        if at < 0 or mine[at].episode != start.episode:
+            return None
+        run, before = mine[at], start.first_row - mine[at].row
+        if before == 0 or before >= run.steps:
+            return run if before == 0 else None
+        channel = self.steps[start.env]  # its start is wrong: some of its steps come before it
+        rest = runs(self._store, self.layout, channel, start.first_row, run.steps - before, keep=True)
+        return next(rest)
 
 
 def _make_starts(episodes: _Episodes, found: _Runs, tail: Unwritten) -> None:
@@ -189,8 +193,9 @@ def _make_starts(episodes: _Episodes, found: _Runs, tail: Unwritten) -> None:
 def _make_ends(episodes: _Episodes, found: _Runs, store: ChunkStore, tail: Unwritten) -> None:
     """Makes the missing ends, in the order of time."""
     missing = []
-    for number in set(episodes.starts) - set(episodes.ends):
-        start = episodes.starts[number][2]
+    running = [episodes.starts[number][2] for number in set(episodes.starts) - set(episodes.ends)]
+    for start in sorted(running, key=lambda start: (start.env, start.first_row)):  # each chunk once
+        number = start.episode
         run = found.of(start)
         if run is not None:  # a reset without a step is no episode
             missing.append((run.last_time, number, start, run))

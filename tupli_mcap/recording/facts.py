@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import struct
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -13,11 +14,11 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.headers import message_headers
 
 __all__ = ["Run", "StepFacts", "runs", "step_facts", "sum_up"]
 
 Array = np.ndarray[Any, Any]
+_TIME, _BEFORE_TIME = struct.Struct("<q"), 15  # of a Message record
 
 
 class StepFacts(NamedTuple):
@@ -36,19 +37,20 @@ class StepFacts(NamedTuple):
 
 
 def step_facts(
-    store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int
+    store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int, *, keep: bool = False
 ) -> Iterator[StepFacts]:
-    """The facts of rows `first:first + count`, a chunk at a time.
+    """The facts of rows `first:first + count`, a chunk at a time; chunks are cached with `keep`.
 
     Raises:
         FormatError: a chunk is damaged, or holds rows of another size.
     """
     for span in store.spans(channel, first, count):
         if layout.constant:
-            rows = store.rows(span.chunk, layout.step_message.dtype, keep=False)[span.begin : span.end]
+            rows = store.rows(span.chunk, layout.step_message.dtype, keep=keep)[span.begin : span.end]
             yield _constant(rows, layout)
         else:
-            yield _variable(memoryview(store.load(span.chunk, keep=False)), layout, span.begin, span.end)
+            data, places = store.records(span.chunk, keep=keep)
+            yield _variable(memoryview(data), layout, places[span.begin : span.end])
 
 
 class Run(NamedTuple):
@@ -64,15 +66,17 @@ class Run(NamedTuple):
     last_time: int
 
 
-def runs(store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int) -> Iterator[Run]:
-    """The runs of the rows `first:first + count`, in their order.
+def runs(
+    store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int, *, keep: bool = False
+) -> Iterator[Run]:
+    """The runs of the rows `first:first + count`, in their order; chunks are cached with `keep`.
 
     Raises:
         FormatError: as `step_facts`, or a row is no step of the layout.
     """
     last: Run | None = None
     row = first
-    for facts in step_facts(store, layout, channel, first, count):
+    for facts in step_facts(store, layout, channel, first, count, keep=keep):
         if facts.bad:
             raise FormatError(next(iter(facts.bad.values())))
         for run in _runs(facts, row, last):
@@ -126,19 +130,19 @@ def _constant(rows: Array, layout: StepLayout) -> StepFacts:
     return StepFacts(rows["episode"], rows["step"], total, *flags, rows["#log_time"].astype(np.int64), {})
 
 
-def _variable(data: memoryview, layout: StepLayout, begin: int, end: int) -> StepFacts:
-    headers = message_headers(data)[begin:end]
-    n = len(headers)
+def _variable(data: memoryview, layout: StepLayout, places: Array) -> StepFacts:
+    """`places`: where the record of each row begins and ends (int64)."""
+    n = len(places)
     numbers = np.zeros((n, 2), np.uint32)
     flags = np.zeros((n, 2), np.uint8)
     total = np.zeros(n)
     bad: dict[int, str] = {}
     decoder = MessageDecoder(layout)
     names = [leaf.name for leaf in layout.reward if leaf.kind != "variable" and leaf.size]
-    for i, (start, length) in enumerate(
-        zip(headers["#offset"].tolist(), headers["#length"].tolist(), strict=True)
-    ):
-        body = data[start + BODY : start + 9 + length]
+    time = np.zeros(n, np.int64)
+    for i, (start, end) in enumerate(places.tolist()):
+        body = data[start + BODY : end]
+        (time[i],) = _TIME.unpack_from(data, start + _BEFORE_TIME)
         try:
             values = decoder.step(body)
         except FormatError as err:
@@ -147,5 +151,4 @@ def _variable(data: memoryview, layout: StepLayout, begin: int, end: int) -> Ste
         numbers[i] = values["episode"], values["step"]
         flags[i] = body[-2], body[-1]
         total[i] = float(sum(np.sum(values[name], dtype=np.float64) for name in names))
-    time = headers["#log_time"].astype(np.int64)
     return StepFacts(numbers[:, 0], numbers[:, 1], total, flags[:, 0], flags[:, 1], time, bad)

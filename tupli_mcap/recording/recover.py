@@ -161,7 +161,7 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
 def _read(source: Source, path: Path, only: Collection[str] | None = None) -> JournalContents | Exception:
     try:
         return read_journal(path, only)
-    except (FileNotFoundError, FormatError) as err:
+    except FileNotFoundError as err:
         return err
     except OSError as err:
         raise RecordingError(
@@ -297,6 +297,7 @@ def _salvage(
             known = max((e[1] + 1 for e in log_records(journal, log, None) if e[0] == channel), default=0)
             state = running_record(journal, log, total, layout)
             if state is not None:
+    topics = {channel.topic: channel.id for channel in found.channels.values()}
                 tail.pending[env], known = state, max(known, total)
         if rows is not None:
             tail.rows.append(rows)
@@ -304,7 +305,9 @@ def _salvage(
             warnings.warn(
                 _gap(source, found.channels[channel].topic, known - total), UserWarning, stacklevel=7
             )
-        _salvage_images(found, journal, layout, env, total, known, tail)
+        top = found.channels[channel].topic.removesuffix("/step")
+        images = [topics.get(f"{top}/image/{leaf.name}") for leaf in layout.images]
+        _salvage_images(found, journal, layout, env, images, total, known, tail)
     for name in journal.areas:
         if name in _EVENTS or name.startswith(FRAMES_AREA):
             tail.rows += to_rows(log_records(journal, _log_area(journal, name), counts))
@@ -333,21 +336,16 @@ def _salvage_images(
     known: int,
     tail: Unwritten,
 ) -> None:
-    """Takes the images of the rows before `steps`.
+    """Takes the images of the rows before `steps`, of each leaf from its channel.
 
     Where the journal does not know a step as committed (`known` is the row after those), its image may be another one:
     in a journal that was read or copied before the file, a reset has written over it since.
     """
-    for leaf in layout.images:
-        (step,) = (
-            c.topic
-            for c in found.channels.values()
-            if c.topic.endswith("/step") and c.metadata.get("env") == str(env)
-        )
-        wanted = f"{step.removesuffix('/step')}/image/{leaf.name}"
-        channel = next((c.id for c in found.channels.values() if c.topic == wanted), None)
+    for leaf, channel in zip(layout.images, channels, strict=True):
         if channel is None:
-            raise FormatError(f"expected a channel {wanted} in the journal, found none")
+            raise FormatError(
+                f"expected a channel for the images of {leaf.name!r}, sub-environment {env}, found none"
+            )
         dtype = layout.image_messages[leaf.name].dtype
         area = _rows_area(journal, f"{leaf.name}/{env}")
         salvage = Salvage(journal, area, 0, dtype, channel, rewritten=True)  # by resets
@@ -356,6 +354,7 @@ def _salvage_images(
             tail.rows.append(rows)
         pending = salvage.row(steps)
         # where the file is ahead, a live writer may have been writing over that row while it was read
+    channels: list[int | None],
         if pending is None or known < steps or found.counts.get(channel, 0) > steps:
             tail.pending.pop(env, None)
         elif env in tail.pending:

@@ -18,7 +18,7 @@ from tupli_mcap.recording.cameras import (
     encode_pair,
 )
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
-from tupli_mcap.recording.repair_plan import PlannedEpisode
+from tupli_mcap.recording.repair_plan import NewPlaces, PlannedEpisode
 from tupli_mcap.recording.repair_segments import intersection, message_at
 
 __all__ = ["OldCameras", "frames_lost", "kept_frames"]
@@ -63,9 +63,7 @@ def kept_frames(
 ) -> Iterator[KeptFrame]:
     """The frames of a sub-environment's episodes, with the numbers that these have now."""
     camera, frame = ids
-    pieces: dict[int, list[PlannedEpisode]] = {}
-    for episode in episodes:
-        pieces.setdefault(episode.segment.episode, []).append(episode)
+    pieces = NewPlaces(episodes)
     for first, stop in intersection(gathered.ranges(camera), gathered.ranges(frame)):
         for span in store.spans(frame, store.packed(frame, first), stop - first):
             rows = store.rows(span.chunk, FRAME_LAYOUT.dtype)[span.begin : span.end]
@@ -74,20 +72,10 @@ def kept_frames(
                 numbers, rows["episode"].tolist(), rows["step"].tolist(), rows["#log_time"], strict=True
             )
             for row, number, step, time_ns in values:
-                found = _place(pieces.get(number, ()), step)
+                found = pieces.find(number, step, state=True)
                 if found is not None:
                     picture = message_at(store, camera, store.packed(camera, row))
                     yield KeptFrame(int(time_ns), picture, encode_pair(*found))
-
-
-def _place(pieces: Sequence[PlannedEpisode], step: int) -> tuple[int, int] | None:
-    """Episode and step that a state of an old episode is of now; a piece's last state belongs to it."""
-    for last in (0, 1):
-        for episode in pieces:
-            at = step - episode.segment.step
-            if 0 <= at < episode.segment.steps + last:
-                return episode.number, at
-    return None
 
 
 def frames_lost(gathered: Gathered, cameras: OldCameras) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from tupli_mcap.recording.index import EpisodeIndex
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
 from tupli_mcap.recording.repair_segments import Channels, Ranges, Segment, messages, segments
 
-__all__ = ["IN_A_HOLE", "RUNNING", "Plan", "PlannedEpisode", "Told", "make_plan"]
+__all__ = ["IN_A_HOLE", "RUNNING", "NewPlaces", "Plan", "PlannedEpisode", "Told", "make_plan"]
 
 RUNNING, IN_A_HOLE = -1, -2  # instead of the row of a final state: where in the journal it is
 _END = 1 << 64  # beyond any row number
@@ -65,6 +66,26 @@ class Plan:
     lost_finals: list[int] = field(default_factory=list)
     lost_rows: int = 0
     next_episode: int = 0
+
+
+class NewPlaces:
+    """The episodes that are made of each old one, by the steps that they have of it."""
+
+    def __init__(self, episodes: Iterable[PlannedEpisode]) -> None:
+        self._of: dict[int, list[PlannedEpisode]] = {}
+        for episode in sorted(episodes, key=lambda episode: episode.segment.step):
+            self._of.setdefault(episode.segment.episode, []).append(episode)
+
+    def find(self, number: int, step: int, *, state: bool = False) -> tuple[int, int] | None:
+        """Which step of which new episode a step of an old one is now; None if it is in none.
+
+        With `state` it is the number of a state: that after a piece's last step belongs to it.
+        """
+        pieces = self._of.get(number, [])
+        at = bisect.bisect_right(pieces, step, key=lambda piece: piece.segment.step) - 1
+        if at < 0 or step - pieces[at].segment.step >= pieces[at].segment.steps + state:
+            return None
+        return pieces[at].number, step - pieces[at].segment.step
 
 
 # ---- what is told of it

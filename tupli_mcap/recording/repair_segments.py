@@ -91,7 +91,9 @@ def segments(
         for first, stop in here:
             open_: Segment | None = None
             row = first
-            for facts in step_facts(store, layout, channel, store.packed(channel, first), stop - first):
+            at = store.packed(channel, first)
+            # a chunk may hold many of the ranges
+            for facts in step_facts(store, layout, channel, at, stop - first, keep=True):
                 for found in _cut(facts, env, row, open_):
                     if open_ is not None and _continues(open_, found):
                         open_ = _joined(open_, found)

@@ -26,7 +26,7 @@ from tupli_mcap.recording.library import library
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_frames import OldCameras, kept_frames
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
-from tupli_mcap.recording.repair_plan import IN_A_HOLE, RUNNING, Plan, PlannedEpisode
+from tupli_mcap.recording.repair_plan import IN_A_HOLE, RUNNING, NewPlaces, Plan, PlannedEpisode
 from tupli_mcap.recording.repair_segments import Channels, message_at, messages
 from tupli_mcap.recording.rows import even_rows
 
@@ -296,15 +296,10 @@ class RepairWriter:
 
     def _infos(self, store: PackedStore, channel: int, plan: Plan) -> Iterator[tuple[int, bytes]]:
         """The infos of steps that are kept, with the numbers these have now."""
-        pieces: dict[int, list[PlannedEpisode]] = {}
-        for episode in plan.episodes:
-            pieces.setdefault(episode.segment.episode, []).append(episode)
+        pieces = NewPlaces(plan.episodes)
         for _, log_time, body in messages(store, channel):
             number, step = int.from_bytes(body[:4], "little"), int.from_bytes(body[4:8], "little")
-            for episode in pieces.get(number, []):
-                at = step - episode.segment.step
-                if 0 <= at < episode.segment.steps:
-                    self.infos_kept += 1
-                    head = episode.number.to_bytes(4, "little") + at.to_bytes(4, "little")
-                    yield log_time, head + bytes(body[8:])
-                    break
+            found = pieces.find(number, step)
+            if found is not None:
+                self.infos_kept += 1
+                yield log_time, b"".join(n.to_bytes(4, "little") for n in found) + bytes(body[8:])
