@@ -77,7 +77,7 @@ def _recover(path: Path) -> None:
     target = path.with_name("recovered.mcap")
     target.unlink(missing_ok=True)
     report = recover_recording(path, target)
-    if report.target is not None and report.kind == "recording":
+    if report.target is not None:
         facts, refused = observe(target)
         if not facts["open"] or not facts["complete"]:
             raise UnexpectedError(f"the recovered file is not whole: {(refused or ['unfinished'])[0]}")

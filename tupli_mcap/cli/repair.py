@@ -38,9 +38,7 @@ def register(app: typer.Typer) -> None:
 def _verify(
     paths: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="PATH", help="Recordings, other MCAP files, directories, storages.", readable=False
-        ),
+        typer.Argument(metavar="PATH", help="Recordings, directories, storages.", readable=False),
     ],
     replay: Annotated[
         bool, typer.Option("--replay", help="Also replay recordings and compare, bit for bit.")
@@ -103,7 +101,6 @@ def _print_verified(report: VerifyReport) -> None:
         if unread
         else {
             "recording": f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}",
-            "mcap": f"no recording, {counted(report.messages, 'message')}",
             "storage": f"{counted(report.attachments, 'artifact')}",
         }[report.kind]
     )
@@ -127,9 +124,7 @@ def _print_verified(report: VerifyReport) -> None:
 
 
 def _recover(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="An MCAP file, a recording or any other.", readable=False)
-    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="FILE", help="By default FILE.recovered.mcap, beside it."),
@@ -138,7 +133,7 @@ def _recover(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what could be saved.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Save everything good in a damaged file into a new one.
+    """Save everything good in a damaged recording into a new one.
 
     One that its writer did not finish is damaged, too. The file itself is only read. What was lost is said by
     episode and step; an episode that lost steps in the middle becomes several. Exit code 1 only if nothing
@@ -200,10 +195,7 @@ def _summary(report: RecoveryReport) -> str:
         files = "attachment" if report.attachments == 1 else "attachments"
         also = f"; {number(report.attachments)} {files} {where}" if report.attachments else ""
         return f"{report.source}: {lost} could be saved{also}"
-    if report.kind == "mcap":
-        what = f"{counted(report.messages, 'message')} and {counted(report.attachments, 'attachment')}"
-    else:
-        what = f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}"
+    what = f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}"
     state = (
         "nothing was wrong with it" if report.intact else "nothing was lost" if _lost_nothing(report) else ""
     )
@@ -233,8 +225,6 @@ def _losses(report: RecoveryReport) -> list[str]:
         found.append(f"lost: {counted(report.infos_lost, 'info')} of steps")
     if report.frames_lost:
         found.append(f"lost: {counted(report.frames_lost, 'frame')}")
-    for topic, count in report.messages_lost.items():
-        found.append(f"lost: {counted(count, 'message')} of {topic}")
     if report.attachments_lost:
         found.append(f"lost: the attachments {', '.join(report.attachments_lost[:_SHOWN])}")
     if report.journal in _NO_JOURNAL:

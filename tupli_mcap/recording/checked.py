@@ -31,12 +31,8 @@ def message_index(body: memoryview) -> tuple[int, np.ndarray[Any, np.dtype[np.ui
     return channel, np.frombuffer(body[6:], "<u8").reshape(-1, 2)
 
 
-def checked_attachment(
-    source: Source, offset: int, length: int, *, unchecked: bool = False
-) -> AttachmentIndex:
+def checked_attachment(source: Source, offset: int, length: int) -> AttachmentIndex:
     """The facts of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
-
-    `unchecked`: a CRC of 0 says that there is none, as other writers use it.
 
     Raises:
         FormatError: it is damaged.
@@ -44,8 +40,6 @@ def checked_attachment(
     found = attachment_index(source, offset, length)
     crc, position, end = 0, offset + 9, offset + 9 + length - 4
     expected = int.from_bytes(source.read(end, 4), "little")
-    if unchecked and not expected:
-        return found
     while position < end:
         piece = source.read(position, min(_PIECE, end - position))
         crc = zlib.crc32(piece, crc)

@@ -53,7 +53,7 @@ class Problem:
 class VerifyReport:
     """What was verified in a file, and what was found.
 
-    kind: "recording" (ours) or "mcap". state: "complete", "unfinished" (its writer was killed) or "recording" (a
+    kind: "recording" or "storage". state: "complete", "unfinished" (its writer was killed) or "recording" (a
     writer is at work on it). more: problems beyond the first thousand.
     """
 

@@ -1,4 +1,4 @@
-"""`recover_recording`: everything good in a damaged MCAP file, in a new one; what was lost, said exactly."""
+"""`recover_recording`: everything good in a damaged recording, in a new one; what was lost, said exactly."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.recording.repair_foreign import copy_foreign
 from tupli_mcap.recording.repair_frames import OldCameras, frames_lost
 from tupli_mcap.recording.repair_gather import Gathered, gather, is_recording, may_be_recording
 from tupli_mcap.recording.repair_journal import add_journal
@@ -26,6 +25,7 @@ from tupli_mcap.recording.repair_write import RepairWriter
 from tupli_mcap.recording.replacing import replacing, tidy
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.source import PathSource, Source
+from tupli_mcap.recording.summary import OTHER_TOOLS
 from tupli_mcap.recording.survey import Damage, attachment_name
 from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.system import refused
@@ -62,13 +62,12 @@ class CutEpisode(NamedTuple):
 class RecoveryReport:
     """What was found in a file, what was saved of it, and what was lost.
 
-    kind: "recording" (ours) or "mcap" (any other). target: the new file, None if none was written.
+    target: the new file, None if none was written.
     finished: the file has its end; journal: "none", "used", "missing", "damaged" or "stale".
     lost_steps counts rows that are known to have been there; lost names their episodes.
     """
 
     source: str
-    kind: str = "recording"
     target: str | None = None
     finished: bool = True
     journal: str = "none"
@@ -78,7 +77,6 @@ class RecoveryReport:
     attachments: int = 0
     episodes_lost: int = 0
     steps_lost: int = 0
-    messages_lost: dict[str, int] = field(default_factory=dict)
     attachments_lost: list[str] = field(default_factory=list)
     lost: list[LostSteps] = field(default_factory=list)
     cut: list[CutEpisode] = field(default_factory=list)
@@ -129,10 +127,10 @@ def recover_recording(
     dry_run: bool = False,
     compression: str = "zstd",
 ) -> RecoveryReport:
-    """Writes everything good in an MCAP file, ours or not, into a new one. The source is only read.
+    """Writes everything good in a recording into a new one. The source is only read.
 
-    Of a recording of ours, alignment is kept by construction: an episode with a hole becomes several, of consecutive
-    steps each (`schemas/README.md`, Repair). Nothing in the file is executed.
+    Alignment is kept by construction: an episode with a hole becomes several, of consecutive steps each
+    (`schemas/README.md`, Repair). Nothing in the file is executed.
 
     Args:
         target: `<name>.recovered.mcap` beside the source by default.
@@ -141,7 +139,7 @@ def recover_recording(
 
     Raises:
         RecordingError: the source cannot be opened, a writer is at work on it, the target exists or cannot be
-            written. FormatError: the source is no MCAP file, or nothing at all can be read from it.
+            written. FormatError: the source is no recording, or nothing at all can be read from it.
     """
     path = Path(source)
     goal = recovered_path(path) if target is None else Path(target)
@@ -157,7 +155,7 @@ def recover_recording(
         tidy(goal.parent)
         with replacing(goal) as (fd, temporary):
             report = _recover(opened, fd, compression)
-            if report.kind == "recording" and not _signature_fits(temporary):
+            if not _signature_fits(temporary):
                 os.ftruncate(fd, os.lseek(fd, 0, os.SEEK_SET))
                 report = _recover(opened, fd, compression, leave_out=SIGNATURE_NAME)
                 report.attachments_lost = [n for n in report.attachments_lost if n != SIGNATURE_NAME]
@@ -215,42 +213,31 @@ def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") 
     if not source.size:
         raise FormatError(f"{source.name} is empty: nothing can be saved from it; delete it")
     tail = read_tail(source)
-    notes = []
-    if may_be_recording(source, tail):
-        gathered = gather(source, tail)
-        gathered.attachments.pop(leave_out, None)
-        if is_recording(gathered):
-            add_journal(gathered)
-            try:
-                layout = _layout(gathered)
-                return _recover_ours(gathered, layout, Container(fd, source.name, compression))
-            except _UnknownLayoutError as err:
-                notes.append(f"{err}: its messages are copied as they are")
-    report = RecoveryReport(source.name, "mcap", notes=notes)
-    copied = copy_foreign(source, tail, fd, compression)
-    report.damaged = _places(copied.damages)
-    report.finished = tail.finished
-    report.messages, report.attachments = copied.messages, copied.attachments
-    report.messages_lost, report.attachments_lost = copied.lost, copied.attachments_lost
-    report.notes += copied.notes
-    return report
-
-
-class _UnknownLayoutError(Exception):
-    """Why the rows of a recording cannot be understood."""
+    gathered = gather(source, tail) if may_be_recording(source, tail) else None
+    if gathered is None or not is_recording(gathered):
+        raise FormatError(f"{source.name} holds nothing of a tupli_mcap recording ({OTHER_TOOLS})")
+    gathered.attachments.pop(leave_out, None)
+    add_journal(gathered)
+    return _recover_ours(gathered, _layout(gathered), Container(fd, source.name, compression))
 
 
 def _layout(gathered: Gathered) -> tuple[StepLayout, Channels] | None:
-    """The layout and the channels; None if the recording has no step channel and no rows."""
+    """The layout and the channels; None if the recording has no step channel and no rows.
+
+    Raises:
+        FormatError: the spaces are lost, so that its rows cannot be understood.
+    """
+    name = gathered.source.name
+    advice = 'nothing can be saved as a recording ("mcap recover" copies the messages as they are)'
     try:
-        steps = step_channels(gathered.channels, gathered.source.name)
+        steps = step_channels(gathered.channels, name)
         if steps:
             layout = StepLayout.from_metadata(steps[0].metadata)
             return layout, Channels.of(gathered, layout)
     except FormatError as err:
-        raise _UnknownLayoutError(f"the spaces of this recording are damaged ({err})") from err
+        raise FormatError(f"{name}: the spaces of the recording are damaged ({err}); {advice}") from err
     if gathered.pieces:
-        raise _UnknownLayoutError("the spaces of this recording are lost")
+        raise FormatError(f"{name}: the spaces of the recording are lost; {advice}")
     return None
 
 

@@ -27,6 +27,7 @@ from tupli_mcap.recording.crc import crc32
 from tupli_mcap.recording.source import Source
 
 __all__ = [
+    "OTHER_TOOLS",
     "Summary",
     "has_summary",
     "parse_record",
@@ -37,6 +38,7 @@ __all__ = [
 ]
 
 FOOTER_SIZE = 9 + 20
+OTHER_TOOLS = '"mcap doctor" checks other MCAP files, "mcap recover" saves what is good in them'
 _FOOTER = struct.Struct("<BQQQI")
 _RECORD = struct.Struct("<BQ")
 _MAX_SUMMARY = 1 << 31
@@ -214,5 +216,5 @@ def foreign(source: Source, why: str) -> FormatError:
     """The error for an MCAP file that is no recording of ours."""
     return FormatError(
         f"{source.name} is an MCAP file, but no tupli_mcap recording ({why}); expected the profile {PROFILE!r} "
-        "(tupli-mcap verify and recover take any MCAP file)"
+        f"({OTHER_TOOLS})"
     )

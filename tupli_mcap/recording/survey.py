@@ -1,4 +1,4 @@
-"""A walk over the records of any MCAP file, good or bad: what is whole, what is damaged, and where it goes on.
+"""A walk over the records of a file, good or bad: what is whole, what is damaged, and where it goes on.
 
 Nothing is believed: a chunk counts if its CRC is right, an attachment too, any other record if it parses to its last
 byte. After a damaged record the walk goes on at the next place where a record stands; a chunk whose header is damaged
@@ -100,8 +100,6 @@ class Survey:
     Args:
         known: what an index says of the chunks, by offset.
         end: where the data section ends, where that is known.
-        messages: whether Message records outside chunks are records, and CRCs of 0 none, as in files that are not
-            ours.
     """
 
     def __init__(
@@ -110,13 +108,11 @@ class Survey:
         *,
         known: Mapping[int, KnownChunk] | None = None,
         end: int | None = None,
-        messages: bool = False,
     ) -> None:
         self._source = source
         self._known = dict(known or {})
         self._known_offsets = sorted(self._known)
         self._end = source.size if end is None else min(end, source.size)
-        self._messages = messages
         self._budget = 4 * source.size + (64 << 20)  # bytes to be checked in vain while looking for a record
 
     def __iter__(self) -> Iterator[Found | Damage]:
@@ -161,7 +157,7 @@ class Survey:
         return hidden if isinstance(hidden, Found) else why
 
     def _other(self, opcode: int, position: int, length: int) -> Found | str:
-        if opcode == Opcode.MESSAGE and not self._messages:
+        if opcode == Opcode.MESSAGE:
             return "a message is outside of chunks"
         if opcode in _LEAST:
             if length < _LEAST[opcode] or length != _SIZES.get(opcode, length):
@@ -183,7 +179,7 @@ class Survey:
 
     def _attachment(self, position: int, length: int) -> Found | str:
         try:
-            index = checked_attachment(self._source, position, length, unchecked=self._messages)
+            index = checked_attachment(self._source, position, length)
         except FormatError as err:
             self._budget -= length
             return str(err)
@@ -271,7 +267,7 @@ class Survey:
         except FormatError as err:
             self._budget -= packed
             return str(err)
-        if (crc or not self._messages) and zlib.crc32(data) != crc:
+        if zlib.crc32(data) != crc:
             self._budget -= packed + size
             return "the chunk's CRC differs"
         return data
@@ -282,7 +278,7 @@ class Survey:
         if opcode == Opcode.CHUNK:
             at = _CHUNK_HEAD.size
             *_, crc, size = _CHUNK_HEAD.unpack(self._source.read(position + 9, at))
-            if size > 4 or at + size + 8 > length or not (crc or self._messages):
+            if size > 4 or at + size + 8 > length or not crc:
                 return False
             rest = self._source.read(position + 9 + at, size + 8)
             known = rest[:size] in (b"", b"zstd", b"lz4")

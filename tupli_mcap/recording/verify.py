@@ -1,4 +1,4 @@
-"""`verify_recording`: everything that can be wrong with an MCAP file, ours or not. Nothing in it is executed."""
+"""`verify_recording`: everything that can be wrong with a recording. Nothing in it is executed."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ from tupli_mcap.recording.recover import belongs, head
 from tupli_mcap.recording.repair_gather import may_be_recording
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.source import PathSource, Source
-from tupli_mcap.recording.summary import has_summary
+from tupli_mcap.recording.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.recording.verify_episodes import verify_episodes
-from tupli_mcap.recording.verify_foreign import verify_foreign
 from tupli_mcap.recording.verify_frames import verify_frames
 from tupli_mcap.recording.verify_structure import Structure
 
@@ -71,8 +70,7 @@ def _verify(source: Source, findings: Findings) -> None:
     live = source.path is not None and is_locked(source.path)
     tail = read_tail(source)
     if not may_be_recording(source, tail):
-        report.kind = "mcap"
-        verify_foreign(source, tail, findings)
+        findings.error("file", "it is an MCAP file, but no recording of tupli-mcap", advice=OTHER_TOOLS)
         return
     lost = "" if has_summary(source) else _lost_journal(source)
     if not has_summary(source) and (tail.index is None or not lost):
@@ -106,16 +104,16 @@ def _note_unfinished(structure: Structure, lost: str, findings: Findings) -> Non
 def _lost_journal(source: Source) -> str:
     """Why the journal of an unfinished recording is of no use; empty if it is there."""
     if source.path is None:
-        return "there is no journal beside it"
+        return "there is no journal beside it", False
     try:
         metadata = head(source)
     except FormatError:
-        return "which journal is its own is not known"
+        return "which journal is its own is not known", False
     try:
         place = recorded_journal(source.path, metadata)
         info = journal_info(place)
     except FileNotFoundError:
-        return f"there is no journal {f'at {place}' if 'journal' in metadata else 'beside it'}"
+        return f"there is no journal {f'at {place}' if 'journal' in metadata else 'beside it'}", False
     except (OSError, FormatError) as err:
         return f"its journal cannot be read ({err})"
     return "" if belongs(info, metadata) else f"{place.name} is the journal of another recording"
