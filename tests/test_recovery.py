@@ -18,6 +18,7 @@ import pytest
 from environments import Sampler, roll
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
+from typer.testing import CliRunner
 
 from tupli_mcap import (
     FormatError,
@@ -28,7 +29,9 @@ from tupli_mcap import (
     recover_recording,
     verify_recording,
 )
+from tupli_mcap.cli.app import app
 from tupli_mcap.recording import recover
+from tupli_mcap.recording.checksums import with_crc
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.journal import JournalContents, RowArea
 from tupli_mcap.recording.salvage import Salvage
@@ -98,14 +101,96 @@ def test_a_stale_journal_of_another_recording_is_left_alone(tmp_path: Path) -> N
     assert 0 < recording.num_steps < 100
 
 
-def test_a_damaged_journal_leaves_the_chunks_readable(tmp_path: Path) -> None:
+UNREADABLE: dict[str, Callable[[bytes], bytes]] = {
+    "a flipped bit": lambda data: data[:40] + bytes([data[40] ^ 1]) + data[41:],
+    "a later version": lambda data: b"TMCAPJ2\0" + data[8:],
+    "nothing": lambda _: b"",
+    "a part": lambda data: data[: len(data) // 2],
+}
+
+
+@pytest.mark.parametrize("steps", [100, 10])  # with chunks in the file, and without
+@pytest.mark.parametrize("how", UNREADABLE)
+def test_a_journal_that_cannot_be_read_is_not_taken_for_none(how: str, steps: int, tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
-    abandon(path, cart_pole, 100)
-    data = bytearray(journal_path(path).read_bytes())
-    data[20] ^= 255
-    journal_path(path).write_bytes(data)
-    with pytest.warns(UserWarning, match="its journal cannot be read"):
-        assert Recording(path).num_steps > 0
+    abandon(path, cart_pole, steps)
+    whole = Recording(path).read().states
+    journal_path(path).write_bytes(UNREADABLE[how](journal_path(path).read_bytes()))
+    before = {item.name: item.read_bytes() for item in tmp_path.iterdir()}
+    with pytest.raises(
+        FormatError, match=r"its journal cannot be read .*: steps that .*; keep it, and update"
+    ):
+        Recording(path)
+    with pytest.raises(FormatError, match="its journal cannot be read"):
+        cart_pole(path, mode="a")
+    report = verify_recording(path)
+    (problem,) = report.errors
+    assert (report.ok, problem.kind) == (False, "journal")
+    assert "its journal cannot be read" in problem.message
+    assert "tupli-mcap recover" in problem.advice
+    assert "append" not in "".join(p.message + p.advice for p in report.problems)
+    assert {item.name: item.read_bytes() for item in tmp_path.iterdir()} == before
+
+    found = recover_recording(path, attached := tmp_path / "new.mcap")
+    assert (found.journal, found.saved) == ("damaged", steps == 100)
+    assert "the journal cannot be read" in found.notes[0]
+    assert CliRunner().invoke(app, ["recover", str(path), "--force"]).exit_code == (steps == 10)
+    with Recording(attached) as recording:
+        kept = recording.num_steps
+        assert (kept > 0) == (steps == 100)
+        assert kept == 0 or np.array_equal(recording.read().states, whole[:kept])
+    assert {item.name: item.read_bytes() for item in tmp_path.iterdir() if item.name in before} == before
+
+
+def test_beside_a_finished_recording_no_journal_matters(tmp_path: Path) -> None:
+    """But it is kept: it may be that of a recording which was renamed."""
+    path = tmp_path / "r.mcap"
+    with cart_pole(path) as env:
+        roll(env, 10)
+    journal_path(path).write_bytes(b"of another version")
+    assert verify_recording(path).problems == []
+    with (
+        pytest.warns(UserWarning, match=r"r\.mcap\.journal could not be read: .* is kept as r\.mcap\."),
+        cart_pole(path, mode="a") as env,
+    ):
+        roll(env, 5)
+    assert Recording(path).num_steps == 15
+    (kept,) = tmp_path.glob("*.journal")
+    assert kept.read_bytes() == b"of another version"
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_later_format_is_neither_recovered_nor_judged(finished: bool, tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    if finished:
+        with cart_pole(path) as env:
+            roll(env, 300)
+    else:
+        abandon(path, cart_pole, 300)
+    metadata, data = dict(Recording(path).metadata), bytearray(path.read_bytes())
+    data[data.index(b"format_version") + len("format_version") + 4] = ord("3")
+    old, new = (with_crc({**metadata, "format_version": n})["crc"].encode() for n in "13")
+    path.write_bytes(data.replace(old, new, 1))
+    for place in (path, tmp_path / "header.mcap"):  # in the second one the header is damaged
+        if place != path:
+            data = path.read_bytes()
+            place.write_bytes(data[:12] + b"\xff" + data[13:])
+        names = sorted(item.name for item in tmp_path.iterdir())
+        with pytest.raises(
+            FormatError, match=r"expected format version '1' or '2', found '3'; update tupli-mcap"
+        ):
+            recover_recording(place)
+        told = CliRunner().invoke(app, ["recover", str(place)])
+        assert (told.exit_code, told.output.count("update tupli-mcap")) == (1, 1)
+        problem = verify_recording(place).problems[-1]
+        assert (problem.message, problem.advice) == (
+            "expected format version '1' or '2', found '3'",
+            "update tupli-mcap",
+        )
+        assert sorted(item.name for item in tmp_path.iterdir()) == names
+    assert [p.advice for p in verify_recording(path).problems] == ["update tupli-mcap"]
+    with pytest.raises(FormatError, match="update tupli-mcap"):
+        cart_pole(path, mode="a")
 
 
 def test_a_finished_recording_that_was_cut_off(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage.verify import verify_paths, verify_storage
 
+_IN_JOURNAL = "steps that are still in its journal are not verified"
 DO_NOT_CARE = (Opcode.HEADER,)  # the text that says which library wrote it
 
 
@@ -116,16 +117,15 @@ def kill_while_recording(path: Path, steps: int, **options: Any) -> None:
     os.waitpid(pid, 0)
 
 
-@pytest.mark.parametrize("content", ["another", b"", b"nonsense" * 10])
-def test_a_journal_of_no_use_is_not_called_all_there(tmp_path: Path, content: bytes | str) -> None:
+def test_the_journal_of_another_recording_is_told(tmp_path: Path) -> None:
     path, other = tmp_path / "a.mcap", tmp_path / "b.mcap"
     kill_while_recording(path, 5)
     kill_while_recording(other, 5)
-    journal_path(path).write_bytes(journal_path(other).read_bytes() if isinstance(content, str) else content)
+    journal_path(path).write_bytes(journal_path(other).read_bytes())
     code, out, _ = tell("verify", path)
     out = " ".join(out.split())  # lines are broken where paths are long
     assert code == 0
-    assert "all finished steps are there" not in out
+    assert _IN_JOURNAL not in out
     assert "steps not yet in a chunk are not here" in out
     assert "lost: steps not yet in a chunk" in " ".join(tell("recover", path)[1].split())
 
@@ -134,7 +134,7 @@ def test_a_journal_elsewhere_is_found(tmp_path: Path) -> None:
     path, directory = tmp_path / "a.mcap", tmp_path / "journals"
     directory.mkdir()
     kill_while_recording(path, 5, journal_dir=directory)
-    assert "all finished steps are there" in " ".join(tell("verify", path)[1].split())
+    assert _IN_JOURNAL in " ".join(tell("verify", path)[1].split())
     (journal,) = directory.iterdir()
     journal.unlink()
     assert f"there is no journal at {journal}" in " ".join(tell("verify", path)[1].split())
@@ -544,14 +544,14 @@ def test_nothing_to_verify_or_to_replay_is_said(tmp_path: Path) -> None:
 
 def test_a_lost_journal_is_not_called_all_there(tmp_path: Path) -> None:
     path = place(next(iter(UNFINISHED)), tmp_path)
-    assert "all finished steps are there" in tell("verify", path)[1]
+    assert _IN_JOURNAL in " ".join(tell("verify", path)[1].split())
     journal_path(path).unlink()
     _, out, _ = tell("verify", path)
     assert "no journal beside it" in out
     with pytest.warns(UserWarning, match="no journal"):
         found = examine(path)
     for text in (out, *(finding.message for finding in found.findings)):
-        assert "all finished steps are there" not in text
+        assert _IN_JOURNAL not in " ".join(text.split())
 
 
 @pytest.mark.parametrize(

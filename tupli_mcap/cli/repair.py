@@ -23,7 +23,7 @@ _STATES = {"unfinished": "not finished", "recording": "being recorded"}
 _NO_JOURNAL = {
     "missing": "which is not beside the file; if the file was cut off, all that followed too",
     "stale": "which is not the one beside the file",
-    "damaged": "as far as that is damaged",
+    "damaged": "as far as that cannot be read",
 }
 _NOTHING = "nothing to be done"
 _SHOWN = 20  # damaged places, lost episodes: what is beyond is in --json

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,7 +26,7 @@ from tupli_mcap.recording.summary import (
     read_summary,
 )
 
-__all__ = ["Contents", "read_contents"]
+__all__ = ["Contents", "NewerVersionError", "check_version", "read_contents"]
 
 RECORDING_METADATA = "tupli_mcap.recording"
 RECORDING_KEYS = (
@@ -35,6 +36,7 @@ RECORDING_KEYS = (
 CHANNEL_KEYS = (
     "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields", "camera",
 )  # fmt: skip
+_VERSIONS = ("1", "2")
 _ATTEMPTS = 5
 _PAUSE = 0.01  # seconds: a writer begins, ends or goes on within that
 _VALUES = (
@@ -42,6 +44,10 @@ _VALUES = (
     ("created_ns", "a time in decimal digits", re.compile("[0-9]{1,19}")),
     ("next_episode", "a number of an episode", re.compile("[0-9]{1,10}|")),
 )
+
+
+class NewerVersionError(FormatError):
+    """A recording of a format that this version of the package does not know: nothing in it can be judged."""
 
 
 @dataclass
@@ -158,13 +164,20 @@ def is_ours(topic: str) -> bool:
 
 def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
     """The metadata without its checksum; FormatError unless it is whole, and of a format this version reads."""
-    version = found.get("format_version")
-    if version not in ("1", "2"):
-        raise FormatError(
-            f"{source.name}: expected format version '1' or '2', found {version!r}; update tupli-mcap"
-        )
     metadata = check_crc(found, RECORDING_KEYS, f"{source.name}: the metadata record {RECORDING_METADATA!r}")
+    check_version(metadata, source.name)
     for key, what, pattern in _VALUES:
         if not pattern.fullmatch(metadata.get(key, "")):
             raise FormatError(f"{source.name}: expected {key!r} of {what}, found {metadata.get(key)!r:.60}")
     return metadata
+
+
+def check_version(metadata: Mapping[str, str], name: str) -> None:
+    """Raises NewerVersionError unless this version of the package knows the format of a recording with these metadata,
+    which are undamaged."""
+    version = metadata.get("format_version")
+    if version not in _VERSIONS:
+        known = " or ".join(map(repr, _VERSIONS))
+        raise NewerVersionError(
+            f"{name}: expected format version {known}, found {version!r:.40}; update tupli-mcap"
+        )

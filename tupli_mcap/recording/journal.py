@@ -23,6 +23,7 @@ import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
+from uuid import uuid4
 
 import numpy as np
 
@@ -241,11 +242,14 @@ def journal_aside(path: Path, uuid: str) -> Path:
 
 
 def _set_aside(path: Path, uuid: Any, replaced: str) -> None:
-    """Renames the journal of another recording than that of `uuid`; warns unless it is that of `replaced`."""
+    """Renames the journal of another recording than that of `uuid`, or one that cannot be read: whose it is, is not
+    known. Warns, unless it is that of `replaced`."""
     try:
-        found = str(journal_info(path).get("uuid"))
-    except (OSError, FormatError):  # none, or none that can be read
+        found, whose = str(journal_info(path).get("uuid")), "was the journal of another recording"
+    except OSError:  # none
         return
+    except FormatError:
+        found, whose = uuid4().hex, "could not be read: it may be the journal of another recording,"
     if found == uuid or not _UUID.fullmatch(found):
         return
     kept = journal_aside(path, found)
@@ -253,7 +257,7 @@ def _set_aside(path: Path, uuid: Any, replaced: str) -> None:
     if found == replaced:
         return
     warnings.warn(
-        f"{path} was the journal of another recording and is kept as {kept.name}: if that recording was renamed, "
+        f"{path} {whose} and is kept as {kept.name}: if that recording was renamed, "
         "rename its journal accordingly; if it was deleted, delete this too",
         stacklevel=2,
     )
@@ -331,18 +335,13 @@ def read_journal(path: Path, only: Collection[str] | None = None) -> JournalCont
     with _open(path) as file:
         info, areas, length = _read_header(path, file)
         offsets, _ = _place(areas, _HEAD.size + length)
-        size = os.fstat(file.fileno()).st_size
         areas = [area for area in areas if only is None or area.name in only]
         for area in areas:
-            start = offsets[area.name]
-            found = max(0, min(area.size, size - start))
-            if found != area.size:
-                raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {found}")
-            file.seek(start)
-            data[area.name] = found_bytes = np.empty(found, np.uint8)
-            read = file.readinto(found_bytes.data)  # type: ignore[attr-defined]
-            if read != found:
-                raise FormatError(f"{path}: area {area.name!r} expected {found} bytes, found {read}")
+            file.seek(offsets[area.name])
+            data[area.name] = read = np.empty(area.size, np.uint8)
+            size = file.readinto(read.data)  # type: ignore[attr-defined]
+            if size != area.size:
+                raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {size}")
     return JournalContents(info, {area.name: area for area in areas}, data)
 
 
@@ -379,10 +378,16 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], list[Area]
         raise FormatError(f"{path}: expected a journal of this version, found {magic!r} or a damaged header")
     try:
         body = json.loads(text)
-        areas = [_area(entry) for entry in body["areas"]]
-        return dict(body["info"]), areas, length
+        areas, info = [_area(entry) for entry in body["areas"]], dict(body["info"])
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
         raise FormatError(f"{path}: expected areas in the journal's header, found {text[:80]!r}") from err
+    offsets, _ = _place(areas, _HEAD.size + length)
+    size = os.fstat(file.fileno()).st_size
+    for area in areas:
+        if offsets[area.name] + area.size > size:
+            left = max(0, size - offsets[area.name])
+            raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {left}")
+    return info, areas, length
 
 
 def _area(entry: Mapping[str, Any]) -> Area:

@@ -43,8 +43,22 @@ from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import foreign, has_summary, parse_record, records
 from tupli_mcap.system import refused
 
-__all__ = ["belongs", "define", "find_journal", "head", "misplaced_journal", "recover_contents"]
+__all__ = [
+    "KEEP_JOURNAL",
+    "STEPS_IN_JOURNAL",
+    "belongs",
+    "define",
+    "find_journal",
+    "head",
+    "misplaced_journal",
+    "recover_contents",
+]
 
+STEPS_IN_JOURNAL = "steps that are not yet in a chunk are nowhere else"
+KEEP_JOURNAL = (
+    "keep it, and update tupli-mcap if a later version recorded this; tupli-mcap recover writes what the file itself "
+    "holds to a new one"
+)
 _EVENTS = ("events", "info")
 _ATTEMPTS = 100
 
@@ -133,7 +147,7 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
 
     Raises:
         RecordingError: it is there and the system refuses to give it: without it steps would be missing.
-        FormatError: the writer was too fast.
+        FormatError: it is there and cannot be read; or the writer was too fast.
     """
     if source.path is None:
         return None
@@ -163,10 +177,23 @@ def _read(source: Source, path: Path, only: Collection[str] | None = None) -> Jo
         return read_journal(path, only)
     except FileNotFoundError as err:
         return err
+    except FormatError as err:
+        raise _unreadable(source.name, err) from err
     except OSError as err:
         raise RecordingError(
             f"{source.name} was not finished, and its journal {path.name} cannot be read: {refused(err)}"
         ) from err
+
+
+def _unreadable(name: str, err: FormatError) -> FormatError:
+    """The error for an unfinished recording whose journal is there and cannot be read: damaged, or of a later version.
+
+    It is never taken for a missing one: it may hold steps that are nowhere else, and a later version of this package,
+    or a copy of it, may read them.
+    """
+    return FormatError(
+        f"{name} was not finished, and its journal cannot be read ({err}): {STEPS_IN_JOURNAL}; {KEEP_JOURNAL}"
+    )
 
 
 def belongs(info: Mapping[str, Any], metadata: Mapping[str, str]) -> bool:
@@ -192,7 +219,7 @@ def misplaced_journal(path: Path, metadata: Mapping[str, str]) -> Path | None:
 
 def _missing(source: Source, metadata: Mapping[str, str], err: Exception) -> str:
     if not isinstance(err, FileNotFoundError):
-        return f"{source.name}: its journal cannot be read ({err})"
+        return f"{source.name}: its journal is not looked for ({err})"
     expected = Path(str(err.filename))
     elsewhere = None if source.path is None else misplaced_journal(source.path, metadata)
     if elsewhere is not None:
@@ -270,6 +297,7 @@ def _salvage(
     """Takes the rows and records the file does not have out of the journal."""
     store = ChunkStore(source, chunk_table(found, tail.rows), [bytes(r.data) for r in tail.rows], 1 << 24)
     counts = dict(found.counts)
+    topics = {channel.topic: channel.id for channel in found.channels.values()}
     for env, channel in enumerate(steps):
         first = counts.get(channel, 0)
         if layout.constant:
@@ -297,7 +325,6 @@ def _salvage(
             known = max((e[1] + 1 for e in log_records(journal, log, None) if e[0] == channel), default=0)
             state = running_record(journal, log, total, layout)
             if state is not None:
-    topics = {channel.topic: channel.id for channel in found.channels.values()}
                 tail.pending[env], known = state, max(known, total)
         if rows is not None:
             tail.rows.append(rows)
@@ -332,6 +359,7 @@ def _salvage_images(
     journal: JournalContents,
     layout: StepLayout,
     env: int,
+    channels: list[int | None],
     steps: int,
     known: int,
     tail: Unwritten,
@@ -354,7 +382,6 @@ def _salvage_images(
             tail.rows.append(rows)
         pending = salvage.row(steps)
         # where the file is ahead, a live writer may have been writing over that row while it was read
-    channels: list[int | None],
         if pending is None or known < steps or found.counts.get(channel, 0) > steps:
             tail.pending.pop(env, None)
         elif env in tail.pending:

@@ -96,7 +96,8 @@ class RecoveryReport:
     @property
     def saved(self) -> bool:
         """Whether anything could be saved: of a damaged recording, whether a step was."""
-        if self.kind == "recording" and (self.steps_lost or self.lost or self.damaged):
+        journal_lost = self.journal not in ("none", "used")
+        if self.steps_lost or self.lost or self.damaged or journal_lost:
             return self.steps > 0
         return bool(self.messages or self.attachments)
 

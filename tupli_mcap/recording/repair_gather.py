@@ -17,7 +17,13 @@ from tupli_mcap.recording.checked import message_index
 from tupli_mcap.recording.checksums import check_crc
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore, Span
 from tupli_mcap.recording.container import CHUNK_ROWS, MAGIC, PROFILE
-from tupli_mcap.recording.contents import CHANNEL_KEYS, RECORDING_KEYS, RECORDING_METADATA, is_ours
+from tupli_mcap.recording.contents import (
+    CHANNEL_KEYS,
+    RECORDING_KEYS,
+    RECORDING_METADATA,
+    check_version,
+    is_ours,
+)
 from tupli_mcap.recording.headers import ChunkRecords, chunk_records, message_headers
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.salvage import FinalHole
@@ -200,7 +206,11 @@ class PackedStore(ChunkStore):
 
 
 def gather(source: Source, tail: Tail) -> Gathered:
-    """Reads the whole file once, its journal not yet; raises nothing for what is damaged."""
+    """Reads the whole file once, its journal not yet; raises nothing for what is damaged.
+
+    Raises:
+        NewerVersionError: the recording's format is not known.
+    """
     gathered = Gathered(source, tail, Pieces(source))
     if tail.summary is not None:
         gathered.schemas |= tail.summary.schemas
@@ -253,6 +263,8 @@ def _take_metadata(gathered: Gathered, values: dict[str, str], found: Found) -> 
     except FormatError as err:
         end = found.offset + found.length
         gathered.damages.append(Damage(found.offset, end, str(err), Opcode.METADATA))
+    else:
+        check_version(gathered.metadata, gathered.source.name)
 
 
 def _is_whole(gathered: Gathered, channel: Channel, found: Found) -> bool:

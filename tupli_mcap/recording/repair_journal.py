@@ -16,7 +16,7 @@ from tupli_mcap.recording.channels import FRAMES_AREA
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, read_journal, recorded_journal
-from tupli_mcap.recording.recover import belongs, define, misplaced_journal
+from tupli_mcap.recording.recover import STEPS_IN_JOURNAL, belongs, define, misplaced_journal
 from tupli_mcap.recording.repair_gather import Gathered, Piece
 from tupli_mcap.recording.repair_segments import Channels, messages
 from tupli_mcap.recording.rows import RowDeriver
@@ -47,7 +47,7 @@ def add_journal(gathered: Gathered) -> None:
         return
     except (OSError, FormatError) as err:
         gathered.journal = "damaged"
-        gathered.notes.append(f"the journal cannot be read ({err})")
+        gathered.notes.append(f"the journal cannot be read ({err}): {STEPS_IN_JOURNAL}; it is left as it is")
         return
     if not _belongs(gathered, journal):
         if no_step:

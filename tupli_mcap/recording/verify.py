@@ -12,13 +12,14 @@ from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError, TupliError
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
 from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.infos import info_schema
 from tupli_mcap.recording.journal import journal_info, recorded_journal
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.recording.recover import belongs, head
+from tupli_mcap.recording.recover import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head
 from tupli_mcap.recording.repair_gather import may_be_recording
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.source import PathSource, Source
@@ -31,14 +32,14 @@ from tupli_mcap.recording.verify_structure import Structure
 __all__ = ["Problem", "VerifyReport", "verify_recording"]
 
 _ARTIFACT = "artifacts/"
+_UNVERIFIED = "; steps that are still in its journal are not verified: they get a checksum when they leave it"
 _FROM_STORAGE = "load its benchmark from the storage it is in"
 
 
 def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
     """Checks a file: structure, every CRC, indexes against contents, layouts, alignment, digests.
 
-    Of an MCAP file that is none of ours structure, CRCs and indexes are checked. A file that cannot be read is
-    reported, as a problem. Chunks are read one at a time.
+    A file that cannot be read, or is no recording, is reported as a problem. Chunks are read one at a time.
 
     Raises:
         RecordingError: there is no such file.
@@ -54,6 +55,9 @@ def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
         return report
     try:
         _verify(source, findings)
+    except NewerVersionError as err:
+        why, _, advice = str(err).removeprefix(f"{source.name}: ").rpartition("; ")
+        findings.error("file", why, advice=advice)
     except (FormatError, OSError) as err:
         findings.error("file", str(err).removeprefix(f"{source.name}: "))
     finally:
@@ -72,25 +76,29 @@ def _verify(source: Source, findings: Findings) -> None:
     if not may_be_recording(source, tail):
         findings.error("file", "it is an MCAP file, but no recording of tupli-mcap", advice=OTHER_TOOLS)
         return
-    lost = "" if has_summary(source) else _lost_journal(source)
+    lost, unreadable = ("", False) if has_summary(source) else _lost_journal(source)
     if not has_summary(source) and (tail.index is None or not lost):
         report.state = "recording" if live else "unfinished"
     structure = Structure(source, tail, findings, journal_lost=bool(lost))
     structure.run()
     if report.state != "complete":
-        _note_unfinished(structure, lost, findings)
+        _note_unfinished(structure, lost, findings, unreadable=unreadable)
     _contents(source, structure, findings)
     if live and report.state == "complete":
         report.state = "recording"
 
 
-def _note_unfinished(structure: Structure, lost: str, findings: Findings) -> None:
+def _note_unfinished(structure: Structure, lost: str, findings: Findings, *, unreadable: bool) -> None:
     if findings.report.state == "recording":
         findings.note("file", "a writer is at work on it", "verify it again once it is closed")
         return
+    if unreadable:
+        findings.note("file", "its writer did not finish it", "nothing to be done")
+        findings.error("journal", f"{lost}: {STEPS_IN_JOURNAL}", advice=KEEP_JOURNAL)
+        return
     findings.note(
         "file",
-        f"its writer did not finish it{'' if lost else '; all finished steps are there'}",
+        f"its writer did not finish it{'' if lost else _UNVERIFIED}",
         "append to it, or write a finished copy with tupli-mcap recover",
     )
     if lost and structure.channels:  # a journal is made before the channels
@@ -101,8 +109,9 @@ def _note_unfinished(structure: Structure, lost: str, findings: Findings) -> Non
         )
 
 
-def _lost_journal(source: Source) -> str:
-    """Why the journal of an unfinished recording is of no use; empty if it is there."""
+def _lost_journal(source: Source) -> tuple[str, bool]:
+    """Why the journal of an unfinished recording is of no use, and whether it is there and cannot be read; "" if it is
+    of use."""
     if source.path is None:
         return "there is no journal beside it", False
     try:
@@ -111,12 +120,15 @@ def _lost_journal(source: Source) -> str:
         return "which journal is its own is not known", False
     try:
         place = recorded_journal(source.path, metadata)
+    except FormatError as err:
+        return f"its journal is not looked for ({err})", False
+    try:
         info = journal_info(place)
     except FileNotFoundError:
         return f"there is no journal {f'at {place}' if 'journal' in metadata else 'beside it'}", False
     except (OSError, FormatError) as err:
-        return f"its journal cannot be read ({err})"
-    return "" if belongs(info, metadata) else f"{place.name} is the journal of another recording"
+        return f"its journal cannot be read ({err})", True
+    return "" if belongs(info, metadata) else f"{place.name} is the journal of another recording", False
 
 
 def _contents(source: Source, structure: Structure, findings: Findings) -> None:

@@ -14,7 +14,13 @@ from tupli_mcap.messages.layout import CDR_HEADER
 from tupli_mcap.recording.checked import message_index
 from tupli_mcap.recording.checksums import check_crc
 from tupli_mcap.recording.container import CHUNK_ROWS, COMPRESSIONS, MAGIC, PROFILE
-from tupli_mcap.recording.contents import CHANNEL_KEYS, RECORDING_KEYS, RECORDING_METADATA, is_ours
+from tupli_mcap.recording.contents import (
+    CHANNEL_KEYS,
+    RECORDING_KEYS,
+    RECORDING_METADATA,
+    check_version,
+    is_ours,
+)
 from tupli_mcap.recording.findings import Findings, VerifyReport
 from tupli_mcap.recording.headers import ChunkRecords, chunk_records
 from tupli_mcap.recording.index import INDEX_NAME
@@ -81,7 +87,11 @@ class Structure:
     # ---- the data section
 
     def run(self) -> None:
-        """Everything that can be said without knowing the layout."""
+        """Everything that can be said without knowing the layout.
+
+        Raises:
+            NewerVersionError: the recording's format is not known.
+        """
         if self._source.read(0, min(len(MAGIC), self._source.size)) != MAGIC:
             self._findings.error("file", "expected the magic of MCAP at the start", offset=0)
         survey = Survey(self._source, known=self._tail.known_chunks(), end=self._tail.data_end)
@@ -167,7 +177,8 @@ class Structure:
             self._metadata.append(MetadataIndex(found.offset, found.length, record.name))
             self._name(Opcode.METADATA, record.name)
             if record.name == RECORDING_METADATA:
-                self._crc(record.metadata, RECORDING_KEYS, "metadata", found.offset)
+                if self._crc(record.metadata, RECORDING_KEYS, "metadata", found.offset):
+                    check_version(record.metadata, self._source.name)
             elif self._records == 2:
                 self._findings.error(
                     "metadata", f"expected {RECORDING_METADATA!r} first", offset=found.offset
@@ -178,11 +189,14 @@ class Structure:
             self.repeated.add(name)
         self._names.add((opcode, name))
 
-    def _crc(self, values: dict[str, str], known: Sequence[str], kind: str, offset: int) -> None:
+    def _crc(self, values: dict[str, str], known: Sequence[str], kind: str, offset: int) -> bool:
+        """Whether pairs have the checksum they say."""
         try:
             check_crc(values, known, "the metadata")
         except FormatError as err:
             self._findings.error(kind, str(err), offset=offset)
+            return False
+        return True
 
     def _define(self, record: Schema | Channel, offset: int) -> None:
         known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
