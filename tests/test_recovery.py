@@ -15,6 +15,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from counting import calls
 from environments import Sampler, roll
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
@@ -69,6 +70,26 @@ def test_appending_finishes_what_a_killed_writer_left(tmp_path: Path) -> None:
     assert np.array_equal(recording.read().states[:100], before.states)
     assert recording.num_steps == 150
     assert not journal_path(path).exists()
+
+
+def test_appending_does_little_for_each_chunk_that_is_there(tmp_path: Path) -> None:
+    def append(path: Path, steps: int) -> None:
+        env = Sampler(BOX, spaces.Discrete(3), length=1000)
+        with RecordEpisodes(
+            env, path, chunk_size=100, attachments={}, mode="a" if path.exists() else "x"
+        ) as env:
+            roll(env, steps)
+
+    def done(count: int) -> tuple[int, int]:
+        path = tmp_path / f"{count}.mcap"
+        append(path, count)
+        with Recording(path) as recording:
+            chunks = len(recording._contents.table)
+        return calls(lambda: append(path, 1)), chunks
+
+    (few, some), (many, more) = done(200), done(800)
+    assert (many - few) / (more - some) < 50
+    assert verify_recording(tmp_path / "800.mcap").problems == []
 
 
 def test_a_journal_elsewhere(tmp_path: Path) -> None:

@@ -10,11 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mcap.records import ChunkIndex
-
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.container import COMPRESSIONS, Container
+from tupli_mcap.recording.chunks import IN_MEMORY
+from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.durability import sync_file
 from tupli_mcap.recording.imagecodecs import image_codecs
@@ -31,7 +30,7 @@ __all__ = ["restore_container", "resume"]
 
 _ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
 
-_CHUNK_HEAD = struct.Struct("<BQQQ")  # opcode, length, start time, end time
+_TIMES = struct.Struct("<QQ")  # of the first and the last message: what a chunk begins with
 
 
 def resume(writer: RecordingWriter) -> None:
@@ -143,16 +142,15 @@ def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: S
 def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
     """New rows must go on where the old ones end; a power loss, or a lost journal, may leave steps without images."""
     counts: dict[int, int] = {}
-    for row in contents.table:
-        counts[int(row["channel"])] = counts.get(int(row["channel"]), 0) + int(row["rows"])
+    for number, rows in contents.table[["channel", "rows"]].tolist():
+        counts[number] = counts.get(number, 0) + rows
+    topics = {channel.topic: channel.id for channel in contents.channels.values()}
     _check_frames_aligned(writer, contents, counts)
     for channel in contents.channels.values():
         if "leaf" not in channel.metadata:
             continue
-        steps = next(
-            c for c in contents.channels.values() if c.topic == f"{channel.topic.partition('image/')[0]}step"
-        )
-        found, expected = counts.get(channel.id, 0), counts.get(steps.id, 0)
+        steps = topics.get(f"{channel.topic.partition('image/')[0]}step", 0)
+        found, expected = counts.get(channel.id, 0), counts.get(steps, 0)
         if found != expected:
             raise RecordingError(
                 f"{writer.path} lost its end: expected {expected} images in {channel.topic}, found {found}; "
@@ -228,20 +226,5 @@ def restore_container(container: Container, contents: Contents, source: Source) 
     container.counts = dict.fromkeys(container.channels, 0)
     container.attachment_indexes = list(contents.attachments.values())
     container.metadata_indexes = contents.metadata_indexes
-    for row in contents.table[contents.table["offset"] < 1 << 63]:
-        offset, length = int(row["offset"]), int(row["length"])
-        _, _, start, end = _CHUNK_HEAD.unpack(source.read(offset, _CHUNK_HEAD.size))
-        index_length = 9 + int.from_bytes(source.read(offset + length + 1, 8), "little")
-        name = COMPRESSIONS[int(row["compression"])].replace("none", "")
-        index = ChunkIndex(
-            chunk_length=length,
-            chunk_start_offset=offset,
-            compression=name,
-            compressed_size=length - 9 - 40 - len(name),
-            message_end_time=end,
-            message_index_length=index_length,
-            message_index_offsets={int(row["channel"]): offset + length},
-            message_start_time=start,
-            uncompressed_size=int(row["uncompressed"]),
-        )
-        container.note_chunk(index, tuple(int(value) for value in row.tolist()))
+    for row in contents.table[contents.table["offset"] < IN_MEMORY].tolist():
+        container.note_chunk(row, *_TIMES.unpack(source.read(row[0] + 9, _TIMES.size)))

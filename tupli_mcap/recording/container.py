@@ -25,7 +25,6 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    ChunkIndex,
     DataEnd,
     Footer,
     Header,
@@ -345,11 +344,14 @@ class Container:
             begin = end
         return found
 
-    def note_chunk(self, index: ChunkIndex, row: tuple[int, ...]) -> None:
-        """Remembers a chunk that is in the file, for the summary and the episode index."""
-        builder = RecordBuilder()
-        index.write(builder)
-        self._note(_built(builder), index.message_start_time, index.message_end_time, row)
+    def note_chunk(self, row: tuple[int, ...], start: int, end: int) -> None:
+        """Remembers a chunk that is in the file (as CHUNK_ROWS, and its times in ns), for the summary and the index."""
+        offset, length, size, _, rows, _, _, channel, method, _ = row
+        text = COMPRESSIONS[method].replace("none", "").encode()
+        name = len(text).to_bytes(4, "little") + text
+        place = (start, end, offset, length, channel, offset + length, _MESSAGE_INDEX.size + 16 * rows)
+        packed = length - _CHUNK.size - len(name) - 8
+        self._note(_chunk_index(name, place, (packed, size)), start, end, row)
 
     def _note(self, index: bytes, start: int, end: int, row: tuple[int, ...]) -> None:
         self.chunk_indexes.append(index)
