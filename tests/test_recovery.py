@@ -34,7 +34,7 @@ from tupli_mcap.cli.app import app
 from tupli_mcap.recording import recover
 from tupli_mcap.recording.checksums import with_crc
 from tupli_mcap.recording.container import Container
-from tupli_mcap.recording.journal import JournalContents, RowArea
+from tupli_mcap.recording.journal import JournalContents, RowArea, read_journal
 from tupli_mcap.recording.salvage import Salvage
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -605,6 +605,27 @@ def test_killed_again_while_appending_nothing_changes(tmp_path: Path) -> None:
         assert told(path) == known
         recorder(path, mode="a").close()
         assert told(path) == known
+
+
+@pytest.mark.parametrize("time_ns", [2**63, 2**64 - 1])
+def test_times_that_no_index_holds_are_refused(time_ns: int, tmp_path: Path) -> None:
+    """Of steps that are in the journal only, and that a clock beyond the year 2262 was set for."""
+    path = tmp_path / "r.mcap"
+    abandon(path, cart_pole, 10)
+    with Recording(path) as recording:
+        dtype = recording.layout.step_message.dtype
+    journal, data = journal_path(path), bytearray(journal_path(path).read_bytes())
+    found = read_journal(journal).data["steps"].tobytes()
+    rows = np.frombuffer(bytearray(found), dtype)
+    rows["#log_time"][rows["#log_time"] > 0] = time_ns
+    at = data.index(found)
+    data[at : at + len(found)] = rows.tobytes()
+    journal.write_bytes(data)
+    for read in (Recording, recover_recording, lambda path: cart_pole(path, mode="a")):
+        with pytest.raises(FormatError, match=r"times? before 2\^63 ns"):
+            read(path)
+    (problem,) = verify_recording(path).errors
+    assert "before 2^63 ns" in problem.message
 
 
 def test_a_journal_of_fewer_channels_is_refused() -> None:

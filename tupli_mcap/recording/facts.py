@@ -42,15 +42,21 @@ def step_facts(
     """The facts of rows `first:first + count`, a chunk at a time; chunks are cached with `keep`.
 
     Raises:
-        FormatError: a chunk is damaged, or holds rows of another size.
+        FormatError: a chunk is damaged, or holds rows of another size, or with times that no index can hold.
     """
     for span in store.spans(channel, first, count):
         if layout.constant:
             rows = store.rows(span.chunk, layout.step_message.dtype, keep=keep)[span.begin : span.end]
-            yield _constant(rows, layout)
+            facts = _constant(rows, layout)
         else:
             data, places = store.records(span.chunk, keep=keep)
-            yield _variable(memoryview(data), layout, places[span.begin : span.end])
+            facts = _variable(memoryview(data), layout, places[span.begin : span.end])
+        if (facts.time < 0).any():
+            late = int(facts.time.astype(np.uint64).max())
+            raise FormatError(
+                f"expected steps with times before 2^63 ns, found {late}: a clock was set wrong"
+            )
+        yield facts
 
 
 class Run(NamedTuple):

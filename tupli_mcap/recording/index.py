@@ -88,7 +88,10 @@ class IndexBuilder:
                 final_row, len(self.metadata), len(text), number, env, end, has_seed,
             )  # fmt: skip
         except struct.error as err:  # only what was read from a damaged journal
-            raise FormatError(f"episode {number}: its facts do not fit the index: {err}") from err
+            raise FormatError(
+                f"episode {number}: expected times before 2^63 ns, and numbers that fit the index, found a start at "
+                f"{start_time} and an end at {end_time} ns: a clock was set wrong, or the journal is damaged ({err})"
+            ) from err
         self.metadata += text
         self.count += 1
 

@@ -65,9 +65,9 @@ class _Checker:
         firsts, lengths = mine["first_row"].astype(np.int64), mine["length"].astype(np.int64)
         total = self._store.count(channel)
         expected = np.append(0, (firsts + lengths))
-        for i in np.flatnonzero(np.append(firsts, total) != expected).tolist():
-            where = int(expected[i])
-            until = int(np.append(firsts, total)[i])
+        begins = np.append(firsts, total)
+        for i in np.flatnonzero(begins != expected).tolist():
+            where, until = int(expected[i]), int(begins[i])
             self._error("rows", f"rows {where} to {until} belong to no episode", channel=topic)
         if (firsts != expected[:-1]).any():
             return  # what follows would say the same of every episode
