@@ -40,6 +40,8 @@ from tupli_mcap.recording.container import MAGIC
 from tupli_mcap.recording.headers import message_headers
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
 from tupli_mcap.recording.repair_gather import gather
+from tupli_mcap.recording.repair_plan import NewPlaces, make_plan
+from tupli_mcap.recording.repair_segments import Channels
 from tupli_mcap.recording.signature import SIGNATURE_NAME, check_signature, sign_recording
 from tupli_mcap.recording.source import PathSource
 from tupli_mcap.recording.survey import Damage, Found, Survey
@@ -508,6 +510,43 @@ def test_a_chunk_that_comes_late_is_not_held_against_all_others(tmp_path: Path) 
         return calls(lambda: recover_recording(path, dry_run=True))
 
     assert grows(done, 150) < 1.3
+
+
+class Looked(int):
+    """A number that counts how often it is held against another one."""
+
+    times = 0
+
+    def __gt__(self, other: int) -> bool:
+        Looked.times += 1
+        return int(self) > other
+
+    def __rsub__(self, other: int) -> int:
+        Looked.times += 1
+        return other - int(self)
+
+
+def test_a_step_is_not_held_against_each_piece_of_its_episode(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", steps=20, length=20)
+    source = PathSource(path)
+    gathered = gather(source, read_tail(source))
+    layout = Recording(path).layout
+    (whole,) = make_plan(gathered, gathered.store(), layout, Channels.of(gathered, layout)).episodes
+    source.close()
+
+    def looked(count: int) -> int:
+        places = NewPlaces(
+            whole._replace(number=i, segment=whole.segment._replace(step=Looked(10 * i), steps=6))
+            for i in range(count)
+        )
+        Looked.times = 0
+        for step in range(10 * count):
+            piece, at = divmod(step, 10)
+            assert places.find(0, step) == (None if at >= 6 else (piece, at))
+            assert places.find(0, step, state=True) == (None if at > 6 else (piece, at))
+        return Looked.times
+
+    assert grows(looked, 50) < 1.5
 
 
 def test_rows_are_taken_once(tmp_path: Path) -> None:
