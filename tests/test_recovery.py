@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from counting import calls
+from counting import calls, grows
 from environments import Sampler, roll
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
@@ -31,10 +31,14 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording import recover
 from tupli_mcap.recording.checksums import with_crc
 from tupli_mcap.recording.container import Container
+from tupli_mcap.recording.durability import checksum
+from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.journal import JournalContents, RowArea, read_journal
+from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.salvage import Salvage
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -626,6 +630,46 @@ def test_times_that_no_index_holds_are_refused(time_ns: int, tmp_path: Path) -> 
             read(path)
     (problem,) = verify_recording(path).errors
     assert "before 2^63 ns" in problem.message
+
+
+def move_starts(journal: Path) -> None:
+    """Lets the starts in a journal say that their episodes begin a row later."""
+    data, found = bytearray(journal.read_bytes()), read_journal(journal)
+    events = found.data["events"].tobytes()
+    base = data.index(events) + 64
+    channel = found.info["channels"][3]
+    for start, end, number, _, _ in iter_records(
+        memoryview(events)[64 : 64 + int.from_bytes(events[:8], "little")]
+    ):
+        if number == channel:
+            record = memoryview(data)[base + start : base + end]
+            told = EpisodeStart.decode(record[BODY:])
+            record[BODY:] = told._replace(first_row=told.first_row + 1).encode()
+            record[23:31] = checksum(record).to_bytes(8, "little")
+    journal.write_bytes(data)
+
+
+def test_starts_that_are_wrong_are_not_each_looked_for_in_all_rows(tmp_path: Path) -> None:
+    """Each says that its episode of two steps begins with the second one."""
+
+    def done(episodes: int) -> int:
+        path = tmp_path / f"{episodes}.mcap"
+
+        def run(path: Path) -> None:
+            env = RecordEpisodes(Sampler(spaces.Text(3), spaces.Discrete(3), length=2), path, attachments={})
+            for seed in range(episodes):
+                env.reset(seed=seed)
+                env.step(0)
+                env.step(0)
+            os.kill(os.getpid(), 9)
+
+        abandon(path, run, 0)
+        move_starts(journal_path(path))
+        with Recording(path) as recording:
+            assert [len(episode) for episode in recording.episodes] == [1] * episodes
+        return calls(lambda: Recording(path).close())
+
+    assert grows(done, 40) < 1.3
 
 
 def test_a_journal_of_fewer_channels_is_refused() -> None:
