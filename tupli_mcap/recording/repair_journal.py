@@ -209,8 +209,8 @@ def _add_images(gathered: Gathered, salvage: Salvage, leaf: Leaf, channel: int, 
     pieces = []
     for rows in salvage.runs(lambda numbers: gathered.lacks(channel, numbers) & (numbers < stop)):
         rows["#publish_time"] = rows["#log_time"]
-        data = rows.view(np.uint8).tobytes()
-        pieces.append(_piece(gathered, int(rows["#sequence"][0]), len(rows), data))
+        first = int(rows["#sequence"][0])
+        pieces.append(_piece(gathered, first, len(rows), rows.view(np.uint8).tobytes()))
     gathered.add(channel, pieces)
     running = salvage.row(stop)
     data: bytes | None = None if running is None else leaf.as_values(running["data"]).tobytes()
