@@ -361,7 +361,7 @@ class TestRecord:
 
         monkeypatch.setattr(TyperGroup, "parse_args", interrupted)
         result = CliRunner().invoke(app, ["ls"])
-        assert (result.exit_code, result.stderr) == (1, "error: interrupted\n")
+        assert (result.exit_code, result.stderr) == (130, "interrupted\n")
 
     def test_ctrl_c_keeps_what_was_recorded(self, here: Path) -> None:
         args = [TOOL, "record", "CartPole-v1", "-o", "a.mcap", "--steps", "100000000"]
@@ -372,10 +372,37 @@ class TestRecord:
                 time.sleep(0.01)
             process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=30)
-        assert (process.returncode, err) == (1, "error: interrupted\n")
         with Recording("a.mcap") as recording:
             assert recording.complete
             assert recording.num_steps > 0
+            held = f"{len(recording):,} episodes, {recording.num_steps:,} steps"
+        assert (process.returncode, err) == (130, f"interrupted; a.mcap holds {held}\n")
+
+    @pytest.mark.parametrize(("limits", "files"), [((), 1), (("--max-bytes", 20_000), 3)])
+    def test_ctrl_c_says_what_is_safe(self, here: Path, limits: tuple[object, ...], files: int) -> None:
+        policy = f"stopping_in_{files}"
+        Path(f"{policy}.py").write_text(
+            "left = [0] * 20_000\n"
+            "def act(state):\n"
+            "    if not left: raise KeyboardInterrupt\n"
+            "    return left.pop()\n"
+        )
+        if files == 1:
+            Path("a_0001.mcap").write_text("not of this recording")
+        args = ("-o", "a.mcap", "--steps", 30_000, "--policy", f"{policy}:act", *limits)
+        result = run("record", "CartPole-v1", *args)
+        paths = [Path("a.mcap"), *(Path(f"a_{i:04}.mcap") for i in range(1, files))]
+        episodes = sum(item["episodes"] for item in run("ls", *paths, "--json").json)
+        held = "a.mcap holds" if files == 1 else "a.mcap to a_0002.mcap hold"
+        assert (result.code, result.out) == (130, "")
+        assert result.err == f"interrupted; {held} {episodes:,} episodes, 20,000 steps\n"
+
+    def test_ctrl_c_before_anything_is_recorded(self, here: Path) -> None:
+        Path("early.py").write_text("def act(state):\n    raise KeyboardInterrupt\n")
+        args = ("record", "CartPole-v1", "-o", "a.mcap", "--policy", "early:act")
+        result = run(*args)
+        assert (result.code, result.out, result.err) == (130, "", "interrupted; nothing was recorded\n")
+        assert list(here.glob("a.mcap*")) == []
 
 
 # --- ls, info, episodes ---
@@ -570,7 +597,7 @@ class TestLook:
         (told,) = run("episodes", "a.mcap", "--json").json
         assert told["metadata"] == {"score": {"$float": "nan"}, "at": 0.5, "name": "a\nb\x1b[31m"}
         out = ok("episodes", "a.mcap")
-        assert "score=nan, at=0.5, name=a�b�[31m" in out  # nothing in a file moves the cursor
+        assert r"score=nan, at=0.5, name=a\nb\x1b[31m" in out  # nothing in a file moves the cursor
 
 
 # --- what is no recording ---

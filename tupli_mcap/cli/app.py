@@ -1,7 +1,7 @@
 """The application: its commands, and the one place where errors become a line and an exit code.
 
-Exit codes: 0, 1 (it failed, or found something), 2 (usage). Only light modules are imported here; each command
-imports what it calls, so that help and completion stay quick.
+Exit codes: 0, 1 (it failed, or found something), 2 (usage), 130 (Ctrl-C). Only light modules are imported here; each
+command imports what it calls, so that help and completion stay quick.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import contextlib
 import errno
 import os
 import sys
-import traceback
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
@@ -29,12 +28,20 @@ from tupli_mcap.cli import (
     trusting,
     viewing,
 )
-from tupli_mcap.cli.output import warnings_in_one_line
+from tupli_mcap.cli.terminal import (
+    fail,
+    flush,
+    print_traceback,
+    say,
+    say_interrupted,
+    stop_writing,
+    warnings_in_one_line,
+)
 from tupli_mcap.errors import FilterError, RecordingError, TupliError, UntrustedError
 
 __all__ = ["app", "main"]
 
-FAILED, USAGE = 1, 2
+FAILED, USAGE, INTERRUPTED = 1, 2, 130  # 128 + SIGINT, as shells have it
 
 
 class _Group(TyperGroup):
@@ -56,10 +63,10 @@ class _Group(TyperGroup):
         try:
             with warnings_in_one_line():
                 code = super().main(words, prog_name, complete_var, False, windows_expand_args, **extra)
-            sys.stdout.flush()
+            flush()
         except BaseException as err:  # noqa: BLE001 - what is no error of ours is raised again
             if debug and not isinstance(err, SystemExit):
-                traceback.print_exc()
+                print_traceback(err)
             code = _report(err)
         if not standalone_mode:
             return code
@@ -75,7 +82,7 @@ class _Group(TyperGroup):
 
 
 class _InterruptedError(TupliError):
-    """The user pressed Ctrl-C."""
+    """The user pressed Ctrl-C; the message is what the command has to say about that, which may be nothing."""
 
 
 @contextlib.contextmanager
@@ -84,7 +91,7 @@ def _before_typer() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as err:
-        raise _InterruptedError from err
+        raise _InterruptedError(*err.args) from err
 
 
 def _report(err: BaseException) -> int:
@@ -93,11 +100,12 @@ def _report(err: BaseException) -> int:
     code = FAILED
     if isinstance(err, OSError) and err.errno == errno.EPIPE:
         # The reader of our output has seen enough. Nothing may be written to it at exit either.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        stop_writing()
         return FAILED
     if isinstance(err, _InterruptedError | KeyboardInterrupt):
-        message = "interrupted"
-    elif isinstance(err, FilterError):
+        say_interrupted("; ".join(filter(None, ("interrupted", message))))
+        return INTERRUPTED
+    if isinstance(err, FilterError):
         code = USAGE  # filters come from the command line only
     elif isinstance(err, UntrustedError):  # each command that may raise it has the option
         message = message.replace("pass trust=True", "pass --trust")
@@ -113,7 +121,7 @@ def _report(err: BaseException) -> int:
             message = f"{message.rstrip('.')}; see {context.command_path} --help"
     elif not isinstance(err, TupliError):
         raise err
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    fail(message)
     return code
 
 
@@ -131,7 +139,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        print(f"tupli-mcap {version('tupli-mcap')}")
+        say(f"tupli-mcap {version('tupli-mcap')}")
         raise typer.Exit
 
 
@@ -146,10 +154,10 @@ def _root(
     """Record reinforcement-learning episodes as MCAP files, look at them, share them.
 
     Commands that print tables print JSON with --json. Exit codes: 0, 1 (it failed, or found
-    something), 2 (usage).
+    something), 2 (usage), 130 (Ctrl-C).
     """
     if context.invoked_subcommand is None:
-        print(context.get_help())
+        say(*context.get_help().split("\n"))
 
 
 recordings.register(app)
@@ -166,4 +174,8 @@ rendering.register(app)
 
 def main() -> None:
     """The console entry point."""
-    app()
+    try:
+        app()
+    except Exception as err:  # noqa: BLE001 - a bug of ours, whose message may hold a text of a file
+        print_traceback(err)
+        sys.exit(FAILED)

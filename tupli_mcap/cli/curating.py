@@ -9,6 +9,7 @@ import typer
 
 from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import Column, bytes_of, counted, number, print_json, print_table
+from tupli_mcap.cli.terminal import say
 
 __all__ = ["register"]
 
@@ -104,6 +105,4 @@ def _plain(report: Any) -> dict[str, Any]:
 def _say(report: Any, dry_run: bool) -> None:
     size = "" if dry_run else f", {bytes_of(report.size)}"
     would = "would write " if dry_run else ""
-    print(
-        f"{would}{report.path}: {counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}{size}"
-    )
+    say(f"{would}{report.path}: {counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}{size}")

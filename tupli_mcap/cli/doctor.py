@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tupli_mcap.cli.options import FilterText, Json, filter_of
-from tupli_mcap.cli.output import Column, number, print_json, print_table, print_wrapped, short_ids, visible
+from tupli_mcap.cli.output import Column, number, print_json, print_table, print_wrapped, short_ids
+from tupli_mcap.cli.terminal import say, say_styled, status
 
 if TYPE_CHECKING:
     from tupli_mcap.doctor import Diagnosis, Finding, Severity
@@ -79,7 +78,7 @@ def _doctor(
     for name in [*(check or ()), *(skip or ())]:
         if name not in CHECKS:
             raise typer.BadParameter(f"there is no check {name!r}; see tupli-mcap doctor --list")
-    with _status() as progress:
+    with status("examining") as progress:
         diagnosis = examine(
             paths or ["."],
             checks=check,
@@ -127,21 +126,6 @@ def _print_checks(as_json: bool) -> None:
     print_table((Column("CHECK"), Column("FINDS", shrink="end")), rows, empty="")
 
 
-@contextmanager
-def _status() -> Iterator[Callable[[str], None] | None]:
-    """Gives a function that shows the name of a recording; None where stderr is no terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.text import Text
-
-    with Console(stderr=True).status("") as status:
-        yield lambda name: status.update(
-            Text(f"examining {visible(name)}", overflow="ellipsis", no_wrap=True)
-        )
-
-
 def _print(diagnosis: Diagnosis, level: Severity) -> None:
     several = diagnosis.files > 1
     groups: dict[tuple[object, ...], list[Finding]] = {}
@@ -151,7 +135,7 @@ def _print(diagnosis: Diagnosis, level: Severity) -> None:
         groups.setdefault((finding.severity, finding.check, finding.leaf, own), []).append(finding)
     for group in groups.values():
         _print_group(group, several)
-        print()
+        say("")
     counts = [
         f"{number(count)} {name}{'s' if count != 1 and name != 'info' else ''}"
         for name in ("error", "warning", "info")
@@ -166,18 +150,14 @@ def _print(diagnosis: Diagnosis, level: Severity) -> None:
         )
     )
     verdict = "healthy" if diagnosis.healthy else ""
-    print(f"{', '.join([*([verdict] if verdict else []), *counts])}: {files}, {episodes}, {steps}")
+    say(f"{', '.join([*([verdict] if verdict else []), *counts])}: {files}, {episodes}, {steps}")
 
 
 def _print_group(group: Sequence[Finding], several: bool) -> None:
-    from rich.console import Console
-    from rich.text import Text
-
     first = group[0]
     severity = str(first.severity)
-    title = visible(" · ".join([first.check, *([] if first.leaf is None else [first.leaf])]))
-    line = Text(f"{severity:<{_INDENT}}", _STYLES[severity]).append(title, "bold")
-    Console(highlight=False, soft_wrap=True).print(line)
+    title = " · ".join([first.check, *([] if first.leaf is None else [first.leaf])])
+    say_styled((f"{severity:<{_INDENT}}", _STYLES[severity]), (title, "bold"))
     if several and first.check != "unreadable":  # which names the file itself
         _print_wrapped(f"{short_ids(first.path)}:")
     _print_wrapped(first.message)

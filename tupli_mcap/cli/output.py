@@ -1,17 +1,15 @@
-"""How results are printed: tables that fit the terminal, facts, JSON, progress, warnings."""
+"""How results are printed: tables that fit the terminal, facts, JSON, numbers and times."""
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
 import re
-import sys
 import textwrap
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Any, Literal, NamedTuple
+
+from tupli_mcap.cli.terminal import say, say_json, say_styled, terminal_width, visible
 
 __all__ = [
     "Column",
@@ -24,17 +22,12 @@ __all__ = [
     "print_table",
     "print_wrapped",
     "short_ids",
-    "step_progress",
-    "terminal_width",
     "time_of",
-    "visible",
-    "warnings_in_one_line",
     "when",
 ]
 
 _GAP = "  "
 _WIDEST = 100  # columns of running text
-_ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _LONG_ID = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{20,52}\b")
 
 
@@ -46,23 +39,13 @@ class Column(NamedTuple):
     shrink: Literal["start", "end"] | None = None
 
 
-def terminal_width() -> int | None:
-    """The width that output has to fit (columns); None where it is no terminal: then nothing is cut."""
-    if os.environ.get("COLUMNS", "").isdecimal():
-        return int(os.environ["COLUMNS"])
-    try:
-        return os.get_terminal_size(sys.stdout.fileno()).columns
-    except (OSError, ValueError):
-        return None
-
-
 def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], *, empty: str) -> None:
     """Print rows under titles, or the sentence `empty` if there are none."""
     from rich.cells import cell_len
 
     cells = [[visible(cell) for cell in row] for row in rows]
     if not cells:
-        print(empty)
+        say(empty)
         return
     # A column without any value says nothing.
     shown = [i for i in range(len(columns)) if any(row[i] for row in cells)]
@@ -80,7 +63,7 @@ def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], *, emp
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:
     """Print `label  value` lines; long values go on below themselves."""
-    pairs = [(label, visible(value)) for label, value in facts]
+    pairs = [(visible(label), visible(value)) for label, value in facts]
     indent = max(len(label) for label, _ in pairs) + len(_GAP)
     width = terminal_width()
     for label, value in pairs:
@@ -88,26 +71,25 @@ def print_facts(facts: Iterable[tuple[str, str]]) -> None:
         if width is not None:
             lines = textwrap.wrap(value, max(20, width - indent), break_on_hyphens=False) or [""]
         for i, line in enumerate(lines):
-            print(f"{label if i == 0 else '':<{indent}}{line}")
+            say(f"{label if i == 0 else '':<{indent}}{line}")
 
 
 def print_wrapped(text: str, first: str, others: str) -> None:
     """Print a text in lines that fit the terminal, at most 100 columns: `first` begins its first, `others` the next."""
     width = terminal_width()
     if width is None:
-        print(first + visible(text))
+        say(first + text)
         return
     room = max(30, min(width, _WIDEST))
-    print(
-        textwrap.fill(
-            visible(text),
-            room,
-            initial_indent=first,
-            subsequent_indent=others,
-            break_on_hyphens=False,
-            break_long_words=False,
-        )
+    lines = textwrap.wrap(
+        visible(text),
+        room,
+        initial_indent=first,
+        subsequent_indent=others,
+        break_on_hyphens=False,
+        break_long_words=False,
     )
+    say(*(lines or [""]))
 
 
 def print_json(value: Any) -> None:
@@ -116,41 +98,7 @@ def print_json(value: Any) -> None:
 
     from tupli_mcap.messages.jsonvalue import dumps_plain
 
-    print(json.dumps(json.loads(dumps_plain(value)), indent=2, ensure_ascii=False))
-
-
-@contextlib.contextmanager
-def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int], None] | None]:
-    """Gives a function to be told of the steps done; None where stderr is no terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    shown = (BarColumn(), MofNCompleteColumn(), TextColumn("steps"), TimeRemainingColumn())
-    with Progress(TextColumn(what), *shown, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("steps", total=total)
-        yield lambda done: progress.update(task, completed=min(done, total))
-
-
-@contextlib.contextmanager
-def warnings_in_one_line() -> Iterator[None]:
-    """Warnings become `warning: ...` on stderr, each once; those for programmers are not shown."""
-    said: set[str] = set()
-
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        text = " ".join(_ANSI.sub("", str(message)).removeprefix("WARN: ").split())
-        if text not in said:
-            said.add(text)
-            print(f"warning: {text}", file=sys.stderr)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        for ignored in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
-            warnings.simplefilter("ignore", ignored)
-        warnings.showwarning = show
-        yield
+    say_json(json.dumps(json.loads(dumps_plain(value)), indent=2, ensure_ascii=False))
 
 
 # --- values as text ---
@@ -216,11 +164,6 @@ def when(created_at: str) -> str:
         return created_at
 
 
-def visible(text: str) -> str:
-    """Without what would move the cursor or break the line: texts come from files."""
-    return "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text)
-
-
 def _fit(columns: Sequence[Column], widths: list[int]) -> None:
     """Narrow the columns that may shrink until the table fits, the widest first."""
     limit = terminal_width()
@@ -262,12 +205,8 @@ def _cut(text: str, width: int, end: Literal["start", "end"]) -> str:
 
 def _print_lines(lines: Sequence[str]) -> None:
     """The first in bold; rich takes too long for the many others."""
-    from rich.console import Console
-    from rich.text import Text
-
     width = terminal_width()
     if width is not None:
         lines = [_cut(line, width, "end") for line in lines]
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(Text(lines[0], style="bold"))
-    print("\n".join(lines[1:]))
+    say_styled((lines[0], "bold"))
+    say(*lines[1:])

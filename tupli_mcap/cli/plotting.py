@@ -9,6 +9,7 @@ import typer
 
 from tupli_mcap.cli.options import FilterText, Json, filter_of
 from tupli_mcap.cli.output import bytes_of, counted, print_json
+from tupli_mcap.cli.terminal import say
 from tupli_mcap.errors import RecordingError
 
 __all__ = ["register"]
@@ -62,4 +63,4 @@ def _plot(
         told = {"path": str(goal), "size": size, "recordings": len(made.measured), "episodes": episodes}
         print_json({**told, "steps": steps, "notes": made.notes})
     else:
-        print(f"{goal}: {counted(episodes, 'episode')}, {counted(steps, 'step')}, {bytes_of(size)}")
+        say(f"{goal}: {counted(episodes, 'episode')}, {counted(steps, 'step')}, {bytes_of(size)}")

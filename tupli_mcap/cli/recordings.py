@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from enum import StrEnum
@@ -21,15 +22,15 @@ from tupli_mcap.cli.output import (
     print_json,
     print_table,
     short_ids,
-    step_progress,
-    terminal_width,
     time_of,
     when,
 )
 from tupli_mcap.cli.sparklines import print_sketch
+from tupli_mcap.cli.terminal import fail, say, step_progress, terminal_width
+from tupli_mcap.errors import TupliError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from tupli_mcap.recording.describe import RecordingDescription, Spread
     from tupli_mcap.schema import EpisodeHeader
@@ -132,7 +133,7 @@ def _record(
 
     Modules (of a policy, or an ENV_ID such as my_envs:Maze-v0) are looked for in the current directory too,
     after the installed ones.
-    Ctrl-C ends the recording early; what was recorded stays.
+    Ctrl-C ends the recording early; what was recorded stays, and how much that is is said.
     """
     if every > 1 and not frames:
         raise typer.BadParameter("--every says of how many steps frames are recorded; give --frames too")
@@ -145,7 +146,7 @@ def _record(
     if policy is not None or ":" in env_id:
         sys.path.append("")  # last: a file that happens to lie here replaces no installed module
     function = None if policy is None else load_policy(policy)
-    with step_progress(steps) as progress:
+    with _saying_what_is_safe(output, max_bytes or max_seconds), step_progress(steps) as progress:
         summary = record_rollouts(
             env_id,
             output,
@@ -175,7 +176,36 @@ def _record(
         *_mean_text(summary),
         f"{bytes_of(summary.size)} in {summary.seconds:.1f} s",
     ]
-    print(f"{summary.paths[0]}{last}: {', '.join(facts)}")
+    say(f"{summary.paths[0]}{last}: {', '.join(facts)}")
+
+
+@contextlib.contextmanager
+def _saying_what_is_safe(output: Path, limit: float | None) -> Iterator[None]:
+    """Adds to Ctrl-C what the recording holds by now; with a limit, the files it went on in count too."""
+    try:
+        yield
+    except KeyboardInterrupt as err:
+        raise KeyboardInterrupt(_held(output, limit)) from err
+
+
+def _held(output: Path, limit: float | None) -> str:
+    from tupli_mcap.recording import Recording
+    from tupli_mcap.recording.rotation import series
+
+    first, others = (output, {}) if limit is None else series(output)
+    paths = [path for path in (first, *others.values()) if path.exists()]
+    episodes = steps = 0
+    try:
+        for path in paths:
+            with Recording(path) as recording:
+                episodes += len(recording)
+                steps += recording.num_steps
+    except TupliError as err:
+        return str(err)
+    if not paths:
+        return "nothing was recorded"
+    files = f"{paths[0]} holds" if len(paths) == 1 else f"{paths[0]} to {paths[-1].name} hold"
+    return f"{files} {counted(episodes, 'episode')}, {counted(steps, 'step')}"
 
 
 def _mean_text(summary: RolloutSummary) -> list[str]:
@@ -225,7 +255,7 @@ def _ls(
             print_table(columns, rows, empty="no recordings")
     bad = [item for item in found if item.error is not None]
     for item in bad:
-        print(f"error: {item.error}", file=sys.stderr)
+        fail(item.error or "")
     if bad:
         raise typer.Exit(1)
 
@@ -254,10 +284,10 @@ def _info(
         print_json({**asdict(description), "channels": channels, **_spreads(description)})
         return
     if description.channels:
-        print()
+        say("")
         _print_channels(description)
     if description.attachments:
-        print()
+        say("")
         print_table(
             (Column("ATTACHMENT", shrink="end"), Column("TYPE"), Column("SIZE", "right")),
             [(short_ids(a["name"]), a["media_type"], bytes_of(a["size"])) for a in description.attachments],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -13,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tupli_mcap.cli.options import FilterText, Json, filter_of
-from tupli_mcap.cli.output import bytes_of, counted, number, print_json, step_progress
+from tupli_mcap.cli.output import bytes_of, counted, number, print_json
+from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -141,18 +141,17 @@ def _plain(report: RenderReport) -> dict[str, object]:
 def _print(report: RenderReport) -> None:
     if report.path is not None:
         rendered = sum(1 for episode in report.episodes if episode.frames)
-        print(
+        say(
             f"{report.path}: {counted(report.frames, 'frame')} of {counted(rendered, 'episode')}, "
             f"{report.width} x {report.height}, {report.fps:.4g} a second, "
             f"{bytes_of(report.path.stat().st_size)} in {report.seconds:.1f} s"
         )
     if report.signature_left_out:
-        print("its signature is left out: it is of the recording without these frames")
+        say("its signature is left out: it is of the recording without these frames")
     for skipped in report.skipped:
-        print(
-            f"error: {counted(skipped.episodes, 'episode')} cannot be replayed, the first is {skipped.first}: "
-            f"{skipped.reason}",
-            file=sys.stderr,
+        fail(
+            f"{counted(skipped.episodes, 'episode')} cannot be replayed, the first is {skipped.first}: "
+            f"{skipped.reason}"
         )
     if report.divergence is not None:
         kept = (
@@ -163,4 +162,4 @@ def _print(report: RenderReport) -> None:
             else f"the {number(report.frames)} before it are kept"
         )
         hint = f". {report.divergence.hint}" if report.divergence.hint else ""
-        print(f"error: {report.divergence}; no frames from there on, {kept}{hint}", file=sys.stderr)
+        fail(f"{report.divergence}; no frames from there on, {kept}{hint}")

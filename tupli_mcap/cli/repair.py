@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +11,7 @@ import typer
 from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import Column, bytes_of, counted, number, print_json, print_table, print_wrapped
 from tupli_mcap.cli.replaying import Replays, episode_numbers
+from tupli_mcap.cli.terminal import fail, say
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.findings import VerifyReport
@@ -76,17 +76,12 @@ def _verify(
     if as_json:
         print_json({**found.to_json(), **({} if replays is None else {"replays": replays.to_json()})})
     elif not found.files:
-        print(
-            "error: there is nothing to verify; give recordings (.mcap) or directories of them",
-            file=sys.stderr,
-        )
+        fail("there is nothing to verify; give recordings (.mcap) or directories of them")
         raise typer.Exit(1)
     elif len(found.files) > 1:
-        print(f"{number(len(found.files))} verified, {number(len(found.damaged))} damaged")
+        say(f"{number(len(found.files))} verified, {number(len(found.damaged))} damaged")
     if replays is not None and not replays.tried and not as_json:
-        print(
-            "error: nothing was replayed: there is no undamaged recording; recover one first", file=sys.stderr
-        )
+        fail("nothing was replayed: there is no undamaged recording; recover one first")
     if not found.ok or (replays is not None and not replays.ok):
         raise typer.Exit(1)
 
@@ -108,16 +103,16 @@ def _print_verified(report: VerifyReport) -> None:
     count = sum(problem.severity == "error" for problem in roots) + report.more
     damage = counted(count, "problem")
     state = "" if report.state == "complete" else f", {_STATES[report.state]}"
-    print(f"{report.path}: {'ok' if report.ok else damage} ({facts}{state})")
+    say(f"{report.path}: {'ok' if report.ok else damage} ({facts}{state})")
     for problem in roots[:_SHOWN]:
         place = f"{problem.place}: " if problem.place else ""
         print_wrapped(f"{problem.severity}: {place}{problem.message}", "  ", "    ")
     if len(roots) > _SHOWN or report.more:
-        print(f"  ... and {number(len(roots) - min(_SHOWN, len(roots)) + report.more)} more; see --json")
+        say(f"  ... and {number(len(roots) - min(_SHOWN, len(roots)) + report.more)} more; see --json")
     followers = len(report.problems) - len(roots)
     if followers:
         follow = f"{'follows' if followers == 1 else 'follow'} from {'that' if len(roots) == 1 else 'these'}"
-        print(f"  ({number(followers)} more {follow}; see --json)")
+        say(f"  ({number(followers)} more {follow}; see --json)")
     for advice in dict.fromkeys(problem.advice for problem in roots if problem.advice != _NOTHING):
         file = f" {shlex.quote(report.path)}" if advice == RECOVER else ""
         print_wrapped(f"→ {advice}{file}", "  ", "    ")
@@ -167,7 +162,7 @@ def _print_recovery(report: RecoveryReport) -> None:
                 if lost.episode == episode
             ]
             rows.append((str(episode), ", ".join(steps), ", ".join(pieces.get(episode, [])) or "nothing"))
-        print()
+        say("")
         columns = (
             Column("EPISODE", "right"),
             Column("STEPS LOST", shrink="end"),
@@ -176,7 +171,7 @@ def _print_recovery(report: RecoveryReport) -> None:
         print_table(columns, rows[:_SHOWN], empty="")
         _print_rest(len(rows))
     if report.damaged:
-        print()
+        say("")
         columns = (Column("OFFSET", "right"), Column("SIZE", "right"), Column("DAMAGE", shrink="end"))
         places = [(str(place.offset), bytes_of(place.size), place.why) for place in report.damaged]
         print_table(columns, places[:_SHOWN], empty="")
@@ -185,7 +180,7 @@ def _print_recovery(report: RecoveryReport) -> None:
 
 def _print_rest(count: int) -> None:
     if count > _SHOWN:
-        print(f"... and {number(count - _SHOWN)} more; see --json")
+        say(f"... and {number(count - _SHOWN)} more; see --json")
 
 
 def _summary(report: RecoveryReport) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import textwrap
 import time
 from collections.abc import Sequence
@@ -11,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from tupli_mcap.cli.output import counted, number, step_progress, terminal_width, visible
+from tupli_mcap.cli.output import counted, number
+from tupli_mcap.cli.terminal import fail, say, step_progress, terminal_width, visible
 from tupli_mcap.errors import TupliError
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class Replays:
         except TupliError as err:
             self._found.append((path, None, str(err)))
             if not quiet:
-                print(f"error: {' '.join(str(err).split())}", file=sys.stderr)
+                fail(str(err))
             return
         self._found.append((path, found, ""))
         if not quiet:
@@ -87,11 +87,11 @@ class Replays:
 
 def _print_lines(head: str, lines: Sequence[str]) -> None:
     width = terminal_width()
-    print(visible(head))
+    say(head)
     for line in map(visible, lines):
         parts = [line] if width is None else textwrap.wrap(line, max(40, width - 4), break_on_hyphens=False)
         for i, part in enumerate(parts):
-            print(f"{'  ' if i == 0 else '    '}{part}")
+            say(f"{'  ' if i == 0 else '    '}{part}")
 
 
 def _outcome(c: Certificate) -> str:

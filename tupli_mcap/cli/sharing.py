@@ -18,6 +18,7 @@ from tupli_mcap.cli.options import (
     open_storage,
 )
 from tupli_mcap.cli.output import bytes_of, counted, number, print_facts, print_json
+from tupli_mcap.cli.terminal import ask_secret, say
 
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
@@ -138,7 +139,7 @@ def _import(
         print_json({"dry_run": dry_run, **preview._asdict(), "signed_by": signed_by})
         return
     verb = "would import" if dry_run else "imported"
-    print(
+    say(
         f"{verb} {number(preview.new_episodes)} of {counted(preview.episodes, 'episode')}, "
         f"{number(preview.new_artifacts)} of {counted(preview.artifacts, 'artifact')}"
     )
@@ -149,7 +150,6 @@ def _import(
 def _signing_key(path: Path) -> SigningKey:
     """The private key in a file; asks for its passphrase where it needs one and somebody is there."""
     import os
-    import sys
 
     from tupli_mcap.signing import PassphraseNeededError, SigningKey
 
@@ -157,9 +157,10 @@ def _signing_key(path: Path) -> SigningKey:
     try:
         return SigningKey(path, passphrase)
     except PassphraseNeededError:
-        if passphrase is not None or not sys.stdin.isatty():
+        answer = None if passphrase is not None else ask_secret(f"Passphrase of {path}")
+        if answer is None:
             raise
-    return SigningKey(path, typer.prompt(f"Passphrase of {path}", hide_input=True, err=True))
+    return SigningKey(path, answer)
 
 
 def _print_written(path: Path, as_json: bool) -> None:
@@ -169,6 +170,6 @@ def _print_written(path: Path, as_json: bool) -> None:
     if as_json:
         print_json(item._asdict())
     else:
-        print(
+        say(
             f"{path}: {counted(item.episodes, 'episode')}, {counted(item.steps, 'step')}, {bytes_of(item.size)}"
         )

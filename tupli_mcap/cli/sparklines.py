@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from tupli_mcap.cli.output import Column, number, print_table, print_wrapped, terminal_width, visible
+from tupli_mcap.cli.output import Column, number, print_table, print_wrapped
+from tupli_mcap.cli.terminal import can_print, say, terminal_width
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Recording
@@ -51,24 +51,24 @@ def print_sketch(recording: Recording) -> None:
     found = sketch(recording, max(_NARROWEST, min(_WIDEST, room)))
     if not found.courses:
         return
-    print()
+    say("")
     _print("EPISODES", "FIRST TO LAST", found.courses, zero_based=False)
     if found.distributions:
-        print()
+        say("")
         _print("STEPS", "LEAST TO MOST", found.distributions, zero_based=True)
         told = "" if found.sampled == recording.num_steps else f"{number(found.sampled)} steps sampled"
         hidden = f"{number(found.hidden)} more dimensions" if found.hidden else ""
         if told or hidden:
-            print(", ".join(filter(None, (hidden, told))))
+            say(", ".join(filter(None, (hidden, told))))
         odd = [f"{number(one.odd)} of {one.name}" for one in found.distributions if one.odd]
         if odd:
             print_wrapped(f"not finite, left out: {', '.join(odd)}", "", "")
     if found.error:
-        print(f"no step is shown: {visible(found.error)}")
+        say(f"no step is shown: {found.error}")
 
 
 def _print(title: str, spark: str, series: Sequence[Series], *, zero_based: bool) -> None:
-    blocks = BLOCKS if _is_printable(BLOCKS) else PLAIN
+    blocks = BLOCKS if can_print(BLOCKS) else PLAIN
     columns = (Column(title, shrink="end"), Column(spark), Column("LEAST", "right"), Column("MOST", "right"))
     rows = [
         (
@@ -79,11 +79,3 @@ def _print(title: str, spark: str, series: Sequence[Series], *, zero_based: bool
         for one in series
     ]
     print_table(columns, rows, empty="")
-
-
-def _is_printable(text: str) -> bool:
-    try:
-        text.encode(sys.stdout.encoding or "ascii")
-    except (UnicodeEncodeError, LookupError):
-        return False
-    return True

@@ -27,6 +27,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.recordings import print_episodes
+from tupli_mcap.cli.terminal import say
 
 __all__ = ["register"]
 
@@ -145,7 +146,7 @@ def _compact(
         if left:
             print(f"would remove {counted(len(left), 'temporary file')} of killed processes")
         return
-    print(
+    say(
         f"rewrote {counted(len(found), 'recording')}, freed {bytes_of(freed)}"
         if found or left
         else "nothing to compact"
@@ -163,4 +164,4 @@ def _reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False)
     if as_json:
         print_json({"storage": str(storage_path), "episodes": episodes})
     else:
-        print(f"{storage_path}: {counted(episodes, 'episode')}")
+        say(f"{storage_path}: {counted(episodes, 'episode')}")

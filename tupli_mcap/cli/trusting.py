@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import bytes_of, print_facts, print_json, visible
+from tupli_mcap.cli.output import bytes_of, print_facts, print_json
+from tupli_mcap.cli.terminal import say
 
 if TYPE_CHECKING:
     from tupli_mcap.environment import PickleImports
@@ -77,7 +78,7 @@ def _trust_key(text: str, name: str | None, *, as_json: bool) -> None:
     if as_json:
         print_json({"fingerprint": fingerprint(key.public_key), "name": name or key.name})
     else:
-        print(visible(f"what {fingerprint(key.public_key)} {name or key.name} signs is trusted"))
+        say(f"what {fingerprint(key.public_key)} {name or key.name} signs is trusted")
 
 
 def _untrust(
@@ -111,7 +112,7 @@ def _untrust(
     if as_json:
         print_json({label: shown, "was_trusted": was_trusted})
     else:
-        print(f"{shown} {'is trusted no longer' if was_trusted else 'was not trusted'}")
+        say(f"{shown} {'is trusted no longer' if was_trusted else 'was not trusted'}")
 
 
 def _list(*, as_json: bool) -> None:
@@ -125,7 +126,7 @@ def _list(*, as_json: bool) -> None:
         return
     lines = [f"environment  {digest}" for digest in digests]
     lines += [f"key          {key['fingerprint']} {key['name']}" for key in keys]
-    print("\n".join(map(visible, lines)) or "nothing is trusted")
+    say(*(lines or ["nothing is trusted"]))
 
 
 def _json_of(code: CarriedCode) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import typer
 
 from tupli_mcap.cli.options import FilterText, filter_of
 from tupli_mcap.cli.output import bytes_of
+from tupli_mcap.cli.terminal import flush, say
 
 __all__ = ["register"]
 
@@ -102,7 +103,7 @@ def _replay(
         path = viewer.save(
             sources, save, episode, filter=wanted, form=form, force=force, tell=commands.append
         )
-        print(f"{path}: {bytes_of(path.stat().st_size)}; open it with: {commands[0]}")
+        say(f"{path}: {bytes_of(path.stat().st_size)}; open it with: {commands[0]}")
     elif web:
         viewer.serve(sources, episode, filter=wanted, form=form, tell=_tell)
     else:
@@ -110,7 +111,8 @@ def _replay(
 
 
 def _tell(url: str) -> None:
-    print(f"{url}\nopen it in a browser; Ctrl-C ends it", flush=True)
+    say(url, "open it in a browser; Ctrl-C ends it")
+    flush()
 
 
 def _copy(
@@ -120,5 +122,5 @@ def _copy(
 
     made = to_mcap(sources, target, episode, filter=wanted, layout=layout, force=force)
     size = bytes_of(made.recording.stat().st_size)
-    print(f"{made.recording}: {size}; open it with: rerun {shlex.quote(str(made.recording))}")
-    print(f"{made.layout}: for Foxglove: open the copy, then import this as a layout")
+    say(f"{made.recording}: {size}; open it with: rerun {shlex.quote(str(made.recording))}")
+    say(f"{made.layout}: for Foxglove: open the copy, then import this as a layout")
