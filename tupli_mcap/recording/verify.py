@@ -229,7 +229,11 @@ def _benchmark(recording: Recording, findings: Findings) -> None:
         why = f"it carries benchmark {told['id']!r:.70}, its episodes are of {recording.benchmark_id!r:.70}"
         findings.error("benchmark", why)
     carried = [name for name in recording.attachments if name.startswith(_ARTIFACT)]
-    missing = [item for item in told.get("artifacts", []) if _ARTIFACT + str(item) not in carried]
+    artifacts = told.get("artifacts", [])
+    if not isinstance(artifacts, list):
+        findings.error("benchmark", f"expected a list of artifacts, found {artifacts!r:.70}")
+        return
+    missing = [item for item in artifacts if _ARTIFACT + str(item) not in carried]
     if carried and missing:
         findings.error(
             "benchmark", f"it lacks artifacts of its benchmark: {', '.join(map(str, missing))[:200]}"
