@@ -96,9 +96,30 @@ def print_json(value: Any) -> None:
     """Print a value as one JSON document: NumPy values as numbers and lists, NaN as `{"$float": "nan"}`."""
     import json
 
-    from tupli_mcap.messages.jsonvalue import dumps_plain
+    from tupli_mcap.messages.jsonvalue import MAX_DEPTH, dumps_plain
 
-    say_json(json.dumps(json.loads(dumps_plain(value)), indent=2, ensure_ascii=False))
+    try:
+        text = dumps_plain(value)
+    except (TypeError, ValueError):
+        text = dumps_plain(_printable(value, MAX_DEPTH // 2))
+    say_json(json.dumps(json.loads(text), indent=2, ensure_ascii=False))
+
+
+def _printable(value: Any, levels: int) -> Any:
+    """A value with text in place of what has no JSON, or is nested deeper: it must not hide all the others."""
+    from tupli_mcap.messages.jsonvalue import dumps_plain, shown
+
+    if levels and isinstance(value, dict):
+        return {_printable(key, 0): _printable(item, levels - 1) for key, item in value.items()}
+    if levels and isinstance(value, list | tuple):
+        return [_printable(item, levels - 1) for item in value]
+    if isinstance(value, dict | list | tuple):
+        return shown(value)
+    try:
+        dumps_plain(value)
+    except (TypeError, ValueError):
+        return shown(value)
+    return value
 
 
 # --- values as text ---
@@ -160,7 +181,7 @@ def when(created_at: str) -> str:
     """The same for an ISO 8601 time; one that is none is shown as it is."""
     try:
         return datetime.fromisoformat(created_at).astimezone().strftime("%Y-%m-%d %H:%M:%S")
-    except ValueError:
+    except (ValueError, OverflowError):  # the year 1 in another zone
         return created_at
 
 

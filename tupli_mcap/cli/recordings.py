@@ -361,7 +361,11 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
 def _short(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
-    return value if isinstance(value, str) else repr(value)
+    if isinstance(value, str):
+        return value
+    from tupli_mcap.messages.jsonvalue import shown
+
+    return shown(value)
 
 
 def _spreads(description: RecordingDescription) -> dict[str, dict[str, float] | None]:

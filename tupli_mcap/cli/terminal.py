@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
-_NOT_ASCII = re.compile(r"[^\n -~]")
+_UNUSUAL = re.compile(r"[^\n -~]")
 
 
 def visible(text: str) -> str:
@@ -82,8 +82,11 @@ def say_styled(*parts: tuple[str, str]) -> None:
 
 def say_json(text: str) -> None:
     """Print a JSON document, its lines as they are; in its strings, characters become `\\u` escapes."""
-    plain = _is_plain if can_print(text) else str.isascii
-    _write(sys.stdout, _NOT_ASCII.sub(lambda m: m[0] if plain(m[0]) else _json_escaped(m[0]), text) + "\n")
+    raw = can_print(text)
+    _write(
+        sys.stdout,
+        _UNUSUAL.sub(lambda m: m[0] if raw and _is_plain(m[0]) else _json_escaped(m[0]), text) + "\n",
+    )
 
 
 def _json_escaped(char: str) -> str:

@@ -30,7 +30,7 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 
-__all__ = ["MAX_DEPTH", "dumps", "dumps_any", "dumps_plain", "loads"]
+__all__ = ["MAX_DEPTH", "dumps", "dumps_any", "dumps_plain", "loads", "shown"]
 
 MAX_DEPTH = 64
 """Deepest nesting of values."""
@@ -71,22 +71,23 @@ def dumps_any(value: Any) -> str:
     itself) the `repr` of the entry.
     """
     try:
-        return dumps(value, fallback=_describe)
+        return dumps(value, fallback=shown)
     except ValueError:
         if type(value) is not dict:
-            return dumps(_describe(value))
-    return dumps({key: _shallow(item) for key, item in value.items()}, fallback=_describe)
+            return dumps(shown(value))
+    return dumps({key: _shallow(item) for key, item in value.items()}, fallback=shown)
 
 
 def _shallow(value: Any) -> Any:
     try:
-        dumps([value], fallback=_describe)
+        dumps([value], fallback=shown)
     except ValueError:
-        return _describe(value)
+        return shown(value)
     return value
 
 
-def _describe(value: Any) -> str:
+def shown(value: Any) -> str:
+    """Return the `repr` of any value at all, or the name of its type if it has none (an integer of 5,000 digits)."""
     try:
         return repr(value)
     except Exception:  # noqa: BLE001 (somebody else's code, and nothing depends on it)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.messages.jsonvalue import shown
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.about import plain, send_about
 from tupli_mcap.viewer.arrange import blueprint_of
@@ -189,7 +190,7 @@ def _episode_told(recording: Recording, position: int) -> str:
     steps = "1 step" if len(episode) == 1 else f"{len(episode):,} steps"
     facts = f"**Episode {episode.number}**: {steps}, return {episode.return_:.6g}, {episode.end}{seed}"
     metadata = "".join(
-        f"\n- {plain(key)}: {plain(repr(value))}" for key, value in list(episode.metadata.items())[:20]
+        f"\n- {plain(key)}: {plain(shown(value))}" for key, value in list(episode.metadata.items())[:20]
     )
     return f"{facts}\n{metadata}"
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.messages.jsonvalue import shown
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.blocks import Block
@@ -104,7 +105,7 @@ def _texts(title: str, roots: Sequence[str], entity: str) -> Any:
 
 
 def _shown(value: Any) -> str:
-    text = value if isinstance(value, str) else repr(value)
+    text = value if isinstance(value, str) else shown(value)
     text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]} … ({len(text):,} characters)"
     return text.encode("utf-8", "replace").decode()
 
