@@ -636,7 +636,7 @@ def test_torch_tensors(cart: tuple[TupliDataset, Taken]) -> None:
 @pytest.mark.parametrize(
     ("module", "parser", "install"),
     [
-        ("torch", TorchTupleParser, r"tupli-mcap\[torch\]"),
+        ("torch", TorchTupleParser, r"pip install .*\[torch\]"),
         ("tensorflow", TensorflowTupleParser, "pip install tensorflow"),
     ],
 )
@@ -650,7 +650,7 @@ def test_missing_libraries_are_named(
 
 def test_missing_pandas_is_named(cart: tuple[TupliDataset, Taken], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(MissingExtraError, match=r"tupli-mcap\[pandas\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install .*\[pandas\]"):
         cart[0].convert_to_dataframe()
 
 

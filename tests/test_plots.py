@@ -34,6 +34,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli import app
 from tupli_mcap.cli.sparklines import PLAIN, sparkline
+from tupli_mcap.errors import install_line
 from tupli_mcap.plots import Report, gather, report
 from tupli_mcap.plots.draw_coverage import most_varying
 from tupli_mcap.plots.draw_trace import by_scale
@@ -733,10 +734,7 @@ def test_without_matplotlib_the_extra_is_named(cartpole: Path, tmp_path: Path) -
 
     done = tool("plot", cartpole)
     assert (done.returncode, done.stdout) == (1, "")
-    assert (
-        done.stderr
-        == "error: reports need matplotlib: pip install 'tupli-mcap[plot]' (or pip install matplotlib)\n"
-    )
+    assert done.stderr == f"error: reports need matplotlib: {install_line('plot')}\n"
     assert "Cart Position" in tool("info", cartpole).stdout  # needs none of it
 
 

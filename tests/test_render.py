@@ -410,7 +410,7 @@ class TestBadInput:
             return real(name, *args, **kwargs)
 
         monkeypatch.setattr(builtins, "__import__", without)
-        with pytest.raises(MissingExtraError, match=r"tupli-mcap\[video\]"):
+        with pytest.raises(MissingExtraError, match=r"pip install .*\[video\]"):
             render(path, tmp_path / "film.mp4")
         assert render(path, tmp_path / "film.gif").ok
 

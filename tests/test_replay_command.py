@@ -19,6 +19,7 @@ import pytest
 
 from tupli_mcap import FileStorage, MissingExtraError, RecordEpisodes, Recording, TupliEnvWrapper, viewer
 from tupli_mcap.cli import app
+from tupli_mcap.errors import install_line
 from tupli_mcap.viewer import targets
 from tupli_mcap.viewer.sdk import ViewerError
 
@@ -234,7 +235,7 @@ def test_without_rerun_the_error_names_the_extra(folder: Path, tmp_path: Path) -
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
-    assert done.stderr == "error: looking at recordings needs rerun-sdk: pip install 'tupli-mcap[rerun]'\n"
+    assert done.stderr == f"error: looking at recordings needs rerun-sdk: {install_line('rerun')}\n"
     assert issubclass(MissingExtraError, ImportError)
 
 

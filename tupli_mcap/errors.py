@@ -5,6 +5,8 @@ Every message is one sentence: what was expected, what was found, where, and wha
 
 from __future__ import annotations
 
+from pathlib import Path
+
 __all__ = [
     "FilterError",
     "FormatError",
@@ -17,6 +19,8 @@ __all__ = [
     "StorageError",
     "TupliError",
     "UntrustedError",
+    "install_line",
+    "missing_extra",
 ]
 
 
@@ -65,3 +69,37 @@ class SignatureError(TupliError):
 
 class MissingExtraError(TupliError, ImportError):
     """An optional dependency is not installed; the message names the extra to install."""
+
+
+def missing_extra(what: str, extra: str) -> MissingExtraError:
+    """The error to raise where an extra is not installed; `what` says what needs which package."""
+    return MissingExtraError(f"{what}: {install_line(extra)}")
+
+
+def install_line(extra: str) -> str:
+    """The command that installs an extra, from where this package came: an index, a checkout, a directory, a file."""
+    import shlex
+
+    checkout = Path(__file__).absolute().parents[1]
+    try:
+        own = 'name = "tupli-mcap"\n' in (checkout / "pyproject.toml").read_text()
+    except (OSError, UnicodeDecodeError):
+        own = False
+    if own:
+        return f"pip install -e {shlex.quote(f'{checkout}[{extra}]')}"
+    origin = _origin() or "tupli-mcap"
+    return f"pip install {shlex.quote(f'{origin}[{extra}]')}"
+
+
+def _origin() -> str | None:
+    """The directory or file that pip installed this package from; None where it was an index."""
+    import json
+    from importlib.metadata import PackageNotFoundError, distribution
+    from urllib.parse import unquote, urlsplit
+
+    try:
+        url = urlsplit(json.loads(distribution("tupli-mcap").read_text("direct_url.json") or "{}")["url"])
+    except (PackageNotFoundError, ValueError, KeyError):
+        return None
+    path = unquote(url.path)
+    return path if url.scheme == "file" and Path(path).exists() else None

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from tupli_mcap import trust
-from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
+from tupli_mcap.errors import NotFoundError, SignatureError, missing_extra
 from tupli_mcap.system import refused
 
 if TYPE_CHECKING:
@@ -200,7 +200,5 @@ def _cryptography() -> _Library:
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError as err:
-        raise MissingExtraError(
-            "signatures of bundles need the package cryptography; pip install 'tupli-mcap[sign]'"
-        ) from err
+        raise missing_extra("signatures of bundles need the package cryptography", "sign") from err
     return _Library(InvalidSignature, UnsupportedAlgorithm, serialization, ed25519)

@@ -11,7 +11,7 @@ from tupli_mcap.dataset.columns import pick
 from tupli_mcap.dataset.loading import Selected
 from tupli_mcap.dataset.parsers import BaseTupleParser
 from tupli_mcap.dataset.tuples import Tuples
-from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.errors import missing_extra
 from tupli_mcap.messages.step import StepLayout
 
 if TYPE_CHECKING:
@@ -72,9 +72,7 @@ def import_pandas() -> Any:
     try:
         import pandas
     except ImportError as err:
-        raise MissingExtraError(
-            "a DataFrame needs pandas, which is not installed; pip install 'tupli-mcap[pandas]'"
-        ) from err
+        raise missing_extra("a DataFrame needs pandas", "pandas") from err
     return pandas
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.errors import MissingExtraError, missing_extra
 
 __all__ = ["BaseTupleParser", "NumpyTupleParser", "TensorflowTupleParser", "TorchTupleParser", "map_columns"]
 
@@ -61,9 +61,7 @@ class TorchTupleParser(BaseTupleParser):
         try:
             import torch  # type: ignore[import-not-found, unused-ignore]
         except ImportError as err:
-            raise MissingExtraError(
-                "tensors need PyTorch, which is not installed; pip install 'tupli-mcap[torch]'"
-            ) from err
+            raise missing_extra("tensors need PyTorch", "torch") from err
         obs, act, rew, term, trunc = NumpyTupleParser.parse_lists(obs, act, rew, term, trunc)
         return (
             map_columns(torch.from_numpy, obs),

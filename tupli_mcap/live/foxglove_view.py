@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.errors import missing_extra
 from tupli_mcap.live.target import Target
 from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA, RECORD_HEADER
 from tupli_mcap.recording.imagecodecs import CODEC
@@ -35,9 +35,7 @@ class FoxgloveView:
         try:
             import foxglove
         except ImportError as err:
-            raise MissingExtraError(
-                "a live view in Foxglove needs foxglove-sdk: pip install 'tupli-mcap[foxglove]'"
-            ) from err
+            raise missing_extra("a live view in Foxglove needs foxglove-sdk", "foxglove") from err
         self._sdk = foxglove
         self._context = foxglove.Context()
         self._writer = writer

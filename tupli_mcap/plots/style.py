@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
-from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.errors import missing_extra
 
 __all__ = [
     "BLUE", "ENDS", "GREY", "INK", "SERIES", "VERMILION", "colours", "cut", "drawable", "legend_above", "number_text",
@@ -70,9 +70,7 @@ def styled() -> Iterator[None]:
     try:
         import matplotlib as mpl
     except ImportError as err:
-        raise MissingExtraError(
-            "reports need matplotlib: pip install 'tupli-mcap[plot]' (or pip install matplotlib)"
-        ) from err
+        raise missing_extra("reports need matplotlib", "plot") from err
     settings: Any = {name: value for name, value in mpl.rcParamsDefault.items() if not name.startswith(_KEPT)}
     with mpl.rc_context(settings | _RC):
         yield

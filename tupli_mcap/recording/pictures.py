@@ -7,7 +7,7 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, missing_extra
 
 __all__ = [
     "FrameFormat",
@@ -53,9 +53,7 @@ def _pillow() -> Any:
     try:
         from PIL import Image
     except ImportError as err:
-        raise MissingExtraError(
-            "pictures need Pillow; install the extra: pip install 'tupli-mcap[frames]'"
-        ) from err
+        raise missing_extra("pictures need Pillow", "frames") from err
     return Image
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, TypeVar
 
-from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, missing_extra
 from tupli_mcap.system import refused
 
 __all__ = ["Source", "open_regular", "open_source"]
@@ -256,7 +256,7 @@ def _open_url(url: str) -> Source:
     try:
         import fsspec
     except ImportError as err:
-        raise MissingExtraError(f"reading {url} needs fsspec; pip install 'tupli-mcap[remote]'") from err
+        raise missing_extra(f"reading {url} needs fsspec", "remote") from err
     try:
         file: Any = fsspec.open(url, "rb", block_size=1 << 18, cache_type="readahead").open()
     except Exception as err:  # each of fsspec's file systems raises errors of its own

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import MissingExtraError, RecordingError
+from tupli_mcap.errors import RecordingError, missing_extra
 from tupli_mcap.recording.pictures import Picture, resized
 
 __all__ = ["Indexed", "check_movie", "write_movie"]
@@ -32,7 +32,7 @@ def _av() -> Any:
     try:
         import av
     except ImportError as err:
-        raise MissingExtraError("MP4 needs PyAV; install the extra: pip install 'tupli-mcap[video]'") from err
+        raise missing_extra("MP4 needs PyAV", "video") from err
     return av
 
 

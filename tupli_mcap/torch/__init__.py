@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.errors import missing_extra
 
 try:
     import torch  # noqa: F401
 except ImportError as err:
-    raise MissingExtraError(
-        "tupli_mcap.torch needs PyTorch, which is not installed; pip install 'tupli-mcap[torch]'"
-    ) from err
+    raise missing_extra("tupli_mcap.torch needs PyTorch", "torch") from err
 
 from tupli_mcap.torch.episodes import Episodes
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.dataset import TupliDataset
-from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.errors import missing_extra
 from tupli_mcap.sampling import SamplingError, Steps
 
 try:
@@ -28,9 +28,7 @@ try:
         TransitionMiniBatch,
     )
 except ImportError as err:
-    raise MissingExtraError(
-        "tupli_mcap.torch.d3rlpy needs d3rlpy, which is not installed; pip install 'tupli-mcap[d3rlpy]'"
-    ) from err
+    raise missing_extra("tupli_mcap.torch.d3rlpy needs d3rlpy", "d3rlpy") from err
 
 __all__ = ["RecordedBuffer", "RecordedEpisode", "RecordedReplayBuffer", "mdp_dataset", "replay_buffer"]
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.errors import missing_extra
 from tupli_mcap.sampling import SamplingError, Transitions
 from tupli_mcap.sampling.transitions import TRANSITION_FIELDS
 from tupli_mcap.torch.items import check_state
@@ -18,9 +18,7 @@ try:
     from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer
     from torchrl.data.replay_buffers.storages import Storage
 except ImportError as err:
-    raise MissingExtraError(
-        "tupli_mcap.torch.rl needs TorchRL, which is not installed; pip install 'tupli-mcap[torchrl]'"
-    ) from err
+    raise missing_extra("tupli_mcap.torch.rl needs TorchRL", "torchrl") from err
 
 __all__ = ["RecordedStorage", "replay_buffer"]
 

@@ -9,7 +9,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from tupli_mcap.errors import MissingExtraError, TupliError
+from tupli_mcap.errors import TupliError, missing_extra
 
 __all__ = ["OLDEST", "ViewerError", "import_quickly", "rerun_sdk"]
 
@@ -29,14 +29,12 @@ def rerun_sdk() -> Any:
     try:
         import rerun
     except ImportError as err:
-        raise MissingExtraError(
-            "looking at recordings needs rerun-sdk: pip install 'tupli-mcap[rerun]'"
-        ) from err
+        raise missing_extra("looking at recordings needs rerun-sdk", "rerun") from err
     found = getattr(rerun, "__version__", None)
     if found is None or version_of(found) < OLDEST:
-        raise MissingExtraError(
-            f"expected rerun-sdk {'.'.join(map(str, OLDEST))} or later, found {found or 'another package'}: "
-            "pip install -U 'tupli-mcap[rerun]'"
+        oldest = ".".join(map(str, OLDEST))
+        raise missing_extra(
+            f"expected rerun-sdk {oldest} or later, found {found or 'another package'}", "rerun"
         )
     return rerun
 
