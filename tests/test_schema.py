@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,64 @@ class TestTuples:
         step = RLTuple(state=state, action=1, reward=0.5)
         assert step.state is state
         assert (step.info, step.terminal, step.timeout) == ({}, False, False)
+
+    @pytest.mark.parametrize(
+        "make",
+        [
+            lambda n: np.float32([n, 2]),
+            lambda n: {"a": np.full((2, 2), n), "b": [np.zeros(n), "x"]},
+            lambda n: ([np.array([n])], 1.0),
+            lambda n: np.array([np.zeros(n), "x"], object),
+            lambda n: np.array(["a" * n]),
+            lambda n: np.float64(n),
+            lambda n: (None, "text" * n),
+            lambda n: np.array([np.nan, n]),
+            lambda n: {"a": float("nan"), "b": n},
+        ],
+    )
+    def test_tuples_are_equal_where_their_values_are(self, make: Callable[[int], Any]) -> None:
+        step, same, other = (
+            RLTuple(state=make(n), action=make(n), reward=1.0, info={"x": make(n)}) for n in (3, 3, 4)
+        )
+        assert (step == same) is True
+        assert (step == other) is False
+        assert (step != other) is True
+        assert [step] == [same] != [other]
+        for name in ("state", "action", "info"):
+            assert step != step.model_copy(update={name: getattr(other, name)})
+
+    @pytest.mark.parametrize(
+        ("one", "other"),
+        [
+            (np.zeros(2), np.zeros(3)),
+            (np.zeros(2), np.zeros((2, 1))),
+            (np.zeros(2), [0.0, 0.0]),
+            (np.zeros(2), None),
+            ([0], (0,)),
+            ([0], [0, 0]),
+            ({"a": 0}, {"b": 0}),
+            ({"a": np.zeros(1)}, [np.zeros(1)]),
+            (np.nan, 0.0),
+        ],
+        ids=repr,
+    )
+    def test_tuples_differ_where_their_values_do(self, one: Any, other: Any) -> None:
+        steps = [RLTuple(state=value, action=0, reward=0.0) for value in (one, other)]
+        assert (steps[0] == steps[1]) is False
+        assert (steps[1] == steps[0]) is False
+
+    def test_a_tuple_equals_none_of_another_type(self) -> None:
+        class Own(RLTuple):
+            pass
+
+        assert RLTuple(state=0, action=0, reward=0) != Own(state=0, action=0, reward=0)
+        assert RLTuple(state=0, action=0, reward=0) != 3
+
+    def test_tuples_of_tensors(self) -> None:
+        torch = pytest.importorskip("torch")
+        step, same, other = (RLTuple(state=torch.full((2,), n), action=0, reward=0) for n in (1.0, 1.0, 2.0))
+        assert (step == same) is True
+        assert (step == other) is False
 
     def test_subclasses_may_convert(self) -> None:
         class Listed(RLTuple):

@@ -89,7 +89,8 @@ class Benchmark(BenchmarkHeader):
 class RLTuple(BaseModel):
     """One step: `state` is the observation that `action` was chosen on.
 
-    Values are kept as they are given: arrays stay arrays, of the same dtype.
+    Values are kept as they are given: arrays stay arrays, of the same dtype. Two tuples are equal if their values are:
+    arrays where shapes and elements agree, a NaN where the other one has a NaN too.
     """
 
     state: Any
@@ -98,6 +99,9 @@ class RLTuple(BaseModel):
     info: dict[Any, Any] = Field(default_factory=dict)
     terminal: bool = False
     timeout: bool = False
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and _equal(self.__dict__, other.__dict__)
 
     @classmethod
     def from_env_step(
@@ -123,6 +127,23 @@ class RLTuple(BaseModel):
             terminal=bool(terminated),
             timeout=bool(truncated),
         )
+
+
+def _equal(a: Any, b: Any) -> bool:
+    """Whether two values are the same, through dicts and lists, where `==` of arrays would be an array."""
+    if a is b:
+        return True
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(_equal(value, b[key]) for key, value in a.items())
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        alike = isinstance(a, list) == isinstance(b, list) and len(a) == len(b)
+        return alike and all(map(_equal, a, b))
+    if getattr(a, "shape", ()) != getattr(b, "shape", ()):
+        return False
+    if object in (getattr(a, "dtype", None), getattr(b, "dtype", None)):
+        return _equal(a.tolist(), b.tolist())
+    same = (a == b) | ((a != a) & (b != b))
+    return bool(same.all() if hasattr(same, "all") else same)
 
 
 class Episode(BaseModel):
