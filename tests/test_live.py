@@ -403,13 +403,14 @@ def test_stacks_of_frames_come_to_rerun(shape: tuple[int, ...], axis: int, tmp_p
     inner = gym.wrappers.TransformObservation(stack, lambda frames: np.moveaxis(frames, 0, axis), space)
     with receiver(port, tmp_path / "r.rrd"), RecordEpisodes(inner, path, live=url(port)) as env:
         roll(env, 100, 0.01)
-    rows, tensors = shown(tmp_path / "r.rrd", "/state", "Tensor:data")
+    rows, buffers = shown(tmp_path / "r.rrd", "/state", "Image:buffer")
     with Recording(path) as recording:
         assert recording.layout.stacks  # type: ignore[union-attr]
         states = recording.read().states
     assert len(rows) > 5
-    for row, (tensor,) in zip(rows, tensors, strict=True):
-        assert np.array_equal(np.array(tensor["buffer"]).reshape(tensor["shape"]), states[row])
+    for row, (buffer,) in zip(rows, buffers, strict=True):
+        picture = np.concatenate(list(np.moveaxis(states[row], axis, 0)), axis=1)  # frames side by side
+        assert np.array_equal(np.array(buffer, np.uint8).reshape(picture.shape), picture)
 
 
 class Told(gym.Wrapper[Any, Any, Any, Any]):

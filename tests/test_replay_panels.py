@@ -15,7 +15,7 @@ from tupli_mcap import RecordEpisodes, Recording, viewer
 from tupli_mcap.recording import EpisodeData, write_recording
 
 pytest.importorskip("rerun")
-from rrd import Rrd, joined_rows
+from rrd import Rrd, joined_rows, states_of
 
 Box = spaces.Box
 
@@ -126,6 +126,49 @@ def test_images_and_grids(tmp_path: Path) -> None:
     assert (form[0]["width"], form[0]["height"]) == (6, 4)
     grids = np.array([item[0]["buffer"] for item in found.rows("/state/map", "Tensor:data")], np.float32)
     assert np.array_equal(grids.reshape(22, 5, 4), seen["map"])
+
+
+STACKS = [
+    ((20, 16), 4, False, True),
+    ((20, 16), 4, True, True),
+    ((20, 16), 6, False, True),
+    ((20, 16, 3), 5, True, True),
+    ((20, 16), 4, False, False),
+    ((20, 16, 3), 2, False, False),
+]
+
+
+@pytest.mark.parametrize(("shape", "count", "last", "said"), STACKS)
+def test_frames_of_a_stack_stand_upright_beside_each_other(
+    tmp_path: Path, shape: tuple[int, ...], count: int, last: bool, said: bool
+) -> None:
+    env: Any = Sampled(Box(0, 255, shape if said else (count, *shape), np.uint8))
+    if said:
+        env = gym.wrappers.FrameStackObservation(env, count)
+    if last:
+        space = Box(0, 255, (*shape, count), np.uint8)
+        env = gym.wrappers.TransformObservation(env, lambda frames: np.moveaxis(frames, 0, -1), space)
+    found = replayed(tmp_path, env)
+    with Recording(tmp_path / "sampled.mcap") as recording:
+        assert bool(recording.layout.stacks) == said  # type: ignore[union-attr]
+        seen = np.concatenate([states_of(episode) for episode in recording.episodes])
+    frames = np.moveaxis(seen, -1, 1) if last else seen
+    frames = frames.reshape(*frames.shape[:4], -1)
+    across, down = min(count, 4), -(-count // 4)
+    (form,) = found.rows("/state", "Image:format")
+    assert (form[0]["width"], form[0]["height"]) == (16 * across, 20 * down)
+    pictures = np.array(found.rows("/state", "Image:buffer"), np.uint8)
+    pictures = pictures.reshape(len(seen), 20 * down, 16 * across, frames.shape[-1])
+    for i in range(across * down):
+        y, x = 20 * (i // across), 16 * (i % across)
+        tile = pictures[:, y : y + 20, x : x + 16]
+        assert np.array_equal(tile, frames[:, i] if i < count else np.zeros_like(tile))
+
+
+def test_a_stack_of_other_values_is_no_picture(tmp_path: Path) -> None:
+    found = replayed(tmp_path, Sampled(Box(0, 1, (4, 20, 16), np.float32)))
+    tensor = found.rows("/state", "Tensor:data")[0][0]
+    assert (tensor["shape"], tensor["names"]) == ([4, 20, 16], ["[0]", "height", "width"])
 
 
 def test_camera_frames_are_sent_as_they_are(tmp_path: Path) -> None:

@@ -16,14 +16,15 @@ from tupli_mcap.viewer.sending import Times, blob_array, column_of, send_blobs, 
 __all__ = ["Camera", "Grid", "HeatMap", "Picture"]
 
 _MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
-# by dimensions of a column of steps
-_AXES = {3: ("row", "column"), 4: ("[0]", "[1]", "[2]"), 5: ("[0]", "[1]", "[2]", "[3]")}
+# By dimensions of a leaf. The viewer knows height and width by these names, and would lay other ones on their side.
+_AXES = {2: ("row", "column"), 3: ("[0]", "height", "width")}
 _FRAMES_AT_ONCE = 64
+_FRAMES_A_LINE = 4  # of a stack
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image leaf: a picture a step, as it is."""
+    """An image leaf: a picture a step, as it is; of a stack its frames, the oldest first, in lines as one reads."""
 
     leaf: Leaf
     column: str
@@ -33,7 +34,7 @@ class Picture:
     def declare(self, place: Place) -> None:
         import rerun as rr
 
-        height, width, channels = self.leaf.shape
+        height, width, channels = self._tiled(np.empty((1, *self.leaf.shape), np.uint8)).shape[1:]
         model = {1: rr.ColorModel.L, 3: rr.ColorModel.RGB, 4: rr.ColorModel.RGBA}[channels]
         form = rr.components.ImageFormat(width, height, color_model=model, channel_datatype="U8")
         nearest = rr.components.MagnificationFilter.Nearest
@@ -43,8 +44,25 @@ class Picture:
     def send(self, place: Place, block: Block, times: Times) -> None:
         import rerun as rr
 
-        values = np.ascontiguousarray(flat_values(self.leaf, self.column, block))
+        pictures = self._tiled(self.leaf.get(getattr(block.columns, self.column)))
+        values = np.ascontiguousarray(pictures).reshape(len(pictures), -1)
         send_blobs(place.stream, place.root + self.entity, times, rr.Image.descriptor_buffer(), values)
+
+    def _tiled(self, values: Array) -> Array:
+        """Pictures (rows x height x width x channels) of a column; black where the last line is not full."""
+        leaf = self.leaf
+        if leaf.kind == "image":
+            return values
+        frames = np.moveaxis(values, -1, 1) if leaf.frames_last else values
+        rows, count, height, width = frames.shape[:4]
+        across = min(count, _FRAMES_A_LINE)
+        down = -(-count // across)
+        tiles = np.zeros(
+            (rows, down * across, height, width, leaf.size // (count * height * width)), np.uint8
+        )
+        tiles[:, :count] = frames.reshape(rows, count, height, width, -1)
+        lines = tiles.reshape(rows, down, across, height, width, -1).swapaxes(2, 3)
+        return lines.reshape(rows, down * height, across * width, -1)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         return _side_by_side(self.title, roots, self.entity)
@@ -52,7 +70,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Grid:
-    """A leaf of two or three dimensions, or a stack of frames: a tensor a step."""
+    """A leaf of two or three dimensions: a tensor a step."""
 
     leaf: Leaf
     column: str
@@ -70,7 +88,7 @@ class Grid:
             place.root + self.entity,
             times,
             list(values.astype(kind, copy=False)),
-            _AXES[values.ndim],
+            _AXES[len(self.leaf.shape)],
         )
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:

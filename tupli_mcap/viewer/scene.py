@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from tupli_mcap.messages.labels import Labels
 from tupli_mcap.messages.leaves import Leaf
-from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.step import StepLayout, can_stack
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.blocks import Array
 from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, escaped, magnitudes, title_of
@@ -27,6 +27,8 @@ _LINES_SMALL: Final = 6
 _MOST_LANES: Final = 12  # values of a Discrete leaf that get a colour each
 _MOST_LANE_ROWS: Final = 20_000  # the state timeline draws every change, however narrow
 _MOST_INFOS: Final = 12
+_MOST_FRAMES: Final = 16  # of a stack that nothing says to be one
+_LEAST_FRAME: Final = 16  # pixels of each of its sides
 _RATIO: Final = 30.0  # magnitudes further apart than this do not share an axis
 _SAMPLE_EPISODES, _SAMPLE_STEPS, _SAMPLE_VALUES = 8, 512, 1 << 20
 
@@ -121,10 +123,8 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
         scene.beside.append(Words(leaf, column, entity, title))
     elif not leaf.size:
         scene.unseen.append(f"{title_of(leaf)} has no values")
-    elif leaf.kind == "image":
+    elif leaf.apart or _are_frames(leaf, column, material):
         scene.beside.append(Picture(leaf, column, entity, title))
-    elif leaf.apart:
-        panels.append(Grid(leaf, column, entity, title))
     elif type(leaf.space) is spaces.Discrete:
         panels.append(_discrete(leaf, column, material))
     elif leaf.size <= MOST_LINES:
@@ -133,6 +133,13 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
         panels.append(Grid(leaf, column, entity, title))
     else:
         panels += _many(scene, leaf, column, material)
+
+
+def _are_frames(leaf: Leaf, column: str, material: _Material) -> bool:
+    """Whether an array that nothing says to be a stack of frames looks like one."""
+    if not can_stack(leaf) or leaf.shape[0] > _MOST_FRAMES or min(leaf.shape[1:3]) < _LEAST_FRAME:
+        return False
+    return all(leaf.get(getattr(part, column)).dtype == np.uint8 for part in material.sample)
 
 
 def _discrete(leaf: Leaf, column: str, material: _Material) -> Panel:
