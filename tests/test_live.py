@@ -413,6 +413,23 @@ def test_stacks_of_frames_come_to_rerun(shape: tuple[int, ...], axis: int, tmp_p
         assert np.array_equal(np.array(buffer, np.uint8).reshape(picture.shape), picture)
 
 
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_rollout_with_a_camera_is_another_application(tmp_path: Path) -> None:
+    from rrd import Rrd
+
+    found = set()
+    for frames in (False, True):
+        path, port = tmp_path / str(frames) / "r.mcap", free_port()
+        path.parent.mkdir()
+        inner = gym.make("CartPole-v1", render_mode="rgb_array")
+        with receiver(port, path.with_suffix(".rrd")):
+            with RecordEpisodes(inner, path, live=url(port), frames=frames) as env:
+                roll(env, 100, 0.01)
+        (entry,) = Rrd(path.with_suffix(".rrd")).recordings
+        found.add(entry.application_id)
+    assert len(found) == 2
+
+
 class Told(gym.Wrapper[Any, Any, Any, Any]):
     """Says something of each step; a sub-environment's episodes are over after `length` steps."""
 

@@ -55,7 +55,7 @@ def replayed(tmp_path: Path, env: gym.Env[Any, Any], steps: int = 20, **options:
             *_, terminated, _, _ = recorder.step(recorder.action_space.sample())
             if terminated:
                 recorder.reset()
-    return Rrd(viewer.save(path, tmp_path / "sampled.rrd"))
+    return Rrd(viewer.save(path, tmp_path / "sampled.rrd", force=True))
 
 
 def card(found: Rrd) -> str:
@@ -378,3 +378,18 @@ def test_the_overview_is_of_all_episodes(tmp_path: Path) -> None:
     assert begins[0] == 0 and np.array_equal(begins[:-1] + widths[:-1], begins[1:])
     assert begins[-1] + widths[-1] == n  # the axis counts episodes, not bars
     assert len(found.scalars("/reward")) == 1
+
+
+def test_recordings_with_other_panels_are_of_other_applications(tmp_path: Path) -> None:
+    """A viewer keeps the blueprint of an application: panels that it lacks would stay hidden."""
+
+    def application(**options: Any) -> str:
+        env = Sampled(Box(-1, 1, (2,)), lambda t: np.full(2, t / 10, np.float32), info=lambda t: {"t": t})
+        env.metadata, env.render_mode = {"render_modes": ["rgb_array"]}, "rgb_array"  # type: ignore[misc]
+        env.render = lambda: np.zeros((8, 8, 3), np.uint8)  # type: ignore[method-assign, return-value]
+        (entry,) = replayed(tmp_path, env, mode="w", **options).recordings
+        return str(entry.application_id)
+
+    plain, filmed, told = application(), application(frames=True), application(record_info=True)
+    assert len({plain, filmed, told, application(frames=True, record_info=True)}) == 4
+    assert application() == plain and application(frames=2) == filmed

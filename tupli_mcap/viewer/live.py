@@ -96,7 +96,7 @@ class LivePicture:
             LiveEnv(layout, labels.step_seconds, scene, i, _place(root, i if count > 1 else None), count)
             for i, root in enumerate(roots)
         ]
-        looks = hashlib.sha256(repr((layout.to_metadata(), roots, infos)).encode()).hexdigest()[:6]
+        looks = hashlib.sha256(repr((layout.to_metadata(), roots, scene.looks)).encode()).hexdigest()[:6]
         self.application = f"{re.sub(r'[^0-9A-Za-z_-]+', '-', title)[:40]} live {looks}"
         self.blueprint = blueprint_of(scene, roots)
 

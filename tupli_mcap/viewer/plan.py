@@ -77,7 +77,7 @@ class Plan(NamedTuple):
         first = self.parts[0]
         recording = first.chosen.recording
         looks = _spaces_of(recording) + repr([part.root for part in self.parts] if first.root else "")
-        looks += "listed" * self.listed
+        looks += first.scene.looks + "listed" * self.listed
         name = re.sub(r"[^\w-]+", "-", name_of(recording))  # the viewer warns of others
         return f"{name} {hashlib.sha256(looks.encode()).hexdigest()[:6]}"
 

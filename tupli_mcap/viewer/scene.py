@@ -49,6 +49,14 @@ class Scene:
     def panels(self) -> list[Panel]:
         return [*self.states, *self.actions, *self.rewards, *self.beside]
 
+    @property
+    def looks(self) -> str:
+        """Which panels there are, and what they show: one blueprint fits scenes where this is the same."""
+        facts = ("title", "entity", "numbers", "texts")
+        return repr(
+            [(type(panel).__name__, *(getattr(panel, fact, None) for fact in facts)) for panel in self.panels]
+        )
+
 
 class _Material(NamedTuple):
     """What panels are decided on: labels, some columns, how many rows will come, and whether lines stay apart."""
