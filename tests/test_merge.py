@@ -115,9 +115,15 @@ def record(
     return path
 
 
-def record_vector(path: Path, *, steps: int = 150, seed: int = 1) -> Path:
+def times_of(recording: Recording) -> list[list[int]]:
+    """The times (ns) of the steps, by episode."""
+    return [recording.read([i], fields=["times"]).times.tolist() for i in range(len(recording))]
+
+
+def record_vector(path: Path, *, steps: int = 150, seed: int = 1, mode: Any = "x") -> Path:
     venv = SyncVectorEnv([lambda: Sampled("image")] * 2, autoreset_mode=AutoresetMode.NEXT_STEP)
-    with RecordVector(venv, path, attachments={}, record_info=True, metadata_callback=Score()) as env:
+    options: Any = {"attachments": {}, "record_info": True, "metadata_callback": Score(), "mode": mode}
+    with RecordVector(venv, path, **options) as env:
         env.action_space.seed(seed)
         env.reset(seed=seed)
         for _ in range(steps):
@@ -200,6 +206,79 @@ class TestMerge:
         report = merge_recordings([second, first], tmp_path / "all.mcap")
         with Recording(report.path) as merged:
             assert same(facts(merged), facts(Recording(first)) + facts(Recording(second)))
+
+    @pytest.mark.parametrize("kind", ["box", "text", "image", "stack"])
+    def test_recordings_appended_in_turns_keep_their_times(self, tmp_path: Path, kind: str) -> None:
+        """A day of each: no time is before one ahead of it if episodes are in the order of their times."""
+        a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"
+        days = [(a, 1), (b, 2), (a, 3), (a, 4), (b, 5)]
+        for path, seed in days:
+            record(path, kind, seed=seed, steps=40, frames=3, mode="a" if path.exists() else "x")
+        opened = [Recording(path) for path in (a, b)]
+        found = [fact for one in opened for fact in facts(one)]
+        times = [moments for one in opened for moments in times_of(one)]
+        order = sorted(range(len(found)), key=lambda i: times[i][0])
+        assert order != list(range(len(found)))
+        report = merge_recordings([b, a], tmp_path / "all.mcap")
+        assert report.held == 0
+        assert_sound(report.path)
+        with Recording(report.path) as merged:
+            assert same(facts(merged), [found[i] for i in order])
+            assert times_of(merged) == [times[i] for i in order]
+            assert [e.number for e in merged.episodes] == list(range(len(merged)))
+            assert merged.metadata["next_episode"] == str(len(merged))
+            assert int(merged.index["end_time"].max()) == max(
+                int(one.index["end_time"].max()) for one in opened
+            )
+
+    def test_only_what_overlaps_is_held(self, tmp_path: Path) -> None:
+        """Two workers at the same time, twice: the second time does not wait for the end of the first."""
+        paths = [tmp_path / f"{i}.mcap" for i in range(2)]
+        for mode in ("x", "a"):
+            envs = [RecordEpisodes(Sampled("box"), path, mode=mode, attachments={}) for path in paths]  # type: ignore[arg-type]
+            for env in envs:
+                env.reset(seed=1)
+            for _ in range(60):
+                for env in envs:
+                    if any(env.step(0)[2:4]):
+                        env.reset()
+            for env in envs:
+                env.close()
+        with pytest.warns(UserWarning, match="rows of .* have the time of the row ahead of them"):
+            report = merge_recordings(paths, tmp_path / "all.mcap")
+        assert_sound(report.path)
+        with Recording(report.path) as merged, Recording(paths[0]) as one, Recording(paths[1]) as other:
+            begun = int(np.median(one.index["start_time"]))
+            wanted = np.sort(np.concatenate([r.read(fields=["times"]).times for r in (one, other)]))
+            found = merged.read(fields=["times"]).times
+            assert (found >= begun).sum() == (wanted >= begun).sum()
+
+    def test_recordings_that_take_too_many_turns_have_one_each(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("tupli_mcap.recording.merge._MOST_TURNS", 2)
+        a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"
+        for path, seed in ((a, 1), (b, 2), (a, 3)):
+            record(path, seed=seed, steps=40, mode="a" if path.exists() else "x")
+        with pytest.warns(UserWarning, match="rows of .* have the time of the row ahead of them"):
+            report = merge_recordings([a, b], tmp_path / "all.mcap")
+        assert report.held >= 40
+        with Recording(report.path) as merged:
+            assert same(facts(merged), facts(Recording(a)) + facts(Recording(b)))
+
+    def test_vector_recordings_appended_in_turns(self, tmp_path: Path) -> None:
+        a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"
+        for path, seed in ((a, 1), (b, 2), (a, 3)):
+            record_vector(path, seed=seed, steps=30, mode="a" if path.exists() else "x")
+        with Recording(a) as one, Recording(b) as other:
+            times = sorted(
+                one.read(fields=["times"]).times.tolist() + other.read(fields=["times"]).times.tolist()
+            )
+        report = merge_recordings([a, b], tmp_path / "all.mcap")
+        assert report.held == 0
+        assert_sound(report.path)
+        with Recording(report.path) as merged:
+            assert sorted(merged.read(fields=["times"]).times.tolist()) == times
 
     def test_recordings_made_at_the_same_time(self, tmp_path: Path) -> None:
         """Times are held, values stay."""

@@ -36,8 +36,9 @@ def _merge(
 ) -> None:
     """Write the episodes of several recordings into one.
 
-    They come in the order in which the recordings were begun, and are numbered anew. The new recording has ids of its
-    own, the environment of the first one, and no signature.
+    They come in the order of their times, and are numbered anew. Of recordings made at the same time, those of the
+    later one follow the others, and rows that may not go back in time get a later one; a warning says how many.
+    The new recording has ids of its own, the environment of the first one, and no signature.
     """
     from tupli_mcap.recording.merge import merge_recordings
 

@@ -30,6 +30,7 @@ from tupli_mcap.recording.writer import LAST_ROW
 __all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]
 
 _ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
+_MOST_TURNS = 100
 _SPACES = ("observation_space", "action_space", "reward_space")
 
 
@@ -69,12 +70,12 @@ def merge_recordings(
     overwrite: bool = False,
     dry_run: bool = False,
 ) -> MergeReport:
-    """Writes one recording, with a UUID of its own, of the episodes of several, in the order in which these were begun.
+    """Writes one recording, with a UUID of its own, of the episodes of several, in the order of their times.
 
     Everything comes along: infos, frames, images, final states, metadata, attachments; but no signature and no
-    certificate, which would not hold. Episodes are numbered anew. Times within a channel never decrease: where
-    recordings were made at the same time, those of the later one are held. The environment and the labels are the
-    first one's.
+    certificate, which would not hold. Episodes are numbered anew. Times stay as they are, but they must never decrease
+    within a channel: episodes of several recordings that overlap in time come one recording after the other, those of
+    the later one are held, and a warning says of how many rows. The environment and the labels are the first one's.
 
     Raises:
         SpaceError: they have different spaces, dtypes, or numbers of sub-environments.
@@ -115,9 +116,9 @@ def _merge(
     sources: Sequence[Recording], container: Container, attachments: Mapping[str, tuple[str, bytes]]
 ) -> Target:
     now, first = time.time_ns(), sources[0]
-    shifts = np.cumsum([0, *(recording._contents.next_episode for recording in sources)])
+    turns, next_episode = _numbered(sources, _turns(sources))
     container.start(library())
-    container.add_metadata(RECORDING_METADATA, _metadata(first, next_episode=int(shifts[-1])))
+    container.add_metadata(RECORDING_METADATA, _metadata(first, next_episode=next_episode))
     for name, (media_type, data) in attachments.items():
         container.add_attachment(name, media_type, data, now)
     target = Target(container)
@@ -126,15 +127,53 @@ def _merge(
         _define_missing(recording, container)
     container.define_channels()
     ids = {channel.topic: channel.id for channel in container.channels.values()}
-    for recording, shift in zip(sources, shifts.tolist(), strict=False):
+    for recording, rows, shift in turns:
         channels = {i: ids.get(topic, i) for topic, i in recording._topics.items()}
         cameras = {
             name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
             for name, pairs_of in camera_channels(recording, container).items()
         }
-        Transfer(recording, target, cameras, channels=channels, shift=shift).run(recording.index)
+        Transfer(recording, target, cameras, channels=channels, shift=shift).run(rows)
     target.finish(now)
     return target
+
+
+def _turns(sources: Sequence[Recording]) -> list[tuple[int, np.ndarray]]:
+    """Which recording's turn it is, and which rows of its index it brings then, in the order of their times.
+
+    Episodes that overlap make a group, each recording has one turn in it. Where there would be too many turns, each
+    recording has one: every one costs a look at all infos of its recording, and ends a chunk.
+    """
+    which = np.repeat(np.arange(len(sources)), [len(recording) for recording in sources])
+    place = np.concatenate([np.arange(len(recording)) for recording in sources])
+    start, end = (np.concatenate([r.index[name] for r in sources]) for name in ("start_time", "end_time"))
+    order = np.lexsort((place, which, start))
+    apart = start[order][1:] >= np.maximum.accumulate(end[order])[:-1]  # all before it have ended
+    group = np.concatenate([[0], np.cumsum(apart)])
+    order = order[np.lexsort((place[order], which[order], group))]
+    bounds = np.flatnonzero(np.diff(which[order])) + 1
+    if len(bounds) >= max(_MOST_TURNS, len(sources)):
+        return [(i, np.arange(len(recording))) for i, recording in enumerate(sources)]
+    return [(int(which[part[0]]), np.sort(place[part])) for part in np.split(order, bounds)]
+
+
+def _numbered(
+    sources: Sequence[Recording], turns: Sequence[tuple[int, np.ndarray]]
+) -> tuple[list[tuple[Recording, np.ndarray, int]], int]:
+    """(recording, rows of its index, what is added to its episodes' numbers) by turn, and the next free number."""
+    last = {i: turn for turn, (i, _) in enumerate(turns)}
+    found = []
+    free, begun = 0, set()
+    for turn, (i, places) in enumerate(turns):
+        recording = sources[i]
+        rows = recording.index[places]
+        shift = max(0, free - int(rows["episode"].min())) if i in begun else free
+        free = shift + (
+            recording._contents.next_episode if last[i] == turn else int(rows["episode"].max()) + 1
+        )
+        begun.add(i)
+        found.append((recording, rows, shift))
+    return found, free
 
 
 def _metadata(source: Recording, *, next_episode: int) -> dict[str, str]:
