@@ -1,4 +1,4 @@
-"""What every test gets: a configuration directory of its own, so that no test trusts anything for the user."""
+"""What every test gets: directories of its own for configuration and cache, so that no test touches the user's."""
 
 from __future__ import annotations
 
@@ -15,10 +15,19 @@ if TYPE_CHECKING:
     from viewing import HeadlessViewer
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _cache_of_all_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """For what is made once for several tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _private_config(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
     directory = tmp_path_factory.mktemp("config")
     monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(directory))
+    monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
     return directory
 
 

@@ -21,10 +21,12 @@ from hypothesis import strategies as st
 from tupli_mcap.errors import FilterError, FormatError, StorageError
 from tupli_mcap.messages.jsonvalue import dumps_plain
 from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR
+from tupli_mcap.storage import FileStorage, place
 from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
+from tupli_mcap.storage.place import cache_dir, catalog_path
 from tupli_mcap.storage.rows import escape_text, unescape_text
 
-STAMP = RecordingStamp(size=10, mtime_ns=20, sidecar_mtime_ns=30)
+STAMP = RecordingStamp(size=10, mtime_ns=20, mixed=30)
 TEXTS = st.text() | st.sampled_from(["\x00", "\x01", "\ud7ff", "\ud800", "\udfff", "\ue000", "a\x00\x01"])
 
 
@@ -389,12 +391,147 @@ class TestFile:
         with pytest.raises(StorageError, match="is closed"):
             catalog.episodes()
 
-    def test_a_temporary_catalog_leaves_nothing(self) -> None:
+    @pytest.mark.parametrize(
+        "change",
+        [
+            "CREATE TRIGGER t AFTER INSERT ON episode BEGIN UPDATE episode SET n_tuples = 7; END",
+            "CREATE VIEW v AS SELECT 1",
+            "CREATE TABLE more (x)",
+            "CREATE INDEX ix_more ON episode (end)",
+            "ALTER TABLE episode ADD COLUMN more",
+            "DROP INDEX ix_recording_uuid",
+            "INSERT INTO declared VALUES ('metadata..x', 9)",
+            "INSERT INTO declared VALUES ('seed', 9)",
+        ],
+    )
+    def test_a_schema_that_is_not_exactly_ours_is_thrown_away(self, tmp_path: Path, change: str) -> None:
+        path = tmp_path / "catalog.sqlite"
+        for expected in (0, 1):  # once more without the change: declared keys are part of the schema
+            with Catalog(path) as catalog:
+                assert len(catalog.recordings()) == expected
+                put(catalog, rows=[row(0)])
+                for key in ("metadata.score", "end", "benchmark_id", "created_at"):
+                    catalog.declare_key(key)
+        with sqlite3.connect(path) as connection:
+            connection.execute(change)
+        connection.close()
+        with Catalog(path) as catalog:
+            assert catalog.recordings() == {}
+            put(catalog, rows=[row(0)])
+            assert [header.n_tuples for header in catalog.episodes()] == [22]
+
+    @pytest.mark.parametrize("kind", ["a link", "a journal beside it", "open to others", "a linked log"])
+    def test_a_file_that_may_be_somebody_elses_is_not_opened(self, tmp_path: Path, kind: str) -> None:
+        directory = tmp_path / "mine"
+        path, elsewhere = directory / "catalog.sqlite", tmp_path / "elsewhere"
+        with Catalog(path) as catalog:
+            put(catalog, rows=[row(0)])
+        elsewhere.write_bytes(path.read_bytes())
+        if kind == "a link":
+            path.unlink()
+            path.symlink_to(elsewhere)
+        elif kind == "a journal beside it":
+            path.with_name("catalog.sqlite-journal").write_bytes(b"")
+        elif kind == "open to others":
+            path.chmod(0o666)
+        else:
+            path.with_name("catalog.sqlite-wal").symlink_to(elsewhere)
+        content = elsewhere.read_bytes()
+        with Catalog(path) as catalog:
+            assert catalog.recordings() == {}
+        assert elsewhere.read_bytes() == content
+        assert {file.name for file in directory.iterdir() if file.suffix != ".lock"} == {"catalog.sqlite"}
+
+    def test_a_catalog_is_private(self, tmp_path: Path) -> None:
+        mask = os.umask(0)
+        try:
+            with Catalog(tmp_path / "a" / "b" / "catalog.sqlite") as catalog:
+                put(catalog, rows=[row(0)])
+                found = [(tmp_path / "a"), *(tmp_path / "a").rglob("*")]
+                modes = {path.name: path.stat().st_mode & 0o777 for path in found if path.suffix != ".lock"}
+        finally:
+            os.umask(mask)
+        assert modes == {"a": 0o700, "b": 0o700} | {
+            f"catalog.sqlite{end}": 0o600 for end in ("", "-wal", "-shm")
+        }
+
+
+class TestInMemory:
+    def test_it_has_no_file(self) -> None:
         with Catalog(None) as catalog:
             put(catalog, rows=[row(0)])
-            folder = catalog.path.parent
-            assert folder.exists()
-        assert not folder.exists()
+            assert catalog.path is None
+            first = catalog.identity
+            assert catalog.is_current()
+            catalog.reset()
+            assert not catalog.is_current()
+            assert catalog.recordings() == {}
+            assert catalog.identity != first
+        with pytest.raises(StorageError, match="is closed"):
+            catalog.episodes()
+
+    def test_what_fails_at_first_leaves_it_usable(self) -> None:
+        with Catalog(None) as catalog:
+            with pytest.raises(StorageError, match="UNIQUE constraint failed"):
+                put(catalog, rows=[row(1), row(1)])
+            assert catalog.recordings() == {}
+
+
+class TestPlace:
+    def test_each_storage_has_its_own(self, tmp_path: Path) -> None:
+        for name in ("one", "two"):
+            (tmp_path / name).mkdir()
+        (tmp_path / "link").symlink_to(tmp_path / "one")
+        one, two, link = (catalog_path(tmp_path / name) for name in ("one", "two", "link"))
+        assert one is not None
+        assert one == link != two
+        assert one.is_relative_to(cache_dir() / "catalogs")
+        (tmp_path / "two").rename(tmp_path / "one" / "moved")
+        assert catalog_path(tmp_path / "one" / "moved") not in (one, two)
+
+    def test_it_is_private_or_none(self, tmp_path: Path) -> None:
+        catalog_path(tmp_path)
+        assert (cache_dir() / "catalogs").stat().st_mode & 0o777 == 0o700
+        cache_dir().chmod(0o777)
+        with pytest.raises(PermissionError, match="others may write there"):
+            catalog_path(tmp_path)
+
+    @pytest.mark.parametrize(
+        ("kind", "is_local"),
+        [
+            ("ext4", True),
+            ("nfs4", False),
+            ("cifs", False),
+            ("fuse.sshfs", False),
+            ("fuse.fuse-overlayfs", True),
+        ],
+    )
+    def test_not_on_a_network(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, is_local: bool
+    ) -> None:
+        cache = tmp_path / "my home" / "cache"
+        monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", str(cache))
+        mounts = tmp_path / "mounts"
+        other = "nfs4" if is_local else "ext4"
+        point = str(cache.parent).replace(" ", "\\040")
+        mounts.write_text(f"x / {other} rw 0 0\ny {point} {kind} rw 0 0\nz {point}x {other} rw 0 0\n")
+        monkeypatch.setattr(place, "_MOUNTS", mounts)
+        assert (catalog_path(tmp_path) is not None) == is_local
+        with FileStorage(tmp_path / "lab") as storage:
+            assert storage.count_episodes() == 0
+        assert (list(cache.rglob("*.sqlite")) != []) == is_local
+
+    def test_what_nobody_opens_is_forgotten(self, tmp_path: Path) -> None:
+        old, used, new = tmp_path / "old", tmp_path / "used", tmp_path / "new"
+        for root in (old, used):
+            FileStorage(root).count_episodes()
+            path = catalog_path(root)
+            assert path is not None
+            os.utime(path.parent, ns=(0, 0))
+        with FileStorage(used) as storage:
+            storage.count_episodes()
+        FileStorage(new).count_episodes()
+        assert len(list((cache_dir() / "catalogs").iterdir())) == 2
 
 
 WORKER = """
@@ -429,7 +566,9 @@ class TestSharing:
             assert catalog.count() == 800
             assert sorted(catalog.declared_keys()) == [f"metadata.score{n}" for n in range(3)]
 
-    def test_several_threads(self, catalog: Catalog) -> None:
+    @pytest.mark.parametrize("in_memory", [False, True])
+    def test_several_threads(self, tmp_path: Path, in_memory: bool) -> None:
+        catalog = Catalog(None if in_memory else tmp_path / "catalog.sqlite")
         errors: list[StorageError] = []
 
         def work(name: int) -> None:
@@ -447,6 +586,7 @@ class TestSharing:
             thread.join()
         assert not errors
         assert catalog.count() == 400
+        catalog.close()
 
     @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
     def test_a_forked_child(self, catalog: Catalog) -> None:
@@ -461,3 +601,19 @@ class TestSharing:
                 os._exit(status)
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
         assert sorted(catalog.recordings()) == ["a.mcap", "child.mcap"]
+
+    @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+    def test_a_forked_child_has_a_memory_of_its_own(self) -> None:
+        with Catalog(None) as catalog:
+            put(catalog, rows=[row(0)])
+            child = os.fork()
+            if child == 0:  # nothing of pytest may run here
+                status = 1
+                try:
+                    fresh = not catalog.is_current() and catalog.count() == 0
+                    put(catalog, "child.mcap", [row(0), row(1)])
+                    status = 0 if fresh and catalog.count() == 2 else 2
+                finally:
+                    os._exit(status)
+            assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+            assert catalog.count() == 1

@@ -39,6 +39,7 @@ from tupli_mcap.cli.output import bytes_of, number, numbers
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, RLTuple
+from tupli_mcap.storage.place import catalog_path
 from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
@@ -762,8 +763,33 @@ class TestStorages:
         assert run("compact", "--storage", "lab", "--dry-run", "--json").json["recordings"] == []
         assert len(run("list-episodes", "--storage", "lab", "--json").json) == 4
 
+    def test_looking_writes_nothing(self, lab: tuple[Path, str, str]) -> None:
+        def state() -> dict[str, tuple[int, int, int]]:
+            found = {str(path): path.lstat() for path in (Path("lab"), *Path("lab").rglob("*"))}
+            return {name: (item.st_size, item.st_mtime_ns, item.st_ino) for name, item in found.items()}
+
+        Path("lab/.lock").unlink()
+        before, recording = state(), next(Path("lab").rglob("*.mcap"))
+        for words in (
+            ["episodes", "lab", "--filter", "n_tuples > 1"],
+            ["list-episodes", "--storage", "lab"],
+            ["list-benchmarks", "--storage", "lab"],
+            ["list-artifacts", "--storage", "lab"],
+            ["ls", "lab"],
+            ["verify", "lab"],
+            ["info", recording],
+            ["episodes", recording],
+            ["compact", "--dry-run", "--storage", "lab"],
+            ["reindex", "--storage", "lab"],
+            ["doctor", "--fail-on", "never", "lab"],
+        ):
+            ok(*words)
+            assert state() == before, words
+
     def test_reindex(self, lab: tuple[Path, str, str]) -> None:
-        Path("lab/catalog.sqlite").write_bytes(b"broken")
+        catalog = catalog_path(Path("lab"))
+        assert catalog is not None
+        catalog.write_bytes(b"broken")
         assert ok("reindex", "--storage", "lab") == "lab: 5 episodes\n"
         assert run("reindex", "--storage", "lab", "--json").json == {"storage": "lab", "episodes": 5}
 

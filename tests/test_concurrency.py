@@ -22,6 +22,7 @@ from tupli_mcap import FileStorage, Recording, TupliDataset, TupliEnvWrapper
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.schema import F, FilterEQ
 from tupli_mcap.storage.atomic import Lock
+from tupli_mcap.storage.place import catalog_path
 
 TOOL = Path(__file__).parents[1] / "tools" / "concurrency.py"
 
@@ -44,6 +45,12 @@ def rollout(env: TupliEnvWrapper, episodes: int = 1) -> None:
         while not done:
             _, _, terminal, timeout, _ = env.step(0)
             done = terminal or timeout
+
+
+def catalog_of(storage: FileStorage) -> Path:
+    path = catalog_path(storage.root)
+    assert path is not None
+    return path
 
 
 @pytest.fixture
@@ -119,7 +126,7 @@ class TestTheCatalog:
             if i % 2:
                 storage.reindex()
             else:
-                (storage.root / "catalog.sqlite").unlink()
+                catalog_of(storage).unlink()
                 storage.list_episodes()
         done.set()
         for thread in threads:
@@ -133,7 +140,7 @@ class TestTheCatalog:
         storage.declare_key("metadata.score")
         rollout(env)
         env.close()
-        (storage.root / "catalog.sqlite").unlink()
+        catalog_of(storage).unlink()
         with FileStorage(storage.root) as other:
             other.list_episodes()
         storage.list_episodes()

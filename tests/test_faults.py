@@ -179,14 +179,19 @@ def test_trusting_is_all_or_nothing(tmp_path: Path) -> None:
         assert run_trust_case(tmp_path / str(i), case).hit, case
 
 
-def test_a_catalog_that_could_not_be_made_leaves_nothing(tmp_path: Path) -> None:
+def test_a_catalog_that_could_not_be_made_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", str(cache))
     storage = FileStorage(tmp_path / "lab")
     with (
         Faults(tmp_path, 0, errno.ENOSPC, kinds=frozenset({"replace"}))(),
         pytest.warns(UserWarning, match="No space left on device; free some space there"),
     ):
         assert storage.count_episodes() == 0
-    assert [p.name for p in storage.root.iterdir() if p.name.startswith("catalog")] == ["catalog.sqlite.lock"]
+    assert [p.name for p in cache.rglob("*") if p.is_file()] == ["catalog.sqlite.lock"]
+    assert list(storage.root.iterdir()) == []
     storage.close()
 
 

@@ -9,10 +9,12 @@ import os
 import shutil
 import signal
 import sqlite3
+import struct
 import subprocess
 import sys
 import textwrap
 import uuid
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -48,6 +50,8 @@ from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, dat
 from tupli_mcap.storage.catalog import Catalog
 from tupli_mcap.storage.document import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
 from tupli_mcap.storage.handmade import conform, infer_space
+from tupli_mcap.storage.place import catalog_path
+from tupli_mcap.storage.verify import verify_storage
 from tupli_mcap.wrappers import RecordEpisodes
 
 BAD_IDS = [
@@ -380,7 +384,7 @@ class TestFileStorage(StorageContract):
         header = storage.store_benchmark(query(artifacts=(item.id,)))
         recorded = storage.record_episode(episode(header.id))
         files = {p.relative_to(storage.root).as_posix() for p in storage.root.rglob("*") if p.is_file()}
-        assert {name for name in files if not name.startswith("catalog.sqlite")} == {
+        assert files == {
             ".lock",
             f"benchmarks/{header.id}.json",
             f"artifacts/{item.id}",
@@ -411,13 +415,14 @@ class TestFileStorage(StorageContract):
         storage.publish_episode(made[1].id, "lab")
         expected = storage.list_episodes()
         storage.close()
-        catalog = storage.root / "catalog.sqlite"
+        catalog = catalog_path(storage.root)
+        assert catalog is not None
         if damage == "reindexed":
             storage.reindex()
         else:
-            for path in storage.root.glob("catalog.sqlite*"):
-                path.unlink()
+            shutil.rmtree(catalog.parent)
             if damage == "overwritten":
+                catalog.parent.mkdir(mode=0o700)
                 catalog.write_bytes(b"not a database at all" * 100)
         with FileStorage(storage.root) as other:
             assert other.list_episodes() == expected
@@ -564,14 +569,16 @@ class TestFileStorage(StorageContract):
         header = storage.store_benchmark(query())
         made = [storage.record_episode(episode(header.id)).id for _ in range(2)]
         storage.close()
-        (storage.root / "catalog.sqlite").unlink()
+        catalog = catalog_path(storage.root)
+        assert catalog is not None
+        catalog.unlink()
         if code is None:
-            (storage.root / "catalog.sqlite").mkdir()
+            catalog.mkdir()
         put_recording = Catalog.put_recording
 
         def refuse(self: Catalog, *args: Any, **facts: Any) -> None:
             put_recording(self, *args, **facts)
-            if code is not None and self.path.parent == storage.root:
+            if code is not None and self.path is not None:
                 err = sqlite3.OperationalError("database or disk is full")
                 err.sqlite_errorcode = code
                 with database._translated(self.path):
@@ -579,7 +586,7 @@ class TestFileStorage(StorageContract):
 
         monkeypatch.setattr(Catalog, "put_recording", refuse)
         with FileStorage(storage.root) as other:
-            with pytest.warns(UserWarning, match="cannot be used: .*; the episodes are listed with a temp"):
+            with pytest.warns(UserWarning, match="cannot be used: .*; TUPLI_MCAP_CACHE_DIR .* in memory"):
                 assert sorted(h.id for h in other.list_episodes()) == sorted(made)
             other.delete_episode(made[0])
             assert [h.id for h in other.list_episodes()] == made[1:]
@@ -590,23 +597,71 @@ class TestFileStorage(StorageContract):
         header = storage.store_benchmark(query())
         made = storage.record_episode(episode(header.id))
         storage.close()
-        copy = tmp_path / "read only"
-        shutil.copytree(storage.root, copy, ignore=shutil.ignore_patterns("catalog*"))
-        open_file = os.open
+        open_file, before = os.open, state_of(storage.root)
 
-        def refuse_lock(path: Any, *args: Any, **kwargs: Any) -> int:
-            if str(path) == str(copy / ".lock"):
+        def refuse(path: Any, flags: int, *args: Any, **kwargs: Any) -> int:
+            if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT) and str(path).startswith(f"{storage.root}/"):
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-            return open_file(path, *args, **kwargs)
+            return open_file(path, flags, *args, **kwargs)
 
-        monkeypatch.setattr(os, "open", refuse_lock)  # permissions do not bind root
-        monkeypatch.setattr(os, "access", lambda *_: False)
-        for catalog in (recordings.Catalog, _refuse_path):
-            monkeypatch.setattr(recordings, "Catalog", catalog)
-            with FileStorage(copy) as other:
-                assert [h.id for h in other.list_episodes(include_tuples=True)] == [made.id]
+        monkeypatch.setattr(os, "open", refuse)  # permissions do not bind root
+        for cache in ("empty", "filled already", None):
+            if cache is None:
+                monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", "/proc/none")
+            with FileStorage(storage.root) as other, warnings.catch_warnings():
+                warnings.simplefilter("ignore" if cache is None else "error")
+                assert [h.id for h in other.list_episodes(F("n_tuples") > 0, include_tuples=True)] == [
+                    made.id
+                ]
+                assert other.list_benchmarks() == [header]
                 with pytest.raises(StorageError, match="cannot change the storage: .*Permission denied"):
                     other.delete_episode(made.id)
+        assert state_of(storage.root) == before
+
+    def test_a_catalog_in_the_storage_is_left_alone_until_the_storage_changes(
+        self, storage: FileStorage
+    ) -> None:
+        header = storage.store_benchmark(query())
+        made = storage.record_episodes([episode(header.id), episode(header.id)])
+        victim = storage.root / "victim"
+        victim.write_bytes(b"not a child of it")
+        with sqlite3.connect(storage.root / "catalog.sqlite") as connection:
+            connection.execute("CREATE TABLE recording (id)")
+        connection.close()
+        journal = storage.root / "catalog.sqlite-journal"
+        journal.write_bytes(hot_journal(victim))
+        before = state_of(storage.root)
+        with FileStorage(storage.root) as other:
+            assert other.count_episodes(F("n_tuples") > 0) == 2
+            other.reindex()
+            assert other.count_episodes() == 2
+        verify_storage(storage.root)
+        assert state_of(storage.root) == before
+        storage.delete_episode(made[0].id)
+        storage.compact()
+        assert list(storage.root.glob("catalog*")) == []
+        assert victim.exists()
+
+    def test_a_directory_in_the_place_of_another_has_its_own_episodes(self, tmp_path: Path) -> None:
+        place, path = tmp_path / "lab", tmp_path / "lab" / "a.mcap"
+
+        def put(seed: int) -> int:
+            place.mkdir(exist_ok=True)
+            with RecordEpisodes(gym.make("CartPole-v1"), path, compression="none", attachments={}) as env:
+                env.reset(seed=seed)
+                env.step(0)
+            os.utime(path, ns=(0, 0))  # as archives that are made alike have it
+            return path.stat().st_size
+
+        sizes, found = set(), []
+        for seed, gone in ((1, None), (2, path), (3, place)):
+            if gone is not None:
+                shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
+            sizes.add(put(seed))
+            with FileStorage(place) as storage:
+                found += [h.seed for h in storage.list_episodes()]
+        assert len(sizes) == 1
+        assert found == [1, 2, 3]
 
     def test_a_killed_recording_is_there(self, storage: FileStorage, monkeypatch: pytest.MonkeyPatch) -> None:
         header = storage.store_benchmark(query())
@@ -751,10 +806,20 @@ def _work(storage: FileStorage, benchmark_id: str, worker: int) -> None:
         storage.list_episodes()
 
 
-def _refuse_path(path: Path | None) -> Catalog:
-    if path is not None:
-        raise StorageError("unable to open database file")
-    return Catalog(None)
+def state_of(root: Path) -> dict[str, tuple[int, int, int]]:
+    """Everything in a directory, with size, time of change and inode."""
+    found = {path: path.lstat() for path in (root, *root.rglob("*"))}
+    return {str(path): (status.st_size, status.st_mtime_ns, status.st_ino) for path, status in found.items()}
+
+
+def hot_journal(victim: Path) -> bytes:
+    """A rollback journal that SQLite plays back, deleting the file that it names as its super-journal."""
+    magic = bytes.fromhex("d9d505f920a163d7")
+    name = os.fsencode(victim)
+    header = magic + struct.pack(">IIIII", 0, 0, 2, 512, 4096)
+    lock_page = (1 << 30) // 4096 + 1
+    tail = struct.pack(">I", lock_page) + name + struct.pack(">II", len(name), sum(name)) + magic
+    return header.ljust(512, b"\0") + tail
 
 
 # --- the contract can fail ---

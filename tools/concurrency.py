@@ -42,6 +42,7 @@ from tupli_mcap import FileStorage, Recording, TupliDataset, TupliEnvWrapper
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.schema import EpisodeMetadataCallback, F, FilterEQ, RLTuple
+from tupli_mcap.storage.place import catalog_path
 
 FOREIGN = 1 << 20  # tokens of imported episodes start here
 _STEP = struct.Struct("<III")  # episode, steps acknowledged, whether it has ended
@@ -342,8 +343,10 @@ class Other(Worker):
 
     def vanish(self) -> None:
         """Somebody deletes the catalog's file."""
+        catalog = catalog_path(self.place.storage)
+        assert catalog is not None
         for suffix in ("", "-wal", "-shm"):
-            (self.place.storage / f"catalog.sqlite{suffix}").unlink(missing_ok=True)
+            catalog.with_name(f"{catalog.name}{suffix}").unlink(missing_ok=True)
 
     def share(self) -> None:
         target = self.place.root / f"bundle-{self.token}-{self.counts['share']}.mcap"
@@ -542,6 +545,7 @@ def main() -> None:
     options = parser.parse_args()
     root = Path(tempfile.mkdtemp(prefix="tupli-concurrency-"))
     os.environ["TUPLI_MCAP_CONFIG_DIR"] = str(root / "config")
+    os.environ["TUPLI_MCAP_CACHE_DIR"] = str(root / "cache")
     try:
         figures = run(root, options.seconds, options.seed, options.writers, options.others, options.patience)
     except WrongError as err:

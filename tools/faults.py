@@ -61,6 +61,7 @@ def main() -> int:
     options = parser.parse_args()
     base = Path(tempfile.mkdtemp(prefix="faults-"))
     os.environ["TUPLI_MCAP_CONFIG_DIR"] = str(base / "config")
+    os.environ["TUPLI_MCAP_CACHE_DIR"] = str(base / "cache")
     made = template(base / "made")
     runs: dict[str, Run] = {name: partial(run_case, name) for name in WORKLOADS}
     runs |= {name: partial(run_storage_case, name, made) for name in OPERATIONS}

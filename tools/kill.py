@@ -77,6 +77,7 @@ def live(chain: Chain, breakage: str, keep: str | None) -> list[Death]:
     directory = Path(tempfile.mkdtemp(prefix="tupli-mcap-kill-"))
     try:
         os.environ["TUPLI_MCAP_CONFIG_DIR"] = str(directory / "config")
+        os.environ["TUPLI_MCAP_CACHE_DIR"] = str(directory / "cache")
         place = directory / "here"
         place.mkdir()
         deaths = lives(chain.kind, chain.moments, chain.seed, place, breakage)

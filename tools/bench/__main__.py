@@ -94,6 +94,7 @@ def _measure(options: argparse.Namespace, log: _Log) -> dict[str, Any]:
         run = Run(Path(name), options.quick, rounds=2 if options.quick else options.rounds)
         os.environ[DATA] = name
         os.environ["TUPLI_MCAP_CONFIG_DIR"] = name
+        os.environ["TUPLI_MCAP_CACHE_DIR"] = f"{name}/cache"
         results["screens"] = play(run.directory / "frames.npy", 310 if options.quick else 1010)
         processes = start(run, options.names)
         bench = Workbench(run, processes, log.say, log.fail, rounds=run.rounds)

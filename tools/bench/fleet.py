@@ -112,4 +112,5 @@ def environment(directory: Path) -> dict[str, str]:
     home = directory / "home"
     home.mkdir(exist_ok=True)
     own = {DATA: str(directory), "PYTHONPATH": str(ROOT), "TMPDIR": str(directory), "HF_HOME": str(home)}
-    return {**os.environ, **threads, **own, "TUPLI_MCAP_CONFIG_DIR": str(home), "PYTHONWARNINGS": "ignore"}
+    ours = {"TUPLI_MCAP_CONFIG_DIR": str(home), "TUPLI_MCAP_CACHE_DIR": str(home / "cache")}
+    return {**os.environ, **threads, **own, **ours, "PYTHONWARNINGS": "ignore"}

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
-import shutil
-import tempfile
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +19,7 @@ from tupli_mcap.storage.database import (
     CatalogMovedError,
     CatalogUnusableError,
     Database,
+    MemoryDatabase,
 )
 from tupli_mcap.storage.rows import (
     EpisodeRow,
@@ -32,14 +31,12 @@ from tupli_mcap.storage.rows import (
     unescape_text,
 )
 from tupli_mcap.storage.sql import compile_filter
-from tupli_mcap.storage.sqlite import SqliteDialect, is_searchable, key_ddl
+from tupli_mcap.storage.sqlite import SqliteDialect, is_searchable, key_statements
 from tupli_mcap.storage.tables import (
     DECLARED,
     EPISODE,
     EPISODE_BITS,
     RECORDING,
-    declared_columns,
-    declared_index,
     in_order,
     of_one_recording,
 )
@@ -54,7 +51,6 @@ __all__ = [
 ]
 
 _ROWS_AT_ONCE: Final = 20_000
-_OWN_COLUMNS: Final = ("n_tuples", "env", "end", "episode_return", "seed", "created_at", "created_by")
 _FIELDS: Final = ", ".join(f'"{name}"' for name in StoredRow._fields)
 _PLACES: Final = ", ".join("?" * len(StoredRow._fields))
 _INSERT: Final = f"INSERT INTO {EPISODE.name} ({_FIELDS}) VALUES ({_PLACES})"
@@ -68,27 +64,22 @@ class Catalog:
     """
 
     def __init__(self, path: Path | None) -> None:
-        """Open or create the catalog at `path`; None is a temporary one, gone when it is closed.
+        """Open or create the catalog at `path`; None is one in memory, gone when it is closed.
 
-        A file that is no catalog, or one of another version, is replaced by an empty catalog.
+        A file that is no catalog, one of another version, or one that somebody else could write, is replaced by an
+        empty catalog.
 
         Raises:
             StorageError: The file cannot be opened or written.
         """
-        self._temporary = None if path else tempfile.mkdtemp(prefix="tupli-mcap-")
-        self.path = path or Path(self._temporary or "") / "catalog.sqlite"
-        self._database = Database(self.path)
-        self._finalizer = weakref.finalize(self, _release, self._database, self._temporary, os.getpid())
+        self.path = path
+        self._database = MemoryDatabase() if path is None else Database(path)
+        self._finalizer = weakref.finalize(self, self._database.close)
         try:
             self._database.open()
         except BaseException:
             self.close()
             raise
-
-    @property
-    def is_temporary(self) -> bool:
-        """Whether nobody else sees it."""
-        return self._temporary is not None
 
     @property
     def identity(self) -> int:
@@ -98,6 +89,14 @@ class Catalog:
     def is_current(self) -> bool:
         """Whether nobody has replaced or deleted the file of the last transaction."""
         return self._database.is_current()
+
+    def alone(self) -> AbstractContextManager[None]:
+        """Held by who brings the catalog up to date: what another one read a moment ago must not replace what is newer.
+
+        Raises:
+            CatalogUnusableError: The lock cannot be taken.
+        """
+        return self._database.alone()
 
     def close(self) -> None:
         """Release the file; closing twice is fine."""
@@ -228,7 +227,7 @@ class Catalog:
             top = connection.execute(select(func.max(DECLARED.c.number))).scalar()
             number = 0 if top is None else top + 1
             connection.execute(insert(DECLARED).values(key=key, number=number))
-            for statement in _key_statements(name, tuple(inside), number):
+            for statement in key_statements(key, number):
                 connection.exec_driver_sql(statement)
 
     def declared_keys(self) -> list[str]:
@@ -281,27 +280,3 @@ def _remove_recording(connection: Connection, relpath: str) -> None:
         delete(EPISODE).where(EPISODE.c.id >= first, EPISODE.c.id < first + (1 << EPISODE_BITS))
     )
     connection.execute(delete(RECORDING).where(RECORDING.c.id == number))
-
-
-def _quoted(name: str) -> str:
-    return f'"{name}"'
-
-
-def _key_statements(name: str, inside: tuple[str, ...], number: int) -> Iterator[str]:
-    """The SQL that declares a key: generated columns and an index, or an index where it has a column."""
-    if name == "metadata":
-        columns: tuple[str, ...] = declared_columns(number)
-        for column, expression in zip(columns, key_ddl(inside), strict=True):
-            # Without a type, so that a text of digits stays a text.
-            yield f"ALTER TABLE {EPISODE.name} ADD COLUMN {column} GENERATED ALWAYS AS ({expression}) VIRTUAL"
-    elif name in _OWN_COLUMNS:
-        columns = (name,)
-    else:
-        return  # of recordings there are few, and the others are lists
-    yield f"CREATE INDEX {declared_index(number)} ON {EPISODE.name} ({', '.join(map(_quoted, columns))})"
-
-
-def _release(database: Database, temporary: str | None, process: int) -> None:
-    database.close()
-    if temporary is not None and process == os.getpid():  # not a forked child's
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""The SQLite file of a catalog: opening, replacing, sharing it, and transactions."""
+"""The SQLite database of a catalog, a file or in memory: opening, replacing, sharing it, and transactions."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from sqlalchemy import URL, Connection, Dialect, Engine, Pool, create_engine, event
+from sqlalchemy import URL, Connection, Dialect, Engine, Pool, StaticPool, create_engine, event, select
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
-from sqlalchemy.schema import CreateIndex, CreateTable
 
 from tupli_mcap.errors import FilterError, StorageError
 from tupli_mcap.recording.lock import drop_private
-from tupli_mcap.storage.atomic import locked
-from tupli_mcap.storage.sqlite import register_functions
-from tupli_mcap.storage.tables import APPLICATION_ID, METADATA, VERSION
+from tupli_mcap.storage.atomic import Lock, LockError, locked
+from tupli_mcap.storage.place import is_private, make_private
+from tupli_mcap.storage.sqlite import key_statements, register_functions, table_statements
+from tupli_mcap.storage.tables import APPLICATION_ID, DECLARED, METADATA, VERSION
 from tupli_mcap.system import refused
 
 _BUSY_MS: Final = 30_000
@@ -31,8 +31,12 @@ _UNUSABLE: Final = (
     sqlite3.SQLITE_READONLY,
     sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_PERM,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_PROTOCOL,
 )
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_SCHEMA: Final = "SELECT type, name, tbl_name, sql FROM sqlite_master"
 _TOO_LARGE: Final = ("too many SQL variables", "Expression tree is too large", "parser stack overflow")
 
 
@@ -45,7 +49,7 @@ class CatalogMovedError(StorageError):
 
 
 class CatalogUnusableError(StorageError):
-    """The system does not let the catalog be written: the disk is full, the file is another user's, ..."""
+    """SQLite or the system does not let the catalog be used: the disk is full, the file stays locked, ..."""
 
 
 class Database:
@@ -57,6 +61,7 @@ class Database:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._engine = _engine(path, lock=_lock_file(path))
+        self._alone = Lock(path.with_name(f"{path.name}.sync.lock"))
         self._lock = threading.Lock()
         self._process = os.getpid()
         self._inherited: list[Pool] = []  # a parent's connections, which a child must not even close
@@ -83,6 +88,20 @@ class Database:
         """Put an empty catalog in the file's place."""
         with self._lock, _translated(self.path), _usable(self.path), _exclusive(self.path):
             self._create()
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep out the other threads and processes that would bring the catalog up to date; reentrant in a thread.
+
+        Raises:
+            CatalogUnusableError: The lock cannot be taken.
+        """
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(self._alone)
+            except LockError as err:
+                raise CatalogUnusableError(f"catalog {str(self.path)!r} cannot be used: {err}") from err
+            yield
 
     @contextlib.contextmanager
     def transaction(self, *, write: bool = False) -> Iterator[Connection]:
@@ -136,7 +155,7 @@ class Database:
             self._identity = None  # nothing keeps the file's number from being given again
 
     def _open(self) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        make_private(self.path.parent)
         for _ in range(_ATTEMPTS):
             if not _is_catalog(self._engine, self.path):
                 self._make()
@@ -171,7 +190,8 @@ class Database:
         self._engine.dispose()
         new = self.path.with_name(f"{self.path.name}.new")
         _remove(new)
-        engine = _engine(new, new=True)
+        os.close(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
+        engine = _engine(new)
         try:
             with engine.connect() as connection, connection.begin():
                 _create_tables(connection)
@@ -188,11 +208,84 @@ class Database:
         self._identity = None  # until it is open
 
 
-def _engine(path: Path, *, new: bool = False, lock: Path | None = None) -> Engine:
+class MemoryDatabase:
+    """The same in the memory of this process: one connection, which threads use one after another."""
+
+    path = None
+
+    def __init__(self) -> None:
+        self._engine = _prepared(
+            create_engine("sqlite://", poolclass=StaticPool, connect_args={"check_same_thread": False})
+        )
+        self._turn = threading.RLock()
+        self._process = os.getpid()
+        self._inherited: list[Pool] = []
+        self._opened = 0
+        self._is_made = False
+        self._closed = False
+
+    def open(self) -> None:
+        """Nothing is to be opened before the first transaction."""
+
+    def close(self) -> None:
+        """Forget everything; closing twice is fine."""
+        self._closed = True
+        self._leave_parent()
+        self._engine.dispose()
+
+    def replace(self) -> None:
+        """Empty it."""
+        self._leave_parent()
+        with self._turn:
+            self._engine.dispose()
+            self._is_made = False
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep out the other threads; reentrant in a thread."""
+        self._leave_parent()
+        with self._turn:
+            yield
+
+    @contextlib.contextmanager
+    def transaction(self, *, write: bool = False) -> Iterator[Connection]:
+        """A transaction, as `Database.transaction`; in a forked child, the catalog is empty at first."""
+        self._leave_parent()
+        with self._turn, _translated(None):
+            if self._closed:
+                raise StorageError("the catalog is closed")
+            with self._engine.connect() as connection:
+                if not self._is_made:
+                    with connection.begin():
+                        _create_tables(connection)
+                    self._is_made = True
+                    self._opened += 1
+                with connection.begin():
+                    yield connection
+
+    @property
+    def identity(self) -> int:
+        """Tells the database of the last transaction from those before it."""
+        return self._opened
+
+    def is_current(self) -> bool:
+        """Whether the database of the last transaction still is the one."""
+        return self._is_made and self._process == os.getpid()
+
+    def _leave_parent(self) -> None:
+        if self._process != os.getpid():
+            self._process = os.getpid()
+            self._turn = threading.RLock()  # held by a thread that is not here, perhaps
+            self._inherited.append(self._engine.pool)
+            self._engine.dispose(close=False)
+            self._is_made = False
+
+
+def _engine(path: Path, *, lock: Path | None = None) -> Engine:
     """An engine for a file; each connection is opened while the file is kept from being replaced by `lock`."""
     # A file that is deleted meanwhile must not come back, empty, without the lock of those who make one.
-    uri = f"file:{quote(str(path))}?mode={'rwc' if new else 'rw'}"
-    engine = create_engine(URL.create("sqlite", database=uri, query={"uri": "true"}))
+    uri = f"file:{quote(str(path))}?mode=rw"
+    engine = _prepared(create_engine(URL.create("sqlite", database=uri, query={"uri": "true"})))
 
     @event.listens_for(engine, "do_connect")
     def _connect(dialect: Dialect, _: object, args: Any, kwargs: Any) -> Any:
@@ -205,6 +298,12 @@ def _engine(path: Path, *, new: bool = False, lock: Path | None = None) -> Engin
                 connection.close()
                 raise
         return connection
+
+    return engine
+
+
+def _prepared(engine: Engine) -> Engine:
+    """An engine whose connections have our settings and functions."""
 
     @event.listens_for(engine, "connect")
     def _prepare(connection: sqlite3.Connection, _: object) -> None:
@@ -224,26 +323,59 @@ def _engine(path: Path, *, new: bool = False, lock: Path | None = None) -> Engin
 
 
 def _is_catalog(engine: Engine, path: Path) -> bool:
-    """Whether the file is a catalog of this version; False too if it is missing or no database at all."""
-    if not path.exists():
+    """Whether the file is a catalog of this version and nothing else; False too if it is missing.
+
+    A file is opened only if nobody else can write it, and never with a rollback journal: ours have none.
+    """
+    if not _is_ours(path):
         return False
     try:
         with engine.connect() as connection:
             application = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
             version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-            names = set(connection.exec_driver_sql("SELECT name FROM sqlite_master").scalars())
+            found = {tuple(row) for row in connection.exec_driver_sql(_SCHEMA)}
+            if (application, version) != (APPLICATION_ID, VERSION) or not _tables_only(found):
+                return False
+            keys = connection.execute(select(DECLARED.c.key, DECLARED.c.number).order_by(DECLARED.c.number))
+            return found == _schema_of([(key, number) for key, number in keys])
     except DBAPIError as err:
         if _is_damage(err) or not path.exists():
             return False
         raise
-    return (application, version) == (APPLICATION_ID, VERSION) and names >= set(METADATA.tables)
+    except FilterError:
+        return False  # it declares what is no key
+
+
+def _is_ours(path: Path) -> bool:
+    if os.path.lexists(path.with_name(f"{path.name}-journal")):
+        return False
+    beside = (path.with_name(path.name + suffix) for suffix in ("-wal", "-shm"))
+    try:
+        return all(is_private(file) and file.is_file() for file in (path, *filter(os.path.lexists, beside)))
+    except FileNotFoundError:
+        return False
+
+
+def _tables_only(found: set[tuple[Any, ...]]) -> bool:
+    """Whether a schema has our tables, and neither views nor triggers."""
+    names = {name for kind, name, *_ in found if kind == "table"}
+    return names == set(METADATA.tables) and all(kind in ("table", "index") for kind, *_ in found)
+
+
+def _schema_of(keys: Sequence[tuple[str, int]]) -> set[tuple[Any, ...]]:
+    """The schema of a catalog in which these keys are declared."""
+    with contextlib.closing(sqlite3.connect(":memory:")) as connection:
+        for statement in table_statements():
+            connection.execute(statement)
+        for key, number in keys:
+            for statement in key_statements(key, number):
+                connection.execute(statement)
+        return set(connection.execute(_SCHEMA))
 
 
 def _create_tables(connection: Connection) -> None:
-    for table in METADATA.sorted_tables:
-        connection.execute(CreateTable(table))
-        for index in sorted(table.indexes, key=lambda index: str(index.name)):
-            connection.execute(CreateIndex(index))
+    for statement in table_statements():
+        connection.exec_driver_sql(statement)
     connection.exec_driver_sql(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.exec_driver_sql(f"PRAGMA user_version = {VERSION}")
 
@@ -278,12 +410,8 @@ def _exclusive(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _shared(lock: Path) -> Iterator[None]:
-    """Keep others from replacing the file. A storage that can only be read has nobody who would."""
-    try:
-        fd = locked(lock, exclusive=False)
-    except OSError:
-        yield
-        return
+    """Keep others from replacing the file."""
+    fd = locked(lock, exclusive=False)
     try:
         yield
     finally:
@@ -300,21 +428,22 @@ def _usable(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _translated(path: Path) -> Iterator[None]:
+def _translated(path: Path | None) -> Iterator[None]:
     """Errors of SQLite and the system as those of this package."""
+    named = "the catalog in memory" if path is None else f"catalog {str(path)!r}"
     try:
         yield
     except DBAPIError as err:
         if _is_damage(err):
             raise CatalogDamagedError(
-                f"catalog {str(path)!r} is damaged ({err.orig}); delete it, it is rebuilt from the recordings"
+                f"{named} is damaged ({err.orig}); delete it, it is rebuilt from the recordings"
             ) from err
         if any(reason in str(err.orig) for reason in _TOO_LARGE):
             raise FilterError(f"the filter has too many values or parts for SQLite ({err.orig})") from err
         kind = CatalogUnusableError if _has_code(err, _UNUSABLE) else StorageError
-        raise kind(f"catalog {str(path)!r} cannot be used: {err.orig}") from err
+        raise kind(f"{named} cannot be used: {err.orig}") from err
     except SQLAlchemyError as err:
-        raise StorageError(f"catalog {str(path)!r} cannot be used: {err}") from err
+        raise StorageError(f"{named} cannot be used: {err}") from err
 
 
 def _is_damage(err: DBAPIError) -> bool:

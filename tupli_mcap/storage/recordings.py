@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import datetime
 import errno
-import os
 import re
 import secrets
 import stat
@@ -21,7 +20,7 @@ from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.recording.lock import is_locked, writers_kept_out
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.storage.ahead import Ahead, ReadRecording
-from tupli_mcap.storage.atomic import Lock, LockError, os_errors
+from tupli_mcap.storage.atomic import Lock, os_errors
 from tupli_mcap.storage.catalog import (
     Catalog,
     CatalogDamagedError,
@@ -31,6 +30,7 @@ from tupli_mcap.storage.catalog import (
 )
 from tupli_mcap.storage.common import LOCAL_USER, published_in
 from tupli_mcap.storage.entries import catalog_rows
+from tupli_mcap.storage.place import cache_dir, catalog_path
 from tupli_mcap.storage.scan import scan, stamp_of
 from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
 
@@ -38,6 +38,9 @@ __all__ = ["RecordingFiles", "episode_id"]
 
 _LIVE = -1  # in place of a stamp that must not be believed next time
 _ATTEMPTS = 100  # at a catalog that is deleted or replaced again and again
+_RESTLESS = "the catalog of {!r} is replaced all the time; try again later"
+_TROUBLE = (CatalogMovedError, CatalogDamagedError, CatalogUnusableError)
+_OLD_CATALOG = [f"catalog.sqlite{end}" for end in ("", "-wal", "-shm", "-journal", ".lock", ".new")]
 _T = TypeVar("_T")
 _EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
 
@@ -46,8 +49,8 @@ class RecordingFiles:
     """The recordings below a storage's root. Several processes may record, query and delete at once.
 
     The files are the truth. Before each query the catalog is brought up to date with those that have
-    appeared, changed (by size and time stamps) or gone; recordings that are being written are read anew each
-    time.
+    appeared, changed (by size, time stamps and inode) or gone; recordings that are being written are read anew each
+    time. The catalog lies in this user's cache directory, or in memory: a query writes nothing below the root.
     """
 
     def __init__(self, root: Path, lock: Lock, declared_keys: Iterable[str]) -> None:
@@ -69,7 +72,7 @@ class RecordingFiles:
     def of_recording(self, path: Path) -> list[EpisodeHeader]:
         """The episodes of a recording that has just been ingested, without a look at the others."""
         wanted = FilterEQ(key="recording", value=path.relative_to(self._root).as_posix())
-        with contextlib.suppress(CatalogMovedError):
+        with contextlib.suppress(*_TROUBLE):
             found = self._catalog.episodes(wanted)
             if found:
                 return found
@@ -85,20 +88,39 @@ class RecordingFiles:
 
     def _settled(self, ask: Callable[[], _T]) -> _T:
         """What a catalog says that is up to date, and that nobody has put another in the place of since."""
-        for _ in range(_ATTEMPTS):
-            self.sync()
-            with contextlib.suppress(CatalogMovedError):
-                found = ask()
-                if self._catalog.identity == self._synced and self._catalog.is_current():
-                    return found
-        raise StorageError(f"the catalog of {str(self._root)!r} is replaced all the time; try again later")
+
+        def settle() -> _T:
+            for _ in range(_ATTEMPTS):
+                self._sync()
+                with contextlib.suppress(CatalogMovedError):
+                    found = ask()
+                    if self._catalog.identity == self._synced and self._catalog.is_current():
+                        return found
+            raise StorageError(_RESTLESS.format(str(self._root)))
+
+        return self._with_usable_catalog(settle)
+
+    def _with_usable_catalog(self, work: Callable[[], _T]) -> _T:
+        """What `work` returns, done again where the catalog fails: with a new one if it is damaged, then in memory."""
+        try:
+            try:
+                return work()
+            except CatalogDamagedError:
+                self._catalog.reset()
+                return work()
+        except (CatalogDamagedError, CatalogUnusableError) as err:
+            self._use_memory(err)
+            return work()
 
     def explain(self, filter: BaseFilter | None) -> str:
-        self._declare_keys()
-        return self._catalog.explain(filter)
+        def ask() -> str:
+            self._declare_keys()
+            return self._catalog.explain(filter)
+
+        return self._with_usable_catalog(ask)
 
     def declare_key(self, key: str) -> None:
-        self._catalog.declare_key(key)
+        self._with_usable_catalog(lambda: self._catalog.declare_key(key))
         if key not in self._declared_keys:
             self._declared_keys.append(key)
 
@@ -112,7 +134,7 @@ class RecordingFiles:
         if match:
             # What the catalog knows already may be out of date in all but where the episode is.
             found = []
-            with contextlib.suppress(CatalogMovedError):
+            with contextlib.suppress(*_TROUBLE):
                 found = self._catalog.episodes(FilterEQ(key="id", value=uri), limit=1)
             if found and self._holds(found[0]):
                 return found[0]
@@ -158,22 +180,19 @@ class RecordingFiles:
     def _catalog(self) -> Catalog:
         if self._opened is None:
             try:
-                self._opened = Catalog(self._root / "catalog.sqlite")
+                with os_errors("no catalog can be kept in", cache_dir()):
+                    path = catalog_path(self._root)
+                self._opened = Catalog(path)
             except StorageError as err:
-                if not isinstance(err, CatalogUnusableError) and os.access(self._root, os.W_OK):
-                    raise
-                return self._use_temporary(err)
+                return self._use_memory(err)
         return self._opened
 
-    def _use_temporary(self, err: StorageError) -> Catalog:
-        """Go on with a catalog that lies elsewhere: what is recorded can be read even on a full disk."""
-        if os.access(self._root, os.W_OK):  # else a storage that can only be read, as its owner wants it
-            warnings.warn(f"{err}; the episodes are listed with a temporary one, made anew", stacklevel=7)
+    def _use_memory(self, err: StorageError) -> Catalog:
+        """Go on with a catalog in memory: what is recorded can be listed even where nothing can be written."""
+        advice = "TUPLI_MCAP_CACHE_DIR names another place; meanwhile the catalog is made in memory"
+        warnings.warn(f"{err}; {advice}", stacklevel=7)
         self.close()
-        try:
-            self._opened = Catalog(None)
-        except (OSError, StorageError):
-            raise err from None  # there is no place for another one either
+        self._opened = Catalog(None)
         return self._opened
 
     def _declare_keys(self) -> None:
@@ -184,24 +203,16 @@ class RecordingFiles:
                 self._catalog.declare_key(key)
             self._undeclared = False
 
-    def sync(self) -> None:
-        """Bring the catalog up to date with the files."""
-        try:
-            try:
-                self._sync()
-            except CatalogDamagedError:
-                self._catalog.reset()
-                self._sync()
-        except (CatalogUnusableError, LockError) as err:
-            self._use_temporary(err)
-            self._sync()
-
     def reindex(self) -> None:
         """Forget the catalog and fill it from the files."""
-        with contextlib.nullcontext() if self._catalog.is_temporary else self._lock:  # nobody sees half of it
-            self._catalog.reset()
-            self._warned.clear()
-            self._sync()
+
+        def make() -> None:
+            with self._catalog.alone():  # nobody sees half of it
+                self._catalog.reset()
+                self._warned.clear()
+                self._sync()
+
+        self._with_usable_catalog(make)
 
     def ingest(self, path: Path) -> None:
         """Catalogue one recording; a finished one without episodes is removed instead.
@@ -216,35 +227,31 @@ class RecordingFiles:
             raise StorageError(
                 f"expected a recording below {str(self._root)!r}, found {str(path)!r}"
             ) from err
+
+        def put() -> int:
+            with self._catalog.alone(), contextlib.suppress(CatalogMovedError):
+                return self._put(relative, path, stamp_of(path))
+            return -1  # the next query fills the new one
+
         with self._lock:
-            if not path.exists():  # without a step, or deleted since
-                self._catalog.remove_recording(relative)
-                return
-            held = -1
-            try:
-                held = self._put(relative, path, stamp_of(path))
-            except CatalogMovedError:
-                pass  # the next query fills the new one
-            except CatalogUnusableError as err:
-                self._use_temporary(err)
-                held = self._put(relative, path, stamp_of(path))
-            if held == 0:
-                self._remove(relative, path)
+            # without a step, or deleted since: the next query notices
+            if path.exists() and self._with_usable_catalog(put) == 0:
+                self._remove(path)
 
     def _sync(self) -> None:
+        """Bring the catalog up to date with the files."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(CatalogMovedError):
                 if self._sync_once():
                     return
-        raise StorageError(f"the catalog of {str(self._root)!r} is replaced all the time; try again later")
+        raise StorageError(_RESTLESS.format(str(self._root)))
 
     def _sync_once(self) -> bool:
         """False if the catalog was replaced meanwhile."""
         if not self._changes():
             self._declare_keys()
             return True
-        # One process at a time: what another one read a moment ago must not replace what is newer.
-        with contextlib.nullcontext() if self._catalog.is_temporary else self._lock:
+        with self._catalog.alone():
             self._follow(self._changes())
             self._declare_keys()
             return self._catalog.identity == self._synced
@@ -312,7 +319,7 @@ class RecordingFiles:
             if not self._is_copy(relative, path, stamp, recording.uuid, ends):
                 self._catalog.put_recording(
                     relative,
-                    stamp._replace(sidecar_mtime_ns=_LIVE) if live else stamp,
+                    stamp._replace(mixed=_LIVE) if live else stamp,
                     uuid=recording.uuid,
                     benchmark_id=recording.benchmark_id,
                     rows=catalog_rows(recording, sidecar, live=live),
@@ -324,7 +331,7 @@ class RecordingFiles:
         if not self._is_copy(relative, path, read.stamp, read.uuid, read.ends):
             self._catalog.put_stored(
                 relative,
-                read.stamp._replace(sidecar_mtime_ns=_LIVE) if read.live else read.stamp,
+                read.stamp._replace(mixed=_LIVE) if read.live else read.stamp,
                 uuid=read.uuid,
                 benchmark_id=read.benchmark_id,
                 rows=read.rows,
@@ -379,11 +386,11 @@ class RecordingFiles:
         # first the note: a crash, or a writer that goes on with the file, must not bring anything back
         sidecar.write(path)  # the next query notices
         if there <= numbers:
-            self._remove(relative, path)
+            self._remove(path)
         return len(there & numbers)
 
-    def _remove(self, relative: str, path: Path) -> None:
-        """Delete a recording, unless somebody is writing to it."""
+    def _remove(self, path: Path) -> None:
+        """Delete a recording, unless somebody is writing to it; the next query notices."""
         try:
             with writers_kept_out(path), os_errors("cannot delete the recording", path):
                 with Recording(path) as recording:
@@ -394,8 +401,6 @@ class RecordingFiles:
                     gone.unlink(missing_ok=True)
         except RecordingError:
             return
-        with contextlib.suppress(CatalogMovedError):
-            self._catalog.remove_recording(relative)
         self.remove_directory(path.parent)
 
     def remove_directory(self, directory: Path) -> None:
@@ -427,6 +432,9 @@ class RecordingFiles:
         Those that are being written are left alone. Episodes that stay keep their ids.
         """
         freed = files.remove_left(files.left_below(self._root))
+        for name in _OLD_CATALOG:  # earlier versions kept it here; it is opened no more
+            with contextlib.suppress(OSError):
+                (self._root / name).unlink()
         for item in sorted(scan(self._root)):
             path = self._root / item.relative
             with self._lock:

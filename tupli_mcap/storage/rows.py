@@ -29,11 +29,14 @@ _LONGEST_INT_BITS: Final = 1024  # what a float can hold
 
 
 class RecordingStamp(NamedTuple):
-    """What a recording's file and its sidecar looked like when they were catalogued (bytes, ns, ns)."""
+    """What a recording's file and its sidecar looked like when they were catalogued.
+
+    size (bytes), mtime_ns: of the recording. mixed: a hash of what else tells both files from others.
+    """
 
     size: int
     mtime_ns: int
-    sidecar_mtime_ns: int
+    mixed: int
 
 
 class EpisodeRow(NamedTuple):

@@ -62,8 +62,9 @@ def _stamp(entry: os.DirEntry[str], found: dict[str, os.DirEntry[str]]) -> Recor
 
 
 def _mix(status: os.stat_result, beside: os.stat_result | None) -> RecordingStamp:
-    if beside is None:
-        return RecordingStamp(status.st_size, status.st_mtime_ns, 0)
-    # A clock ticks every few ms only: a sidecar may be replaced twice in one tick, but not by its equal.
-    mixed = hash((beside.st_mtime_ns, beside.st_ino, beside.st_size)) & (2**63 - 1)
-    return RecordingStamp(status.st_size, status.st_mtime_ns, mixed)
+    # A clock ticks every few ms only, and archives set the times of their files: neither inodes nor times of change
+    # repeat where a file is replaced.
+    facts = [
+        (found.st_ino, found.st_ctime_ns, found.st_size) for found in (status, beside) if found is not None
+    ]
+    return RecordingStamp(status.st_size, status.st_mtime_ns, hash(tuple(facts)) & (2**63 - 1))

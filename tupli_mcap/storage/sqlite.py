@@ -15,20 +15,29 @@ import json
 import math
 import re
 import sqlite3
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Final
 
 from sqlalchemy import Text, and_, case, column, false, func, literal_column, null, or_, select, true
 from sqlalchemy.dialects import sqlite
+from sqlalchemy.schema import CreateIndex, CreateTable
 from sqlalchemy.sql.elements import ColumnElement
 
-from tupli_mcap.schema import BaseFilter, FilterIN, FilterType, compile_predicate, join_key
+from tupli_mcap.schema import BaseFilter, FilterIN, FilterType, compile_predicate, join_key, split_key
 from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import FLOAT_TAG, Scalar, against_floats, classify
 from tupli_mcap.storage.rows import escape_text, load_metadata, load_number
 from tupli_mcap.storage.sql import Condition, Operand, ScalarOperand, apply, bindable, whole_numbers
-from tupli_mcap.storage.tables import EPISODE, EPISODE_BITS, RECORDING, AsStored, declared_columns
+from tupli_mcap.storage.tables import (
+    EPISODE,
+    EPISODE_BITS,
+    METADATA,
+    RECORDING,
+    AsStored,
+    declared_columns,
+    declared_index,
+)
 
 _SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
 _FEW: Final = 16  # so many numbers of an IN are looked up one by one
@@ -39,6 +48,7 @@ _RELATIVE_BAND: Final = 1e-12
 _ABSOLUTE_BAND: Final = 1e-300
 
 _DIALECT: Final = sqlite.dialect()
+_OWN_COLUMNS: Final = ("n_tuples", "env", "end", "episode_return", "seed", "created_at", "created_by")
 
 _Value = ColumnElement[Any]
 
@@ -98,6 +108,31 @@ def key_ddl(path: tuple[str, ...]) -> list[str]:
         str(part.compile(dialect=_DIALECT, compile_kwargs={"literal_binds": True}))
         for part in _expressions(path, source)
     ]
+
+
+def table_statements() -> list[str]:
+    """The SQL that makes the tables of an empty catalog."""
+    made: list[CreateTable | CreateIndex] = []
+    for table in METADATA.sorted_tables:
+        indexes = sorted(table.indexes, key=lambda index: str(index.name))
+        made += [CreateTable(table), *(CreateIndex(index) for index in indexes)]
+    return [str(statement.compile(dialect=_DIALECT)) for statement in made]
+
+
+def key_statements(key: str, number: int) -> Iterator[str]:
+    """The SQL that declares a key: generated columns and an index, or an index where it has a column."""
+    name, *inside = split_key(key)
+    if name == "metadata":
+        columns: tuple[str, ...] = declared_columns(number)
+        for made, expression in zip(columns, key_ddl(tuple(inside)), strict=True):
+            # Without a type, so that a text of digits stays a text.
+            yield f"ALTER TABLE {EPISODE.name} ADD COLUMN {made} GENERATED ALWAYS AS ({expression}) VIRTUAL"
+    elif name in _OWN_COLUMNS:
+        columns = (name,)
+    else:
+        return  # of recordings there are few, and the others are lists
+    quoted = ", ".join(f'"{part}"' for part in columns)
+    yield f"CREATE INDEX {declared_index(number)} ON {EPISODE.name} ({quoted})"
 
 
 def register_functions(connection: sqlite3.Connection) -> None:

@@ -9,7 +9,7 @@ from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.types import UserDefinedType
 
 APPLICATION_ID: Final = 0x7475_706C  # "tupl": how SQLite tells whose file this is
-VERSION: Final = 1
+VERSION: Final = 2
 
 EPISODE_BITS: Final = 32
 """An episode's row id is its recording's id shifted left by this, plus its number: rows lie in file order."""
@@ -33,7 +33,7 @@ RECORDING: Final = Table(
     Column("path", Text, nullable=False, unique=True),
     Column("size", BigInteger, nullable=False),
     Column("mtime_ns", BigInteger, nullable=False),
-    Column("sidecar_mtime_ns", BigInteger, nullable=False),
+    Column("mixed", BigInteger, nullable=False),
     Column("uuid", Text, nullable=False, index=True),
     Column("benchmark_id", Text, nullable=False, index=True),
 )

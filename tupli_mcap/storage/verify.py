@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import sqlite3
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -24,13 +23,13 @@ from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.common import is_hash
 from tupli_mcap.storage.files import FileStorage
-from tupli_mcap.storage.scan import scan, stamp_of
+from tupli_mcap.storage.scan import scan
 from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
 
 __all__ = ["StorageReport", "verify_paths", "verify_storage"]
 
 _PIECE = 1 << 20
-_PARTS = ("benchmarks", "artifacts", "recordings", "catalog.sqlite", "storage.json")
+_PARTS = ("benchmarks", "artifacts", "recordings", "storage.json")
 
 
 @dataclass
@@ -60,7 +59,7 @@ class StorageReport:
 
 
 def verify_storage(storage: FileStorage | Path) -> StorageReport:
-    """Verifies all recordings of a storage (or any directory), its artifacts, benchmarks, notes and catalog."""
+    """Verifies all recordings of a storage (or any directory), its artifacts, benchmarks and notes."""
     root = storage.root if isinstance(storage, FileStorage) else storage
     return StorageReport(list(verify_paths([root])))
 
@@ -152,7 +151,7 @@ def _directory(root: Path) -> Iterator[VerifyReport]:
     report = VerifyReport(str(root), kind="storage")
     findings = Findings(report)
     is_storage = any((root / part).exists() for part in _PARTS)
-    for check in (_leftovers, *((_artifacts, _benchmarks, _catalog) if is_storage else ())):
+    for check in (_leftovers, *((_artifacts, _benchmarks) if is_storage else ())):
         _guarded(check, root, findings)
     if is_storage or report.problems:
         yield report
@@ -261,53 +260,3 @@ def _benchmarks(root: Path, findings: Findings) -> None:
                     findings.error("benchmark", what, advice="store the artifact again, or import its bundle")
         except (NotFoundError, TupliError) as err:
             findings.error("benchmark", str(err), advice="store it again, or import its bundle")
-
-
-def _catalog(root: Path, findings: Findings) -> None:
-    """The catalog against the files. It is only an index: what is wrong with it is a note."""
-    path = root / "catalog.sqlite"
-    if not path.exists():
-        return
-    advice = "the next query brings it up to date; tupli-mcap reindex makes it anew"
-    try:
-        rows = _catalogued(path)
-    except (sqlite3.Error, OSError) as err:
-        findings.note("catalog", f"the catalog cannot be read: {err}", advice)
-        return
-    here = {item.relative: item.stamp for item in scan(root)}
-    gone = sorted(set(rows) - set(here))
-    if gone:
-        findings.note("catalog", f"it lists recordings that are gone: {', '.join(gone[:5])}", advice)
-    for relative in sorted(set(rows) & set(here)):
-        stamp, episodes, steps = rows[relative]
-        if stamp != tuple(stamp_of(root / relative)):
-            continue  # changed since; noticed by the next query
-        found = _count(root / relative)
-        if found is not None and found != (episodes, steps):
-            what = f"it lists {episodes} episodes, {steps} steps of {relative}, where there are {found[0]}, {found[1]}"
-            findings.error("catalog", what, advice="make it anew with tupli-mcap reindex")
-
-
-def _catalogued(path: Path) -> dict[str, tuple[tuple[int, int, int], int, int]]:
-    """Stamp, episodes and steps of each recording in a catalog."""
-    connection = sqlite3.connect(f"file:{path.as_posix()}?mode=ro", uri=True)
-    try:
-        found = connection.execute(
-            "SELECT path, size, mtime_ns, sidecar_mtime_ns, COUNT(e.id), COALESCE(SUM(n_tuples), 0) FROM recording r "
-            "LEFT JOIN episode e ON e.recording_id = r.id GROUP BY r.id"
-        )
-        return {row[0]: (tuple(row[1:4]), row[4], row[5]) for row in found}
-    finally:
-        connection.close()
-
-
-def _count(path: Path) -> tuple[int, int] | None:
-    """Episodes and steps of a recording without the deleted ones; None if it cannot be read."""
-    try:
-        deleted = list(Sidecar.read(path).deleted)
-        with Recording(path) as recording:
-            rows = recording.index
-            rows = rows[[int(number) not in deleted for number in rows["episode"]]] if deleted else rows
-            return len(rows), int(rows["length"].sum())
-    except (TupliError, OSError):
-        return None

@@ -43,7 +43,7 @@ def filter_catalog(run: Run) -> Iterator[Target]:
             for episode, score in enumerate(part)
         ]
         name = uuid.UUID(int=number).hex
-        stamp = RecordingStamp(size=1, mtime_ns=1, sidecar_mtime_ns=0)
+        stamp = RecordingStamp(size=1, mtime_ns=1, mixed=0)
         catalog.put_recording(f"{name}.mcap", stamp, uuid=name, benchmark_id="bench", rows=rows)
     query = FilterGEQ(key="metadata.score", value=total - matches)
     found = catalog.episodes(query)
