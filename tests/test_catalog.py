@@ -26,6 +26,7 @@ from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, EpisodeRow,
 from tupli_mcap.storage.place import cache_dir, catalog_path
 from tupli_mcap.storage.rows import escape_text, unescape_text
 
+CREATED_NS = 1_795_251_600_000_001_999
 STAMP = RecordingStamp(size=10, mtime_ns=20, mixed=30)
 TEXTS = st.text() | st.sampled_from(["\x00", "\x01", "\ud7ff", "\ud800", "\udfff", "\ue000", "a\x00\x01"])
 
@@ -38,7 +39,7 @@ def row(episode: int = 0, metadata: Any = None, **changes: Any) -> EpisodeRow:
         end="terminal",
         episode_return=1.5,
         seed=7,
-        created_at="2026-11-21T09:00:00+00:00",
+        created_at=CREATED_NS,
         created_by="me",
         published_in='["me"]',
         metadata=metadata if isinstance(metadata, str) else dumps_plain(metadata or {}),
@@ -79,7 +80,7 @@ class TestRows:
             id="f" * 32 + "-3",
             created_by="me",
             published_in=["me"],
-            created_at="2026-11-21T09:00:00+00:00",
+            created_at="2026-11-21T09:00:00.000001+00:00",
             benchmark_id="b",
             metadata=metadata,
             n_tuples=22,
@@ -543,7 +544,7 @@ path, name = Path(sys.argv[1]), sys.argv[2]
 sys.stdin.readline()
 with Catalog(path) as catalog:
     for n in range(10):
-        rows = [EpisodeRow(i, 0, 1, "terminal", 1.0, None, "", "", "[]", '{"a": %d}' % i) for i in range(20)]
+        rows = [EpisodeRow(i, 0, 1, "terminal", 1.0, None, 0, "", "[]", '{"a": %d}' % i) for i in range(20)]
         catalog.put_recording(f"{name}-{n}", RecordingStamp(1, 2, 3), uuid=name, benchmark_id="b", rows=rows)
         catalog.declare_key(f"metadata.score{n % 3}")
         assert len(catalog.episodes()) >= 20

@@ -573,13 +573,18 @@ class TestLook:
 
     def test_episodes_of_a_file(self, cartpole: Path, here: Path) -> None:
         header, *rows = ok("episodes", cartpole).splitlines()
-        assert header.split() == ["EPISODE", "STEPS", "RETURN", "END", "SEED", "ENDED", "AT"]
+        assert header.split() == ["EPISODE", "STEPS", "RETURN", "END", "SEED", "ENDED"]
         with Recording(cartpole) as recording:
             assert [int(row.split()[1]) for row in rows] == recording.index["length"].tolist()
             long = int((recording.index["length"] > 20).sum())
         assert len(run("episodes", cartpole, "--filter", "n_tuples > 20", "--json").json) == long
         assert len(run("episodes", cartpole, "--limit", 2, "--json").json) == 2
         assert ok("episodes", cartpole, "--filter", "n_tuples > 1000") == "no episodes\n"
+        shown = re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[+-]\d\d:\d\d", rows[0])
+        assert shown is not None
+        for found in (f'ended = "{shown[0]}"', f'created_at >= "{shown[0][:19]}" and ended <= "today"'):
+            assert len(run("episodes", cartpole, "--filter", found, "--json").json) == len(rows)
+        assert "expected a time, such as" in fails("episodes", cartpole, "--filter", "ended > 5")
 
     def test_episodes_of_a_storage(self, filled: tuple[Path, str, str], here: Path) -> None:
         told = run("episodes", filled[0], "--json").json

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
+import re
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -35,6 +38,7 @@ from tupli_mcap.schema import (
     parse_filter,
     split_key,
 )
+from tupli_mcap.schema.times import local_text, span_of, time_ns
 from tupli_mcap.storage.catalog import Catalog, EpisodeRow, RecordingStamp
 
 STAMP = RecordingStamp(1, 2, 3)
@@ -114,37 +118,64 @@ values = st.recursive(
 )
 items = st.dictionaries(names | surrogates, values, max_size=4)
 metadata_keys = st.lists(names, min_size=1, max_size=3).map(lambda path: join_key(["metadata", *path]))
-HEADER_KEYS = [
-    *(
-        "n_tuples",
-        "env",
-        "episode",
-        "seed",
-        "episode_return",
-        "terminated",
-        "timeout",
-        "end",
-        "id",
-        "created_at",
-    ),
-    *("created_by", "benchmark_id", "recording", "published_in", "metadata", "end.x"),
-]
-keys = metadata_keys | st.sampled_from(HEADER_KEYS)
 own_texts = st.sampled_from(
     [f"{UUID}-0", f"{UUID}-1", f"{UUID}-", "x-0", "terminal", "timeout", "me", "bench"]
 )
+MOMENTS = [
+    "2026-03-29T00:30:00",
+    "2026-03-29T01:59:59.5",
+    "2026-10-25T01:30:00.000001",
+    "2026-11-21",
+    "2031-01-01",
+]
+times = st.sampled_from(
+    [
+        *(
+            "2026-03-29",
+            "2026-10-25",
+            "2026-11-21",
+            "2026-03-29 01:30",
+            "2026-03-29T02:30+01:00",
+            "2026-10-25 02:30",
+        ),
+        *("2026-03-29T01:59:59.5Z", "2026-03-29 01:59:59Z", "2026-10-25T01:30:00.000001999+00:00"),
+        *("today", "Yesterday", "7d ago", "3 h ago", "90min ago", "2w ago", "0001-01-02", "9998-12-31"),
+        *(1_795_219_200 * 10**9, 1_795_219_200 * 10**9 + 1, 2**63 - 1, 10**17),
+        *(
+            datetime.date(2026, 11, 21),
+            datetime.datetime(2026, 11, 21),
+            datetime.datetime(2026, 3, 29, 2, 30),
+        ),
+        datetime.datetime(2026, 3, 29, 0, 30, tzinfo=datetime.UTC),
+    ]
+)
+real = numbers.filter(lambda number: number == number)
+ends = st.sampled_from(["terminal", "timeout", "interrupted", ""])
+FACTS: dict[str, st.SearchStrategy[Any]] = {
+    **dict.fromkeys(("n_tuples", "env", "episode"), real),
+    **dict.fromkeys(("seed", "episode_return"), real | st.none()),
+    **dict.fromkeys(("terminated", "timeout"), st.booleans()),
+    **dict.fromkeys(("id", "created_by", "benchmark_id", "recording"), texts | own_texts),
+    **dict.fromkeys(("created_at", "ended"), times),
+    "end": ends,
+}
+"""What each key that is no metadata may be compared with."""
+operations = st.sampled_from([FilterEQ, FilterNE, FilterIN, FilterGT, FilterGEQ, FilterLT, FilterLEQ])
 
 
 @st.composite
 def leaves(draw: st.DrawFn) -> BaseFilter:
-    key, kind = (
-        draw(keys),
-        draw(st.sampled_from([FilterEQ, FilterNE, FilterIN, FilterGT, FilterGEQ, FilterLT, FilterLEQ])),
-    )
+    kind = draw(operations)
+    key = draw(metadata_keys | st.sampled_from(sorted(FACTS)))
+    given = FACTS.get(key, scalars | own_texts)
     if kind is FilterIN:
-        return FilterIN(key=key, value=draw(st.lists(scalars | own_texts, max_size=20)))
-    ordered = numbers | texts | own_texts
-    return kind(key=key, value=draw(ordered if kind not in (FilterEQ, FilterNE) else scalars | own_texts))
+        return FilterIN(key=key, value=draw(st.lists(given, max_size=20)))
+    if kind not in (FilterEQ, FilterNE):
+        if key in ("terminated", "timeout"):
+            kind = FilterNE
+        else:
+            given = given.filter(lambda value: not (value is None or isinstance(value, bool)))
+    return kind(key=key, value=draw(given))
 
 
 filters = st.recursive(
@@ -165,6 +196,7 @@ rows = st.fixed_dictionaries(
         "episode_return": st.none() | st.floats() | st.sampled_from([0.0, 1.0, 2.0**63]),
         "seed": st.none() | st.integers(0, 3) | st.integers(-(2**130), 2**130),
         "created_by": st.sampled_from(["me", "you", "a\x00", "\ud800"]),
+        "created_at": st.sampled_from(MOMENTS),
     }
 )
 
@@ -172,14 +204,13 @@ rows = st.fixed_dictionaries(
 def header_of(number: int, row: dict[str, Any]) -> EpisodeHeader:
     return EpisodeHeader(
         id=f"{UUID}-{number}",
-        created_at="2026-01-01",
         published_in=["me"],
         benchmark_id="bench",
         terminated=row["end"] == "terminal",
         timeout=row["end"] == "timeout",
         episode=number,
         recording="r.mcap",
-        **row,
+        **{"created_at": "2026-01-01", **row},
     )
 
 
@@ -192,7 +223,7 @@ def fill(catalog: Catalog, headers: list[EpisodeHeader]) -> None:
             end=h.end,
             episode_return=h.episode_return,
             seed=h.seed,
-            created_at=h.created_at,
+            created_at=time_ns(h.created_at) or 0,
             created_by=h.created_by,
             published_in=json.dumps(h.published_in),
             metadata=dumps_plain(h.metadata),
@@ -219,6 +250,16 @@ def catalogs() -> Iterator[tuple[Catalog, Catalog]]:
         yield plain, declared
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _zone() -> Iterator[None]:
+    """A zone of two offsets."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+        time.tzset()
+        yield
+    time.tzset()
+
+
 class TestOneMeaning:
     @settings(max_examples=400, deadline=None)
     @given(data=st.lists(rows, min_size=1, max_size=4), filter=filters)
@@ -236,6 +277,31 @@ class TestOneMeaning:
                 header.episode for header in headers if not predicate(header)
             ]
             assert catalog.count(again) == len(expected)
+
+    @settings(max_examples=300, deadline=None)
+    @given(
+        key=st.sampled_from([*FACTS, "published_in", "metadata", "end.x", "n_tuples.x"]),
+        kind=operations,
+        value=scalars | own_texts | times,
+    )
+    def test_what_is_refused_in_memory_is_refused_in_sqlite(
+        self, catalogs: tuple[Catalog, Catalog], key: str, kind: Any, value: Any
+    ) -> None:
+        def refusal(ask: Any) -> str | None:
+            try:
+                ask()
+            except FilterError as err:
+                return str(err)
+            return None
+
+        try:
+            asked = kind(key=key, value=[value] if kind is FilterIN else value)
+        except FilterError:
+            return
+        said = refusal(lambda: compile_predicate(asked, EpisodeHeader))
+        assert said == refusal(lambda: catalogs[0].count(asked)) == refusal(lambda: catalogs[1].count(asked))
+        if key not in FACTS:
+            assert said is not None
 
     @settings(max_examples=300, deadline=None)
     @given(filter=filters)
@@ -269,10 +335,129 @@ class TestOneMeaning:
         with Catalog(None) as catalog:
             fill(catalog, [header_of(i, base_row({"x": number}, number)) for i, number in enumerate(NUMBERS)])
             for operation in (FilterEQ, FilterNE, FilterGT, FilterGEQ, FilterLT, FilterLEQ):
-                for key in ("metadata.x", "episode_return", "seed"):
+                for key in ("metadata.x", *(("episode_return", "seed") if value == value else ())):
                     asked = operation(key=key, value=value)
                     expected = [h.episode for h in catalog.episodes() if compile_predicate(asked)(h)]
                     assert [h.episode for h in catalog.episodes(asked)] == expected, asked
+
+
+class TestTimes:
+    """In CET: the clocks of 2026 are changed on 29 March and 25 October."""
+
+    @pytest.mark.parametrize(
+        ("value", "first", "length"),
+        [
+            ("2026-11-21", "2026-11-20T23:00:00", 86_400),
+            ("2026-03-29", "2026-03-28T23:00:00", 23 * 3600),
+            ("2026-10-25", "2026-10-24T22:00:00", 25 * 3600),
+            ("2026-11-21 09:30", "2026-11-21T08:30:00", 60),
+            ("2026-11-21T09:30", "2026-11-21T08:30:00", 60),
+            ("2026-07-01 09:30:05", "2026-07-01T07:30:05", 1),
+            ("2026-07-01 09:30:05Z", "2026-07-01T09:30:05", 1),
+            ("2026-07-01 09:30:05+0530", "2026-07-01T04:00:05", 1),
+            (" 2026-07-01T09:30:05,25 -01:00", "2026-07-01T10:30:05.25", 0.01),
+            ("2026-07-01T09:30:05.123456789+00:00", "2026-07-01T09:30:05.123456", 1e-6),
+            ("today", "2026-11-20T23:00:00", 86_400),
+            ("YESTERDAY", "2026-11-19T23:00:00", 86_400),
+            ("7d ago", "2026-11-14T08:00:00", 1e-6),
+            ("2 W ago", "2026-11-07T08:00:00", 1e-6),
+            ("3h ago", "2026-11-21T05:00:00", 1e-6),
+            ("90 min ago", "2026-11-21T06:30:00", 1e-6),
+            (1_795_248_000_123_456_789, "2026-11-21T08:00:00.123456", 1e-6),
+        ],
+    )
+    def test_what_a_value_names(self, value: Any, first: str, length: float) -> None:
+        found = span_of(value, datetime.datetime.fromisoformat("2026-11-21T09:00:00+01:00"))
+        assert found.start == time_ns(first)
+        assert found.stop - found.start == round(length * 10**9)
+
+    def test_what_a_table_shows_is_what_is_found(self) -> None:
+        created_at = "2026-11-21T08:30:05.999999+00:00"
+        shown = local_text(time_ns(created_at) or 0)
+        assert shown == "2026-11-21 09:30:05+01:00"
+        header = header_of(0, {**base_row({}, 0), "created_at": created_at})
+        local = shown.removesuffix("+01:00")
+        moment = datetime.datetime.fromisoformat(created_at)
+        with Catalog(None) as catalog:
+            fill(catalog, [header])
+            assert catalog.episodes()[0].created_at == created_at
+            for key in (F("created_at"), F("ended")):
+                for value in (shown, local, local.replace(" ", "T"), created_at, moment, moment.date()):
+                    true = [key == value, key >= value, key <= value, key.isin(["2001-01-01", value])]
+                    for asked in (*true, key > "2026-11-20", key < "2026-11-22"):
+                        assert compile_predicate(asked, EpisodeHeader)(header), asked
+                        assert catalog.count(asked) == 1, asked
+                        assert parse_filter(format_filter(asked)) == asked
+                    for asked in (key != value, key > value, key < value, ~(key == value)):
+                        assert not compile_predicate(asked, EpisodeHeader)(header), asked
+                        assert catalog.count(asked) == 0, asked
+
+    def test_an_index_leads_to_times(self) -> None:
+        with Catalog(None) as catalog:
+            catalog.declare_key("ended")
+            assert "USING INDEX ix_key_0 (created_at>? AND created_at<?)" in catalog.explain(
+                F("created_at") == "2026-11-21"
+            )
+
+    def test_facts_that_say_no_time(self) -> None:
+        header = header_of(0, {**base_row({}, 0), "created_at": "some day"})
+        for asked, expected in ((F("created_at") > "2001-01-01", False), (F("created_at") != "today", True)):
+            assert compile_predicate(asked, EpisodeHeader)(header) == expected
+
+    @pytest.mark.parametrize(
+        ("filter", "message"),
+        [
+            *(
+                (
+                    F(key) > value,
+                    f"'{key}' is a time: expected a time, such as .*; found {re.escape(repr(value))}",
+                )
+                for key in ("created_at", "ended")
+                for value in (
+                    5,
+                    1_795_248_000,
+                    2**63,
+                    1.8e18,
+                    "soon",
+                    "2026-13-01",
+                    "2026-11-21 25:00",
+                    "1d",
+                    "",
+                )
+            ),
+            *(
+                (
+                    F("created_at") == value,
+                    f"'created_at' is a time: expected .*; found {re.escape(repr(value))}",
+                )
+                for value in (None, True, math.nan, "9999-12-31", "999999999w ago")
+            ),
+            (F("n_tuples") < "20", "'n_tuples' is a number: expected such a value, found '20'"),
+            (F("n_tuples").isin([1, None]), "'n_tuples' is a number: expected such a value, found None"),
+            (F("seed") == True, "'seed' is a number or null: expected such a value, found True"),  # noqa: E712
+            (
+                F("episode_return") != math.nan,
+                "nan is equal to nothing; 'episode_return' <= inf is true of all",
+            ),
+            (F("terminated") == 1, "'terminated' is true or false: expected such a value, found 1"),
+            (F("end") > 1, "'end' is a text: expected such a value, found 1"),
+            (F("end") == "terminated", "'end' is terminal, timeout or interrupted, found 'terminated'"),
+            (F("end.x") == 1, "filter key 'end.x': end is a text and has no parts"),
+            (F("published_in") == "lab", "'published_in' holds several values and is equal to none"),
+            (F("metadata") != 1, "'metadata' holds several values .* name one, such as metadata.score"),
+        ],
+        ids=repr,
+    )
+    def test_what_can_never_be_true_is_refused(self, filter: BaseFilter, message: str) -> None:
+        with pytest.raises(FilterError, match=message):
+            compile_predicate(filter, EpisodeHeader)
+        with pytest.raises(FilterError, match=message), Catalog(None) as catalog:
+            catalog.count((F("n_tuples") > 0) & ~filter)
+
+    def test_dates_are_about_times(self) -> None:
+        for value in (datetime.date(2026, 11, 21), datetime.datetime(2026, 11, 21)):
+            with pytest.raises(FilterError, match=r"'metadata.day' holds no times: expected a text"):
+                F("metadata.day").isin([value])
 
 
 def base_row(metadata: dict[str, Any], number: float) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import math
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
 from typing import Any, Literal, NamedTuple
 
 from tupli_mcap.cli.terminal import say, say_json, say_styled, terminal_width, visible
@@ -171,18 +170,20 @@ def bytes_of(size: int) -> str:
 
 
 def time_of(time_ns: int) -> str:
-    """A wall clock time (ns) in the local time zone, to the second; empty for 0."""
+    """A wall clock time (ns) in the local time zone, to the second, as filters take it; empty for 0."""
     if not time_ns:
         return ""
-    return datetime.fromtimestamp(time_ns // 10**9, UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
+    from tupli_mcap.schema.times import local_text
+
+    return local_text(time_ns)
 
 
 def when(created_at: str) -> str:
     """The same for an ISO 8601 time; one that is none is shown as it is."""
-    try:
-        return datetime.fromisoformat(created_at).astimezone().strftime("%Y-%m-%d %H:%M:%S")
-    except (ValueError, OverflowError):  # the year 1 in another zone
-        return created_at
+    from tupli_mcap.schema.times import time_ns
+
+    found = time_ns(created_at)
+    return created_at if found is None else time_of(found)
 
 
 def _fit(columns: Sequence[Column], widths: list[int]) -> None:

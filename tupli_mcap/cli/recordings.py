@@ -306,8 +306,9 @@ def _episodes(
 ) -> None:
     """List episodes of a recording or a storage.
 
-    Filters compare keys of episodes (n_tuples, end, episode_return, seed, env, metadata.<name>, ...) with
-    = != > >= < <= in, and join with and, or, not.
+    Filters compare keys of episodes (n_tuples, end, episode_return, seed, env, ended, metadata.<name>, ...) with
+    = != > >= < <= in, and join with and, or, not. Times are "2026-11-23", "2026-11-23 03:31:07", "yesterday",
+    "7d ago", ...: a text means all of the time that it names.
     """
     wanted = filter_of(filter_text)
     headers: Sequence[EpisodeHeader]
@@ -338,7 +339,7 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
         Column("RETURN", "right"),
         Column("END"),
         Column("SEED", "right"),
-        *([Column("ENDED AT")] if roomy else []),
+        *([Column("ENDED")] if roomy else []),
         Column("METADATA", shrink="end"),
     )
     rows = []

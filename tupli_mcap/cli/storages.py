@@ -108,8 +108,9 @@ def _list_episodes(
 ) -> None:
     """List the episodes of a storage.
 
-    Filters compare id, benchmark_id, recording, n_tuples, end, episode_return, seed, env, created_at,
-    metadata.<name>, ... with = != > >= < <= in, and join with and, or, not.
+    Filters compare id, benchmark_id, recording, n_tuples, end, episode_return, seed, env, ended,
+    metadata.<name>, ... with = != > >= < <= in, and join with and, or, not. Times are "2026-11-23",
+    "2026-11-23 03:31:07", "yesterday", "7d ago", ...: a text means all of the time that it names.
     """
     with open_storage(storage_path) as storage:
         headers = storage.list_episodes(filter_of(filter_text), limit=limit)

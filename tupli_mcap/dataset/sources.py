@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-import numpy as np
 from pydantic import ValidationError
 
 from tupli_mcap.errors import FormatError, RecordingError, TupliError
@@ -25,6 +24,7 @@ from tupli_mcap.schema import (
     compile_predicate,
 )
 from tupli_mcap.schema.models import unchecked_header
+from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.storage import FileStorage, TupliStorage
 from tupli_mcap.storage.document import restored
 from tupli_mcap.storage.sidecar import Sidecar
@@ -232,13 +232,13 @@ def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
 def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:
     """Headers as a storage would list them; `recording` of each is the name the file was opened by."""
     index = recording.index
-    times = np.datetime_as_string(index["end_time"].astype("datetime64[ns]"), unit="us", casting="unsafe")
     columns: list[Any] = [
-        index[field].tolist() for field in ("episode", "env", "length", "end", "return", "has_seed", "seed")
+        index[field].tolist()
+        for field in ("episode", "env", "length", "end", "return", "has_seed", "seed", "end_time")
     ]
     uuid, benchmark_id = recording.uuid, recording.benchmark_id
     for number, env, length, end, total, has_seed, seed, time, metadata in zip(
-        *columns, times.tolist(), recording.all_metadata(), strict=True
+        *columns, recording.all_metadata(), strict=True
     ):
         if number in deleted:
             continue
@@ -247,7 +247,7 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
                 "id": f"{uuid}-{number}",
                 "created_by": "",
                 "published_in": [],
-                "created_at": f"{time}+00:00",
+                "created_at": iso_utc(time),
                 "benchmark_id": benchmark_id,
                 "metadata": {} if metadata == "{}" else _metadata(metadata, name, number),
                 "n_tuples": length,
@@ -283,7 +283,7 @@ def _benchmark_header(recording: Recording) -> BenchmarkHeader:
     return BenchmarkHeader(
         id=recording.benchmark_id,
         created_by="",
-        created_at=f"{np.datetime64(recording.created_ns // 1000, 'us')}+00:00",
+        created_at=iso_utc(recording.created_ns),
         hash=recording.benchmark_id,
         metadata=metadata,
         environment=environment,

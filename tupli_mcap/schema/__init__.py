@@ -1,5 +1,6 @@
 """What benchmarks, artifacts and episodes are described by, and the filters over them. No I/O."""
 
+from tupli_mcap.schema.facts import bound, check_keys, filter_keys
 from tupli_mcap.schema.field import F
 from tupli_mcap.schema.filters import (
     BaseFilter,
@@ -32,7 +33,7 @@ from tupli_mcap.schema.models import (
     RLTuple,
 )
 from tupli_mcap.schema.parse import format_filter, parse_filter
-from tupli_mcap.schema.predicate import check_keys, compile_predicate, evaluate_columns, filter_keys
+from tupli_mcap.schema.predicate import compile_predicate, evaluate_columns
 
 __all__ = [
     "ArtifactMetadata",
@@ -61,6 +62,7 @@ __all__ = [
     "FilterOR",
     "FilterType",
     "RLTuple",
+    "bound",
     "check_keys",
     "compile_predicate",
     "evaluate_columns",

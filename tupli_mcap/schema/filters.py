@@ -15,12 +15,16 @@ A filter is true or false of an item (nested mappings of JSON values), never unk
 - **IN** is true where EQ is true of any of its values. An empty **AND** is true; an empty **OR** or IN is
   false.
 
+- **Times** (`created_at`, and `ended`, which is the same of an episode) compare as times, whatever their zones: see
+  `tupli_mcap.schema.times`.
+
 What has no meaning is a `FilterError`: an unknown top-level key, a value that is no scalar, ordering by
-anything but a number or a text.
+anything but a number or a text, a fact compared with a value of a kind that it never has.
 """
 
 from __future__ import annotations
 
+import datetime
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
@@ -31,6 +35,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     ValidationError,
+    ValidationInfo,
     field_serializer,
     field_validator,
     model_validator,
@@ -38,6 +43,7 @@ from pydantic import (
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.keys import join_key, split_key
+from tupli_mcap.schema.times import text_of
 from tupli_mcap.schema.values import classify, tag_float
 
 
@@ -59,6 +65,7 @@ class FilterType(StrEnum):
 COMBINING: Final = frozenset({FilterType.AND, FilterType.OR, FilterType.NOT})
 ORDERING: Final = frozenset({FilterType.GT, FilterType.GEQ, FilterType.LT, FilterType.LEQ})
 MAX_DEPTH: Final = 32
+_TIME_KEYS: Final = ("created_at", "ended")
 _MAX_INT_BITS: Final = 13_000  # Python neither writes nor reads decimal integers much longer
 
 _SYMBOL: Final[Mapping[FilterType, str]] = {
@@ -112,14 +119,15 @@ class BaseFilter(BaseModel):
 
     @field_validator("value", mode="before")
     @classmethod
-    def _plain_value(cls, value: Any) -> Any:
+    def _plain_value(cls, value: Any, info: ValidationInfo) -> Any:
+        key = info.data.get("key")
         if isinstance(value, set | frozenset):
-            return tuple(_plain(item) for item in sorted(value, key=repr))
+            return tuple(_plain(item, key) for item in sorted(value, key=repr))
         if isinstance(value, np.ndarray) and value.ndim == 1:
-            return tuple(_plain(item) for item in value)
+            return tuple(_plain(item, key) for item in value)
         if isinstance(value, list | tuple):
-            return tuple(_plain(item) for item in value)
-        return _plain(value)
+            return tuple(_plain(item, key) for item in value)
+        return _plain(value, key)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -294,7 +302,13 @@ def _combined(cls: type[BaseFilter], type: FilterType, left: BaseFilter, right: 
     return cls(filters=parts)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any, key: str | None) -> Any:
+    if isinstance(value, datetime.date):
+        if key not in _TIME_KEYS:
+            raise ValueError(
+                f"{key!r} holds no times: expected a text to compare it with, found {value!r:.60}"
+            )
+        return text_of(value)
     scalar = classify(value)
     return value if scalar.kind == "other" else scalar.value
 

@@ -11,8 +11,10 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from tupli_mcap.errors import FilterError
+from tupli_mcap.schema.facts import TIME_KEY, bound
 from tupli_mcap.schema.filters import BaseFilter, FilterType, path_of
 from tupli_mcap.schema.keys import join_key
+from tupli_mcap.schema.times import time_ns
 from tupli_mcap.schema.values import Scalar, against_floats, classify, compare, untag_float
 
 Item: TypeAlias = Mapping[str, Any] | BaseModel
@@ -22,60 +24,37 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 MISSING: Final = object()
 
 
-def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
-    """The top-level keys that a filter over items of a model (or with these fields) may name, sorted."""
-    return sorted(fields.model_fields if isinstance(fields, type) else fields)
-
-
-def check_keys(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> None:
-    """Raises FilterError if it is no filter, or names a top-level key that is not among `fields`."""
-    if not isinstance(filter, BaseFilter):
-        raise FilterError(
-            f"expected a filter, such as FilterEQ(key=..., value=...) or F(...) > 3, found {filter!r:.80}"
-        )
-    known = filter_keys(fields)
-    for comparison in comparisons(filter):
-        if path_of(comparison)[0] not in known:
-            raise FilterError(f"unknown filter key {comparison.key!r}; the keys are {', '.join(known)}")
-
-
-def comparisons(filter: BaseFilter) -> Iterable[BaseFilter]:
-    """The comparisons in a filter, from left to right."""
-    if filter.key is not None:
-        yield filter
-    for item in filter.filters:
-        yield from comparisons(item)
-
-
 def compile_predicate(
     filter: BaseFilter | None, fields: type[BaseModel] | Iterable[str] | None = None
 ) -> Predicate:
     """A function that tells whether a filter is true of an item: nested mappings, or a pydantic model.
 
-    No filter is true of everything. With `fields` (a model class, or names), only those top-level keys exist.
+    No filter is true of everything. With `fields` (a model class, or names), only those top-level keys exist; with a
+    model class, times are compared as times.
 
     Raises:
-        FilterError: The filter names an unknown top-level key.
+        FilterError: The filter names an unknown top-level key, or compares a field with what it can never be.
     """
     if filter is None:
         return lambda item: True
-    if fields is not None:
-        check_keys(filter, fields)
-    return _predicate(filter)
+    meant = filter if fields is None else bound(filter, fields)
+    return _predicate(meant, timed=isinstance(fields, type))
 
 
-def _predicate(filter: BaseFilter) -> Predicate:
+def _predicate(filter: BaseFilter, *, timed: bool) -> Predicate:
     match filter.type:
         case FilterType.AND:
-            parts = [_predicate(part) for part in filter.filters]
+            parts = [_predicate(part, timed=timed) for part in filter.filters]
             return lambda item: all(part(item) for part in parts)
         case FilterType.OR:
-            parts = [_predicate(part) for part in filter.filters]
+            parts = [_predicate(part, timed=timed) for part in filter.filters]
             return lambda item: any(part(item) for part in parts)
         case FilterType.NOT:
-            inner = _predicate(filter.filters[0])
+            inner = _predicate(filter.filters[0], timed=timed)
             return lambda item: not inner(item)
     path, test = path_of(filter), scalar_test(filter)
+    if timed and path == (TIME_KEY,):
+        return lambda item: (ns := time_ns(look_up(item, path))) is not None and test(Scalar("number", ns))
 
     def comparison(item: Item) -> bool:
         found = look_up(item, path)

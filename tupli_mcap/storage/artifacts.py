@@ -11,6 +11,7 @@ from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.messages.jsonvalue import loads
 from tupli_mcap.schema import ArtifactMetadata, ArtifactMetadataItem, BaseFilter, compile_predicate
+from tupli_mcap.schema.times import time_ns
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
 from tupli_mcap.storage.common import LOCAL_USER, first_defect, is_hash, published_in, to_json
 from tupli_mcap.storage.document import plain, restored
@@ -64,7 +65,10 @@ class ArtifactFiles:
                 items.append(self._read(sidecar))
             except (FormatError, StorageError) as err:
                 warnings.warn(f"skipped an artifact: {err}", stacklevel=3)
-        return sorted((item for item in items if matches(item)), key=lambda item: (item.created_at, item.id))
+        return sorted(
+            (item for item in items if matches(item)),
+            key=lambda item: (time_ns(item.created_at) or 0, item.id),
+        )
 
     def delete(self, uri: str) -> None:
         with self._lock:

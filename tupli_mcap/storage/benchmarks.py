@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
+from tupli_mcap.schema.times import time_ns
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
 from tupli_mcap.storage.common import LOCAL_USER, first_defect, is_hash, published_in, to_json
 from tupli_mcap.storage.document import artifacts_of, benchmark_hash, pack, plain, restored, unpack
@@ -65,7 +66,7 @@ class BenchmarkFiles:
                 pass  # deleted since, or not a benchmark's name
             except (FormatError, StorageError) as err:
                 warnings.warn(f"skipped a benchmark: {err}", stacklevel=3)
-        return sorted((h for h in headers if matches(h)), key=lambda h: (h.created_at, h.id))
+        return sorted((h for h in headers if matches(h)), key=lambda h: (time_ns(h.created_at) or 0, h.id))
 
     def delete(self, uri: str) -> None:
         with self._lock:

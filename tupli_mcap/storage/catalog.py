@@ -13,7 +13,8 @@ from typing import Any, Final
 from sqlalchemy import Connection, Select, delete, func, insert, select
 
 from tupli_mcap.errors import FilterError
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, split_key
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, filter_keys, split_key
+from tupli_mcap.schema.facts import check_key
 from tupli_mcap.storage.database import (
     CatalogDamagedError,
     CatalogMovedError,
@@ -214,8 +215,8 @@ class Catalog:
         Raises:
             FilterError: There is no such top-level key, or SQLite cannot index it.
         """
-        check_keys(F(key) == 0, EpisodeHeader)
         name, *inside = split_key(key)
+        check_key(key, (name,), filter_keys(EpisodeHeader))
         if name == "metadata" and not (inside and is_searchable(tuple(inside))):
             raise FilterError(
                 f"key {key!r} cannot be declared: its names need to be printable ASCII without quotes, "

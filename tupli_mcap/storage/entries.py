@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from typing import Any
-
-import numpy as np
 
 from tupli_mcap.recording import Recording
 from tupli_mcap.storage.common import LOCAL_USER
@@ -21,7 +18,7 @@ _ENDS = ("terminal", "timeout", "interrupted")
 def catalog_rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[EpisodeRow]:
     """The rows of a recording, without deleted episodes and those a live writer is in the middle of."""
     index = recording.index
-    columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return")]
+    columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return", "end_time")]
     seeds = [
         seed if has else None
         for has, seed in zip(index["has_seed"].tolist(), index["seed"].tolist(), strict=True)
@@ -29,7 +26,7 @@ def catalog_rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Itera
     running = _running(columns[1], columns[3]) if live else set()
     local = json.dumps([LOCAL_USER])
     for i, (number, env, length, end, total, created_at, seed, metadata) in enumerate(
-        zip(*columns, _iso(index["end_time"]), seeds, recording.all_metadata(), strict=True)
+        zip(*columns, seeds, recording.all_metadata(), strict=True)
     ):
         if number in sidecar.deleted or i in running:
             continue
@@ -53,9 +50,3 @@ def _running(envs: Sequence[int], ends: Sequence[int]) -> set[int]:
     end."""
     last = {env: i for i, env in enumerate(envs)}
     return {i for i in last.values() if _ENDS[ends[i]] == "interrupted"}
-
-
-def _iso(times_ns: np.ndarray[Any, Any]) -> list[str]:
-    """Wall clock times (ns) as ISO 8601 in UTC, to the microsecond."""
-    texts = np.datetime_as_string(times_ns.astype("datetime64[ns]"), unit="us", casting="unsafe")
-    return [f"{text}+00:00" for text in texts.tolist()]

@@ -13,6 +13,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.schema.models import unchecked_header
+from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.schema.values import classify, tag_float
 from tupli_mcap.storage.tables import EPISODE_BITS
 
@@ -42,8 +43,9 @@ class RecordingStamp(NamedTuple):
 class EpisodeRow(NamedTuple):
     """An episode to catalogue.
 
-    `end` is `terminal`, `timeout` or `interrupted`; `published_in` is the JSON text of a list of group names
-    and `metadata` that of an object, strict JSON as `tupli_mcap.messages.jsonvalue` writes it.
+    `end` is `terminal`, `timeout` or `interrupted`; `created_at` is in ns since 1970 (UTC); `published_in` is the JSON
+    text of a list of group names and `metadata` that of an object, strict JSON as `tupli_mcap.messages.jsonvalue`
+    writes it.
     """
 
     episode: int
@@ -52,7 +54,7 @@ class EpisodeRow(NamedTuple):
     end: str
     episode_return: float | None
     seed: int | None
-    created_at: str
+    created_at: int
     created_by: str
     published_in: str
     metadata: str
@@ -69,7 +71,7 @@ class StoredRow(NamedTuple):
     end: str
     episode_return: float | str | None
     seed: float | str | None
-    created_at: str
+    created_at: int
     created_by: str
     published_in: str
     metadata: str
@@ -94,7 +96,7 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
         end=row.end,
         episode_return=store_number(row.episode_return),
         seed=store_number(row.seed),
-        created_at=escape_text(row.created_at),
+        created_at=row.created_at // 1000 * 1000,
         created_by=escape_text(row.created_by),
         published_in=row.published_in,
         metadata=metadata,
@@ -109,7 +111,7 @@ def header(row: StoredRow, uuid: str, benchmark_id: str, path: str) -> EpisodeHe
             "id": f"{uuid}-{row.episode}",
             "created_by": unescape_text(row.created_by),
             "published_in": list(_published_in(row.published_in)),
-            "created_at": unescape_text(row.created_at),
+            "created_at": iso_utc(row.created_at),
             "benchmark_id": unescape_text(benchmark_id),
             "metadata": load_metadata(row.metadata if row.original is None else row.original),
             "n_tuples": row.n_tuples,

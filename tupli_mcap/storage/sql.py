@@ -17,9 +17,9 @@ from sqlalchemy import Text, and_, case, cast, false, or_, true
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.errors import FilterError
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterIN, FilterType, check_keys
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterIN, FilterType, bound
+from tupli_mcap.schema.facts import comparisons
 from tupli_mcap.schema.filters import COMBINING, path_of
-from tupli_mcap.schema.predicate import comparisons
 from tupli_mcap.schema.values import Scalar, classify
 from tupli_mcap.storage.rows import escape_text
 from tupli_mcap.storage.tables import EPISODE, RECORDING
@@ -65,12 +65,12 @@ def compile_filter(filter: BaseFilter | None, dialect: Dialect) -> Condition:
     """The condition on rows of `EPISODE` joined with `RECORDING` that a filter stands for.
 
     Raises:
-        FilterError: The filter names an unknown top-level key, or makes too many comparisons.
+        FilterError: The filter names an unknown top-level key, compares a fact with what it can never be, or makes too
+            many comparisons.
     """
     if filter is None:
         return true()
-    check_keys(filter, EpisodeHeader)
-    return _compile(filter, dialect)
+    return _compile(bound(filter, EpisodeHeader), dialect)
 
 
 def _compile(filter: BaseFilter, dialect: Dialect) -> Condition:
@@ -145,12 +145,12 @@ def _operand(path: tuple[str, ...], dialect: Dialect) -> Operand:
 
 _TEXTS: Final[Mapping[str, ColumnElement[Any]]] = {
     "created_by": EPISODE.c.created_by,
-    "created_at": EPISODE.c.created_at,
     "benchmark_id": RECORDING.c.benchmark_id,
     "end": EPISODE.c.end,
     "recording": RECORDING.c.path,
 }
 _INTEGERS: Final[Mapping[str, ColumnElement[Any]]] = {
+    "created_at": EPISODE.c.created_at,
     "n_tuples": EPISODE.c.n_tuples,
     "env": EPISODE.c.env,
     "episode": EPISODE.c.episode,

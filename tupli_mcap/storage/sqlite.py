@@ -122,6 +122,7 @@ def table_statements() -> list[str]:
 def key_statements(key: str, number: int) -> Iterator[str]:
     """The SQL that declares a key: generated columns and an index, or an index where it has a column."""
     name, *inside = split_key(key)
+    name = {"ended": "created_at"}.get(name, name)
     if name == "metadata":
         columns: tuple[str, ...] = declared_columns(number)
         for made, expression in zip(columns, key_ddl(tuple(inside)), strict=True):

@@ -50,7 +50,7 @@ EPISODE: Final = Table(
     # Numbers that SQLite cannot hold (NaN, integers beyond 64 bits) are their JSON text in these two.
     Column("episode_return", AsStored),
     Column("seed", AsStored),
-    Column("created_at", Text, nullable=False),
+    Column("created_at", BigInteger, nullable=False),  # ns since 1970 in UTC, whole microseconds
     Column("created_by", Text, nullable=False),
     Column("published_in", Text, nullable=False),
     Column("metadata", Text, nullable=False),

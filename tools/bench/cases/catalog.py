@@ -35,7 +35,7 @@ def filter_catalog(run: Run) -> Iterator[Target]:
                 end="terminal",
                 episode_return=22.0,
                 seed=None,
-                created_at="2026-01-01T00:00:00+00:00",
+                created_at=1_767_225_600 * 10**9,
                 created_by="bench",
                 published_in="[]",
                 metadata=f'{{"score": {score}, "is_expert": false}}',

@@ -1,0 +1,167 @@
+"""What a filter may ask of the fields of a model: keys that there are, values of their kind, and times as times."""
+
+from __future__ import annotations
+
+import datetime
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from typing import Any, Final
+
+from pydantic import BaseModel
+
+from tupli_mcap.errors import FilterError
+from tupli_mcap.schema.filters import (
+    COMBINING,
+    BaseFilter,
+    FilterAND,
+    FilterGEQ,
+    FilterLT,
+    FilterNOT,
+    FilterOR,
+    FilterType,
+    path_of,
+)
+from tupli_mcap.schema.models import EpisodeHeader
+from tupli_mcap.schema.times import EXPECTED, TimeSpan, span_of
+from tupli_mcap.schema.values import classify
+
+__all__ = ["TIME_KEY", "bound", "check_key", "check_keys", "comparisons", "filter_keys"]
+
+TIME_KEY: Final = "created_at"
+_ENDED: Final = "ended"  # what `created_at` of an episode is, and how tables call it
+_ENDS: Final = ("terminal", "timeout", "interrupted", "")
+_KINDS: Final[Mapping[Any, str]] = {
+    str: "text",
+    bool: "bool",
+    int: "number",
+    float: "number",
+    type(None): "null",
+}
+_WORDS: Final = {"text": "a text", "bool": "true or false", "number": "a number", "null": "null"}
+
+
+def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
+    """The top-level keys that a filter over items of a model (or with these fields) may name, sorted."""
+    if not isinstance(fields, type):
+        return sorted(fields)
+    return sorted([*fields.model_fields, *([_ENDED] if issubclass(fields, EpisodeHeader) else [])])
+
+
+def check_key(key: str, path: tuple[str, ...], known: Iterable[str]) -> None:
+    """Raises FilterError unless the top-level key of a path is known."""
+    if path[0] not in known:
+        raise FilterError(f"unknown filter key {key!r}; the keys are {', '.join(known)}")
+
+
+def check_keys(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> None:
+    """Raises FilterError if it is no filter, names a top-level key that is not among `fields`, or compares a field of a
+    model with what it can never be."""
+    bound(filter, fields)
+
+
+def bound(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> BaseFilter:
+    """A filter over items of a model, its times as nanoseconds in UTC: words such as "yesterday" are about now.
+
+    Raises:
+        FilterError: As `check_keys`.
+    """
+    if not isinstance(filter, BaseFilter):
+        raise FilterError(
+            f"expected a filter, such as FilterEQ(key=..., value=...) or F(...) > 3, found {filter!r:.80}"
+        )
+    known = filter_keys(fields)
+    for comparison in comparisons(filter):
+        check_key(comparison.key or "", path_of(comparison), known)
+    if not isinstance(fields, type):
+        return filter
+    return _bound(filter, fields, datetime.datetime.now(datetime.UTC))
+
+
+def comparisons(filter: BaseFilter) -> Iterable[BaseFilter]:
+    """The comparisons in a filter, from left to right."""
+    if filter.key is not None:
+        yield filter
+    for item in filter.filters:
+        yield from comparisons(item)
+
+
+def _bound(filter: BaseFilter, model: type[BaseModel], now: datetime.datetime) -> BaseFilter:
+    if filter.type in COMBINING:
+        parts = tuple(_bound(part, model, now) for part in filter.filters)
+        return filter.model_copy(update={"filters": parts})
+    name, *inside = path_of(filter)
+    if name in (TIME_KEY, _ENDED) and not inside:
+        return _in_time(filter, now)
+    kinds = _kinds_of(model, TIME_KEY if name == _ENDED else name)
+    if inside and kinds:
+        raise FilterError(f"filter key {filter.key!r}: {name} is {_one_of(kinds)} and has no parts")
+    if not inside:
+        _check_values(filter, name, kinds)
+    return filter
+
+
+def _check_values(filter: BaseFilter, name: str, kinds: frozenset[str]) -> None:
+    key = repr(filter.key)
+    if not kinds:
+        raise FilterError(
+            f"{key} holds several values and is equal to none; name one, such as metadata.score"
+        )
+    for value in filter.value if filter.type is FilterType.IN else (filter.value,):
+        kind = classify(value).kind
+        if kind == "nan" and "number" in kinds:
+            raise FilterError(f"nan is equal to nothing; {key} <= inf is true of all numbers")
+        if kind not in kinds:
+            raise FilterError(f"{key} is {_one_of(kinds)}: expected such a value, found {value!r:.60}")
+        if (
+            name == "end"
+            and filter.type in (FilterType.EQ, FilterType.NE, FilterType.IN)
+            and value not in _ENDS
+        ):
+            raise FilterError(f"{key} is terminal, timeout or interrupted, found {value!r:.60}")
+
+
+def _in_time(filter: BaseFilter, now: datetime.datetime) -> BaseFilter:
+    """A comparison with times, as comparisons of `created_at` with nanoseconds."""
+    if filter.type is FilterType.IN:
+        return FilterOR(filters=[_within(_time(filter, value, now)) for value in filter.value])
+    span = _time(filter, filter.value, now)
+    match filter.type:
+        case FilterType.EQ:
+            return _within(span)
+        case FilterType.NE:
+            return FilterNOT(filters=[_within(span)])
+        case FilterType.GT:
+            return FilterGEQ(key=TIME_KEY, value=span.stop)
+        case FilterType.GEQ:
+            return FilterGEQ(key=TIME_KEY, value=span.start)
+        case FilterType.LT:
+            return FilterLT(key=TIME_KEY, value=span.start)
+    return FilterLT(key=TIME_KEY, value=span.stop)
+
+
+def _within(span: TimeSpan) -> BaseFilter:
+    return FilterAND(
+        filters=[FilterGEQ(key=TIME_KEY, value=span.start), FilterLT(key=TIME_KEY, value=span.stop)]
+    )
+
+
+def _time(filter: BaseFilter, value: object, now: datetime.datetime) -> TimeSpan:
+    try:
+        return span_of(value, now)
+    except ValueError as err:
+        raise FilterError(f"{filter.key!r} is a time: expected {EXPECTED}; found {value!r:.60}") from err
+
+
+@lru_cache(maxsize=256)
+def _kinds_of(model: type[BaseModel], name: str) -> frozenset[str]:
+    """The kinds of scalars that a field may hold; none where it holds lists or mappings."""
+    annotation = model.model_fields[name].annotation
+    several = typing.get_origin(annotation) in (types.UnionType, typing.Union)
+    parts = typing.get_args(annotation) if several else (annotation,)
+    return frozenset(_KINDS[part] for part in parts) if set(parts) <= set(_KINDS) else frozenset()
+
+
+def _one_of(kinds: frozenset[str]) -> str:
+    return " or ".join(_WORDS[kind] for kind in _WORDS if kind in kinds)

@@ -1,0 +1,116 @@
+"""Times: facts are kept in UTC, shown in the local zone, and compared as times, to the microsecond.
+
+A text means all of the time that it names: `2026-11-23` is a day, `2026-11-23 03:31` a minute, `2026-11-23 03:31:07`
+a second. So `==` is true within it, `>` after its end, `>=` from its beginning, `<` before it and `<=` up to its end:
+what a table shows is found by `==`. A text without a zone is about local time.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+from typing import Final, NamedTuple
+
+__all__ = ["TimeSpan", "iso_utc", "local_text", "span_of", "text_of", "time_ns"]
+
+EXPECTED: Final = (
+    'a time, such as "2026-11-23", "2026-11-23 03:31:07", "2026-11-23T03:31:07+01:00", "today", "yesterday", "7d ago" '
+    "(w, d, h, min), or nanoseconds since 1970"
+)
+_EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+_MICROSECOND: Final = datetime.timedelta(microseconds=1)
+_ISO: Final = re.compile(
+    r"(?P<day>\d{4}-\d\d-\d\d)"
+    r"(?:[ T](?P<minute>\d\d:\d\d)(?::(?P<second>\d\d)(?:[.,](?P<fraction>\d+))?)? ?(?P<zone>Z|[+-]\d\d:?\d\d)?)?",
+    re.ASCII | re.IGNORECASE,
+)
+_AGO: Final = re.compile(r"(\d{1,9}) ?(min|h|d|w) ago", re.ASCII | re.IGNORECASE)
+_UNITS: Final = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
+_EARLIEST_NS: Final = 10**17  # 1973: what is less is no time in nanoseconds, but in seconds or milliseconds
+
+
+class TimeSpan(NamedTuple):
+    """From `start` to before `stop` (ns since 1970 in UTC, whole microseconds)."""
+
+    start: int
+    stop: int
+
+
+def span_of(value: object, now: datetime.datetime | None = None) -> TimeSpan:
+    """What a value in a filter names: an ISO 8601 text, a word, or nanoseconds; `now` (default: now) is for the words.
+
+    Raises:
+        ValueError: It names no time.
+    """
+    if isinstance(value, int) and not isinstance(value, bool) and _EARLIEST_NS <= value < 1 << 63:
+        return TimeSpan(value // 1000 * 1000, value // 1000 * 1000 + 1000)
+    if not isinstance(value, str):
+        raise ValueError(EXPECTED)
+    try:
+        return _span_of_text(" ".join(value.split()), now or datetime.datetime.now(datetime.UTC))
+    except (ValueError, OverflowError) as err:
+        raise ValueError(EXPECTED) from err
+
+
+def _span_of_text(text: str, now: datetime.datetime) -> TimeSpan:
+    word = text.lower()
+    if word in ("today", "yesterday"):
+        return _day(now.astimezone().date() - datetime.timedelta(days=word == "yesterday"))
+    ago = _AGO.fullmatch(text)
+    if ago is not None:
+        return _span(now - datetime.timedelta(**{_UNITS[ago[2].lower()]: int(ago[1])}), _MICROSECOND)
+    iso = _ISO.fullmatch(text)
+    if iso is None:
+        raise ValueError(f"no time: {text!r}")
+    if iso["minute"] is None:
+        return _day(datetime.date.fromisoformat(iso["day"]))
+    fraction = (iso["fraction"] or "")[:6]
+    clock = f"{iso['minute']}:{iso['second'] or '00'}.{fraction.ljust(6, '0')}"
+    whole = f"{iso['day']}T{clock}{(iso['zone'] or '').upper()}"
+    if iso["second"] is None:
+        length = datetime.timedelta(minutes=1)
+    else:
+        length = 10 ** (6 - len(fraction)) * _MICROSECOND
+    return _span(datetime.datetime.fromisoformat(whole), length)
+
+
+def _day(day: datetime.date) -> TimeSpan:
+    """A day in the local zone, of 23 hours or 25 where the clocks are changed."""
+    following = day + datetime.timedelta(days=1)
+    midnights = (datetime.datetime.combine(date, datetime.time()) for date in (day, following))
+    return TimeSpan(*(_ns(midnight.astimezone()) for midnight in midnights))
+
+
+def _span(start: datetime.datetime, length: datetime.timedelta) -> TimeSpan:
+    first = _ns(start.astimezone())
+    return TimeSpan(first, first + length // _MICROSECOND * 1000)
+
+
+def _ns(time: datetime.datetime) -> int:
+    return (time - _EPOCH) // _MICROSECOND * 1000
+
+
+def text_of(value: datetime.date) -> str:
+    """A date or a `datetime` (local time if it has no zone) as `span_of` reads it: a day, or a microsecond."""
+    if isinstance(value, datetime.datetime):
+        return value.astimezone().isoformat(timespec="microseconds")
+    return value.isoformat()
+
+
+def time_ns(text: object) -> int | None:
+    """The time that a fact says (ISO 8601, in UTC where it has no zone); None if it says none."""
+    try:
+        found = datetime.datetime.fromisoformat(text)  # type: ignore[arg-type]
+    except (ValueError, TypeError):
+        return None
+    return _ns(found if found.tzinfo is not None else found.replace(tzinfo=datetime.UTC))
+
+
+def iso_utc(time_ns: int) -> str:
+    """A time (ns) as a fact says it: ISO 8601 in UTC, to the microsecond."""
+    return (_EPOCH + time_ns // 1000 * _MICROSECOND).isoformat(timespec="microseconds")
+
+
+def local_text(time_ns: int) -> str:
+    """A time (ns) as tables show it: in the local zone, to the second: `2026-11-23 04:31:07+01:00`."""
+    return (_EPOCH + time_ns // 1000 * _MICROSECOND).astimezone().isoformat(sep=" ", timespec="seconds")
