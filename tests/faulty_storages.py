@@ -119,7 +119,7 @@ OPERATIONS: dict[str, Callable[[FileStorage, Lab], object]] = {
     "list": lambda s, lab: (s.list_benchmarks(), s.list_artifacts(), s.list_episodes(include_tuples=True)),
 }
 
-SEVERAL = ("record", "import", "delete-episodes", "delete-recording", "record-by-hand")
+SEVERAL = ("record", "import", "record-by-hand")
 """These change several things, one after another: any number of them may have been done."""
 
 

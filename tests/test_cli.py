@@ -584,7 +584,7 @@ class TestLook:
         assert shown is not None
         for found in (f'ended = "{shown[0]}"', f'created_at >= "{shown[0][:19]}" and ended <= "today"'):
             assert len(run("episodes", cartpole, "--filter", found, "--json").json) == len(rows)
-        assert "expected a time, such as" in fails("episodes", cartpole, "--filter", "ended > 5")
+        assert "expected a time, such as" in fails("episodes", cartpole, "--filter", "ended > 5", code=2)
 
     def test_episodes_of_a_storage(self, filled: tuple[Path, str, str], here: Path) -> None:
         told = run("episodes", filled[0], "--json").json

@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from tupli_mcap import TupliDataset
 from tupli_mcap.environment import capture
 from tupli_mcap.errors import (
     FilterError,
@@ -50,6 +51,7 @@ from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, dat
 from tupli_mcap.storage.catalog import Catalog
 from tupli_mcap.storage.document import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
 from tupli_mcap.storage.handmade import conform, infer_space
+from tupli_mcap.storage.listing import list_recordings
 from tupli_mcap.storage.place import catalog_path
 from tupli_mcap.storage.verify import verify_storage
 from tupli_mcap.wrappers import RecordEpisodes
@@ -510,6 +512,70 @@ class TestFileStorage(StorageContract):
         storage.delete_benchmark(header.id)
         assert list((storage.root / "recordings").iterdir()) == []
 
+    @pytest.mark.parametrize("kind", [KeyboardInterrupt, OSError])
+    def test_deleting_from_several_recordings_is_done_or_not(
+        self, storage: FileStorage, tmp_path: Path, kind: type[BaseException]
+    ) -> None:
+        header = storage.store_benchmark(query())
+        for i in range(3):
+            storage.record_episodes([episode(header.id, score=float(score)) for score in (i == 2, 1)])
+        (storage.root / next(storage.root.rglob("*.mcap"))).rename(storage.root / "dropped\udcff.mcap")
+        seen, k = set(), -1
+        while True:
+            k += 1
+            root = tmp_path / f"{k}"
+            shutil.copytree(storage.root, root)
+            calls = Calls(k, kind)
+            with FileStorage(root) as one, pytest.MonkeyPatch.context() as patch:
+                doomed = one.list_episodes(F("metadata.score") == 1)
+                calls.patch(patch)
+                try:
+                    assert one.delete_episodes(F("metadata.score") == 1) == 4
+                except (KeyboardInterrupt, StorageError):
+                    assert calls.left < 0
+            before = state_of(root)
+            with FileStorage(root) as other:
+                left = {h.id for h in other.list_episodes()}
+            listed = list_recordings([root])
+            of_files = TupliDataset.from_files(
+                [str(root / "*.mcap"), str(root / "recordings" / "*" / "*.mcap")]
+            )
+            assert len(left) == sum(item.episodes for item in listed) == len(of_files.preview())
+            assert all(report.ok for report in verify_storage(root).files)
+            assert state_of(root) == before
+            seen.add(len(left))
+            assert not left & {h.id for h in doomed} if len(left) == 2 else len(left) == 6
+            with FileStorage(root) as other:
+                other.delete_episodes(F("metadata.score") == 1)
+                other.compact()
+                assert other.count_episodes() == 2
+            assert not (root / "deleting.json").exists()
+            shutil.rmtree(root)
+            if calls.left >= 0:
+                break
+        assert seen == {2, 6}
+        assert k > 6
+
+    def test_a_deletion_of_somebody_elses_stays_in_the_storage(
+        self, storage: FileStorage, tmp_path: Path
+    ) -> None:
+        header = storage.store_benchmark(query())
+        made = storage.record_episodes([episode(header.id), episode(header.id)])
+        (tmp_path / "outside").mkdir()
+        outside = tmp_path / "outside" / "a.mcap"
+        shutil.copy(storage.root / made[0].recording, outside)
+        (storage.root / "link").symlink_to(tmp_path / "outside")
+        names = ["../outside/a.mcap", "link/a.mcap", str(outside), made[0].recording]
+        deleting = storage.root / "deleting.json"
+        deleting.write_text(json.dumps({"version": 1, "deleted": {name: [0] for name in names}}))
+        assert [h.id for h in storage.list_episodes()] == [made[1].id]
+        assert storage.delete_episodes(F("episode") == 0) == 0
+        assert list(outside.parent.iterdir()) == [outside]
+        assert not deleting.exists()
+        deleting.write_text("{")
+        with pytest.raises(FormatError, match=r"deleting\.json: expected episodes to delete: .*; delete it"):
+            storage.list_episodes()
+
     def test_a_plain_recording_can_be_dropped_in(self, storage: FileStorage) -> None:
         with RecordEpisodes(gym.make("CartPole-v1"), storage.root / "plain.mcap") as env:
             env.reset(seed=1)
@@ -810,6 +876,35 @@ def state_of(root: Path) -> dict[str, tuple[int, int, int]]:
     """Everything in a directory, with size, time of change and inode."""
     found = {path: path.lstat() for path in (root, *root.rglob("*"))}
     return {str(path): (status.st_size, status.st_mtime_ns, status.st_ino) for path, status in found.items()}
+
+
+class Calls:
+    """Lets so many changes of files pass, and breaks off at the next."""
+
+    def __init__(self, left: int, kind: type[BaseException]) -> None:
+        self.left, self._kind = left, kind
+
+    def patch(self, patch: pytest.MonkeyPatch) -> None:
+        for name in ("replace", "unlink", "rename", "rmdir"):
+            patch.setattr(os, name, self._counted(getattr(os, name)))
+
+    def _counted(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def counted(path: Any, *args: Any, **kwargs: Any) -> Any:
+            if not str(path).endswith(".tmp"):  # what is removed whether it was used or not
+                self._count()
+            if call is _REPLACE:
+                self._count()
+            return call(path, *args, **kwargs)
+
+        return counted
+
+    def _count(self) -> None:
+        self.left -= 1
+        if self.left == -1:
+            raise self._kind(errno.EIO, os.strerror(errno.EIO))
+
+
+_REPLACE = os.replace
 
 
 def hot_journal(victim: Path) -> bytes:

@@ -137,7 +137,7 @@ def serve() -> None:
         found = None
         with suppress(Exception), warnings.catch_warnings():  # read where it is missed, and said there
             warnings.simplefilter("error")
-            found = _read_recording(Path(root) / name)
+            found = _read_recording(Path(root), name)
         data = marshal.dumps(found)
         sys.stdout.buffer.write(_SIZE.pack(len(data)) + data)
         sys.stdout.buffer.flush()
@@ -148,9 +148,10 @@ def _asked() -> Iterator[list[str]]:
         yield json.loads(line)
 
 
-def _read_recording(path: Path) -> tuple[Any, ...] | None:
+def _read_recording(root: Path, name: str) -> tuple[Any, ...] | None:
     """The fields of a ReadRecording, as plain tuples; None if it is too long."""
-    stamp, sidecar, live = stamp_of(path), Sidecar.read(path), is_locked(path)
+    path = root / name
+    stamp, sidecar, live = stamp_of(root, name), Sidecar.read(path, root), is_locked(path)
     with Recording(path) as recording:
         live |= is_locked(path)  # a writer may have come or gone meanwhile
         numbers = recording.index["episode"]

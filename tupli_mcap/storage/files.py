@@ -4,6 +4,7 @@ benchmarks/<id>.json, <id>.cloudpickle     the environment, as data or as truste
 artifacts/<sha256>, <sha256>.json          bytes, and what is known of them
 recordings/<benchmark id>/<name>.mcap      episodes; `<name>.mcap.json` notes deletions and publications
 storage.json                               declared keys
+deleting.json                              a deletion from several recordings, while it is done
 
 The catalog, an index of the recordings, lies in this user's cache directory and may be deleted at any time. Listing,
 filtering and reading write nothing into the directory.

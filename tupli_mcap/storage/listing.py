@@ -70,7 +70,7 @@ def list_recordings(paths: Iterable[Path]) -> Iterator[ListedRecording]:
             yield ListedRecording(str(path), error=str(err))
             continue
         for file in found:
-            yield _listed(file)
+            yield _listed(file, path if path.is_dir() else None)
 
 
 def compactable(root: Path) -> list[Compactable]:
@@ -82,15 +82,15 @@ def compactable(root: Path) -> list[Compactable]:
     found = []
     for item in sorted(scan(root)):
         path = root / item.relative
-        deleted = Sidecar.read(path).deleted
+        deleted = Sidecar.read(path, root).deleted
         if deleted and not is_locked(path):
             found.append(Compactable(item.relative, len(deleted), item.stamp.size))
     return found
 
 
-def _listed(path: Path) -> ListedRecording:
+def _listed(path: Path, root: Path | None) -> ListedRecording:
     try:
-        deleted = list(Sidecar.read(path).deleted)
+        deleted = list(Sidecar.read(path, root).deleted)
         with Recording(path) as recording:
             rows = recording.index
             if deleted:

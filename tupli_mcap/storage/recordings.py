@@ -32,7 +32,7 @@ from tupli_mcap.storage.common import LOCAL_USER, published_in
 from tupli_mcap.storage.entries import catalog_rows
 from tupli_mcap.storage.place import cache_dir, catalog_path
 from tupli_mcap.storage.scan import scan, stamp_of
-from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
+from tupli_mcap.storage.sidecar import Deletion, Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles", "episode_id"]
 
@@ -145,7 +145,7 @@ class RecordingFiles:
 
     def _holds(self, header: EpisodeHeader) -> bool:
         path = self._root / header.recording
-        return path.is_file() and header.episode not in Sidecar.read(path).deleted
+        return path.is_file() and header.episode not in Sidecar.read(path, self._root).deleted
 
     # --- files ---
 
@@ -230,7 +230,7 @@ class RecordingFiles:
 
         def put() -> int:
             with self._catalog.alone(), contextlib.suppress(CatalogMovedError):
-                return self._put(relative, path, stamp_of(path))
+                return self._put(relative, path, stamp_of(self._root, relative))
             return -1  # the next query fills the new one
 
         with self._lock:
@@ -294,7 +294,7 @@ class RecordingFiles:
             if read is not None:
                 self._put_read(relative, path, read)
                 return
-            stamp = stamp_of(path)
+            stamp = stamp_of(self._root, relative)
             self._put(relative, path, stamp)
         except FileNotFoundError:
             self._catalog.remove_recording(relative)
@@ -311,7 +311,7 @@ class RecordingFiles:
 
     def _put(self, relative: str, path: Path, stamp: RecordingStamp) -> int:
         """Catalogue a recording unless it is a copy; returns how many episodes it holds."""
-        sidecar = Sidecar.read(path)
+        sidecar = Sidecar.read(path, self._root)
         live = is_locked(path)
         with Recording(path) as recording:
             live |= is_locked(path)  # a writer may have come or gone meanwhile
@@ -358,44 +358,62 @@ class RecordingFiles:
     def publish(self, header: EpisodeHeader, group: str) -> None:
         with self._lock:
             path = self.path(header.recording)
-            sidecar = Sidecar.read(path)
+            sidecar = Sidecar.read(path, self._root)
             groups = sidecar.published_in.get(header.episode, [LOCAL_USER])
             sidecar.published_in[header.episode] = published_in(groups, group)
             sidecar.write(path)  # the next query notices
 
     def delete(self, headers: Sequence[EpisodeHeader]) -> int:
-        """Delete episodes: by a note beside their recording, or with it where nothing else is left in it.
+        """Delete episodes, all of them or none: by notes beside their recordings, or with these where nothing else is
+        left in them.
 
         Returns how many there still were.
         """
         by_recording: dict[str, set[int]] = {}
         for header in headers:
             by_recording.setdefault(header.recording, set()).add(header.episode)
-        deleted = 0
-        for relative, numbers in by_recording.items():
-            with self._lock, contextlib.suppress(NotFoundError):  # somebody else was first
-                deleted += self._delete(relative, numbers)
-        return deleted
+        with self._lock:
+            self._finish_deletion()
+            there: dict[str, set[int]] = {}
+            for relative, numbers in by_recording.items():
+                with contextlib.suppress(NotFoundError):  # somebody else was first
+                    there[relative] = self._left(self.path(relative)) & numbers
+            doomed = {relative: numbers for relative, numbers in there.items() if numbers}
+            if len(doomed) > 1:
+                Deletion(deleted=doomed).write(self._root)
+            self._do_deletion(doomed)
+        return sum(map(len, doomed.values()))
 
-    def _delete(self, relative: str, numbers: set[int]) -> int:
-        path = self.path(relative)
-        sidecar = Sidecar.read(path)
+    def _finish_deletion(self) -> None:
+        """Do what is left of a deletion that was broken off; only recordings that are listed are touched."""
+        deleted = Deletion.read(self._root).deleted
+        if deleted:
+            listed = {item.relative for item in scan(self._root)}
+            self._do_deletion({relative: deleted[relative] for relative in deleted.keys() & listed})
+
+    def _do_deletion(self, deleted: Mapping[str, set[int]]) -> None:
+        for relative, numbers in deleted.items():
+            path = self._root / relative
+            sidecar = Sidecar.read(path, self._root)
+            sidecar.deleted |= numbers
+            # first the note: a crash, or a writer that goes on with the file, must not bring anything back
+            sidecar.write(path)  # the next query notices
+            with contextlib.suppress(FormatError, RecordingError):  # damaged: its note is enough
+                if not self._left(path):
+                    self._remove(path)
+        Deletion().write(self._root)
+
+    def _left(self, path: Path) -> set[int]:
+        """The numbers of the episodes of a recording that are not deleted."""
+        deleted = Sidecar.read(path, self._root).deleted  # first: they may be taken out of both meanwhile
         with Recording(path) as recording:
-            there = {int(number) for number in recording.index["episode"]} - sidecar.deleted
-        sidecar.deleted |= numbers
-        # first the note: a crash, or a writer that goes on with the file, must not bring anything back
-        sidecar.write(path)  # the next query notices
-        if there <= numbers:
-            self._remove(path)
-        return len(there & numbers)
+            return {int(number) for number in recording.index["episode"]} - deleted
 
     def _remove(self, path: Path) -> None:
         """Delete a recording, unless somebody is writing to it; the next query notices."""
         try:
             with writers_kept_out(path), os_errors("cannot delete the recording", path):
-                with Recording(path) as recording:
-                    left = {int(n) for n in recording.index["episode"]} - Sidecar.read(path).deleted
-                if left:  # somebody has written to it meanwhile
+                if self._left(path):  # somebody has written to it meanwhile
                     return
                 for gone in (path, journal_path(path), sidecar_path(path)):
                     gone.unlink(missing_ok=True)
@@ -432,13 +450,15 @@ class RecordingFiles:
         Those that are being written are left alone. Episodes that stay keep their ids.
         """
         freed = files.remove_left(files.left_below(self._root))
+        with self._lock:
+            self._finish_deletion()
         for name in _OLD_CATALOG:  # earlier versions kept it here; it is opened no more
             with contextlib.suppress(OSError):
                 (self._root / name).unlink()
         for item in sorted(scan(self._root)):
             path = self._root / item.relative
             with self._lock:
-                if not path.exists() or not Sidecar.read(path).deleted:
+                if not path.exists() or not Sidecar.read(path, self._root).deleted:
                     continue
                 try:
                     with writers_kept_out(path):  # nobody appends meanwhile
@@ -451,7 +471,7 @@ class RecordingFiles:
         return freed
 
     def _compact(self, path: Path) -> int:
-        sidecar = Sidecar.read(path)
+        sidecar = Sidecar.read(path, self._root)
         before = path.stat().st_size
         with os_errors("cannot rewrite the recording", path), Recording(path) as recording:
             kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]

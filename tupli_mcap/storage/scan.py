@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from tupli_mcap.recording.journal import journal_name
 from tupli_mcap.storage.rows import RecordingStamp
-from tupli_mcap.storage.sidecar import sidecar_path
+from tupli_mcap.storage.sidecar import Deletion, sidecar_path
 
 __all__ = ["FoundRecording", "scan", "stamp_of"]
 
@@ -24,8 +24,13 @@ class FoundRecording(NamedTuple):
 
 
 def scan(root: Path) -> Iterator[FoundRecording]:
-    """Every recording below a directory; what is hidden is passed over, and so are links to directories."""
+    """Every recording below a directory; what is hidden is passed over, and so are links to directories.
+
+    Raises:
+        FormatError: What is noted there about a deletion is damaged.
+    """
     pending = [(os.fspath(root), "")]
+    deleting = Deletion.read(root).deleted
     while pending:
         directory, prefix = pending.pop()
         try:
@@ -38,7 +43,8 @@ def scan(root: Path) -> Iterator[FoundRecording]:
                 try:
                     if entry.is_file():
                         journal = journal_name(name) in found
-                        yield FoundRecording(prefix + name, _stamp(entry, found), journal)
+                        stamp = _stamp(entry, found, deleting.get(prefix + name, set()))
+                        yield FoundRecording(prefix + name, stamp, journal)
                 except OSError as err:
                     if err.errno not in (errno.ENOENT, errno.ELOOP):  # deleted since, or a link in a circle
                         raise
@@ -46,25 +52,27 @@ def scan(root: Path) -> Iterator[FoundRecording]:
                 pending.append((entry.path, f"{prefix}{name}/"))
 
 
-def stamp_of(path: Path) -> RecordingStamp:
-    """The stamp of one recording; FileNotFoundError if it is gone."""
+def stamp_of(root: Path, relative: str) -> RecordingStamp:
+    """The stamp of one recording below a directory; FileNotFoundError if it is gone."""
+    deleting = Deletion.read(root).deleted.get(relative, set())
+    path = root / relative
     status = path.stat()
     try:
-        return _mix(status, sidecar_path(path).stat())
+        return _mix(status, sidecar_path(path).stat(), deleting)
     except FileNotFoundError:
-        return _mix(status, None)
+        return _mix(status, None, deleting)
 
 
-def _stamp(entry: os.DirEntry[str], found: dict[str, os.DirEntry[str]]) -> RecordingStamp:
+def _stamp(entry: os.DirEntry[str], found: dict[str, os.DirEntry[str]], deleting: set[int]) -> RecordingStamp:
     beside = found.get(f"{entry.name}.json")
     # Not `beside.stat()`: what scandir knows of a file may be older than its name.
-    return _mix(os.stat(entry.path), None if beside is None else os.stat(beside.path))  # noqa: PTH116
+    return _mix(os.stat(entry.path), None if beside is None else os.stat(beside.path), deleting)  # noqa: PTH116
 
 
-def _mix(status: os.stat_result, beside: os.stat_result | None) -> RecordingStamp:
+def _mix(status: os.stat_result, beside: os.stat_result | None, deleting: set[int]) -> RecordingStamp:
     # A clock ticks every few ms only, and archives set the times of their files: neither inodes nor times of change
     # repeat where a file is replaced.
     facts = [
         (found.st_ino, found.st_ctime_ns, found.st_size) for found in (status, beside) if found is not None
     ]
-    return RecordingStamp(status.st_size, status.st_mtime_ns, hash(tuple(facts)) & (2**63 - 1))
+    return RecordingStamp(status.st_size, status.st_mtime_ns, hash((*facts, *sorted(deleting))) & (2**63 - 1))

@@ -24,7 +24,7 @@ from tupli_mcap.storage.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.common import is_hash
 from tupli_mcap.storage.files import FileStorage
 from tupli_mcap.storage.scan import scan
-from tupli_mcap.storage.sidecar import Sidecar, sidecar_path
+from tupli_mcap.storage.sidecar import DELETING, Sidecar, sidecar_path
 
 __all__ = ["StorageReport", "verify_paths", "verify_storage"]
 
@@ -75,10 +75,12 @@ def verify_paths(paths: Iterable[Path]) -> Iterator[VerifyReport]:
         if path.is_dir():
             try:
                 found = sorted(scan(path))
-            except OSError as err:
+            except (OSError, TupliError) as err:
                 report = VerifyReport(str(path), kind="storage")
-                advice = "check the directory's permissions"
-                Findings(report).error("file", f"it cannot be read: {err.strerror}", advice=advice)
+                said, _, advice = str(err).removeprefix(f"{path}: ").partition("; ")
+                if isinstance(err, OSError):
+                    said, advice = f"it cannot be read: {err.strerror}", "check the directory's permissions"
+                Findings(report).error("file", said, advice=advice)
                 yield report
                 continue
             for item in found:
@@ -192,6 +194,9 @@ def _leftovers(root: Path, findings: Findings) -> None:
             )
         elif name.endswith(".mcap.journal"):
             _finished_journal(path, relative, findings)
+        elif relative == DELETING:
+            advice = "nothing to be done: the episodes are gone; the next deletion finishes it, or tupli-mcap compact"
+            findings.note("leftover", f"{relative} is of a deletion that was broken off", advice)
         elif name.endswith(".mcap.json") and not path.with_name(name.removesuffix(".json")).exists():
             findings.note("leftover", f"{relative} is about a recording that is not here", "delete it")
 
