@@ -106,18 +106,18 @@ def check_interrupted(name: str, made: Lab, directory: Path, line: int) -> bool:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_any_command_at_any_line(tmp_path: Path, lab: Lab, name: str) -> None:
-    for again in ("first", "whole"):  # a first run imports modules, and has more lines
-        lines = lines_of(name, lab, tmp_path / again)
+    lines = lines_of(name, lab, tmp_path / "whole")
     hits = 0
     for i, line in enumerate(random.Random(name).choices(range(1, lines), k=2)):
         hits += check_interrupted(name, lab, tmp_path / str(i), line)
         shutil.rmtree(tmp_path / str(i))
-    assert hits
+    assert hits  # the second run of a command has fewer lines than the first
 
 
 def lines_of(name: str, made: Lab, directory: Path) -> int:
     """How many lines of the package a command runs."""
     lab = clone(made, directory)
+    state_of(lab)  # as before each interruption: there is a catalog
     far = 1 << 40
     trace = Traced(far)
     sys.settrace(trace)
