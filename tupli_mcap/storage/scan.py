@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from tupli_mcap.recording.journal import journal_name
 from tupli_mcap.storage.rows import RecordingStamp
-from tupli_mcap.storage.sidecar import Deletion, sidecar_path
+from tupli_mcap.storage.sidecar import DELETING, Deletion, sidecar_path
 
 __all__ = ["FoundRecording", "scan", "stamp_of"]
 
@@ -30,7 +30,7 @@ def scan(root: Path) -> Iterator[FoundRecording]:
         FormatError: What is noted there about a deletion is damaged.
     """
     pending = [(os.fspath(root), "")]
-    deleting = Deletion.read(root).deleted
+    deleting: dict[str, set[int]] = {}
     while pending:
         directory, prefix = pending.pop()
         try:
@@ -38,6 +38,8 @@ def scan(root: Path) -> Iterator[FoundRecording]:
                 found = {entry.name: entry for entry in entries if not entry.name.startswith(".")}
         except FileNotFoundError:
             continue  # deleted since it was listed
+        if not prefix and DELETING in found:
+            deleting = Deletion.read(root).deleted
         for name, entry in found.items():
             if name.endswith(".mcap"):
                 try:
