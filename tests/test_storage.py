@@ -537,9 +537,7 @@ class TestFileStorage(StorageContract):
             with FileStorage(root) as other:
                 left = {h.id for h in other.list_episodes()}
             listed = list_recordings([root])
-            of_files = TupliDataset.from_files(
-                [str(root / "*.mcap"), str(root / "recordings" / "*" / "*.mcap")]
-            )
+            of_files = TupliDataset.from_files(sorted(root.rglob("*.mcap")))
             assert len(left) == sum(item.episodes for item in listed) == len(of_files.preview())
             assert all(report.ok for report in verify_storage(root).files)
             assert state_of(root) == before
