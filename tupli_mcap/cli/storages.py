@@ -23,11 +23,10 @@ from tupli_mcap.cli.output import (
     print_json,
     print_table,
     short_ids,
-    terminal_width,
     when,
 )
 from tupli_mcap.cli.recordings import print_episodes
-from tupli_mcap.cli.terminal import say
+from tupli_mcap.cli.terminal import say, terminal_width
 
 __all__ = ["register"]
 
