@@ -97,8 +97,9 @@ def print_json(value: Any) -> None:
 
     from tupli_mcap.messages.jsonvalue import MAX_DEPTH, dumps_plain
 
+    most = 2 * MAX_DEPTH  # of what was read, and of the lists and objects it is printed in
     try:
-        text = dumps_plain(value)
+        text = dumps_plain(value, max_depth=most)
     except (TypeError, ValueError):
         text = dumps_plain(_printable(value, MAX_DEPTH // 2))
     say_json(json.dumps(json.loads(text), indent=2, ensure_ascii=False))

@@ -4,7 +4,7 @@ What JSON has stays plain: strings, finite floats, integers, booleans, None, lis
 Everything else is an object with one key that starts with `$`:
 
 `$float`: "nan", "inf" or "-inf"
-`$int`: hexadecimal digits of an integer that does not fit 64 bits
+`$int`: hexadecimal digits of an integer of more than 64 bits, and at most 1024
 `$complex`: `[real, imaginary]`
 `$str`: code points of a string with lone surrogates, which UTF-8 cannot carry
 `$bytes`, `$bytearray`: base64
@@ -22,6 +22,7 @@ import base64
 import binascii
 import json
 import math
+import operator
 import re
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -33,7 +34,7 @@ from tupli_mcap.errors import FormatError
 __all__ = ["MAX_DEPTH", "dumps", "dumps_any", "dumps_plain", "loads", "shown"]
 
 MAX_DEPTH = 64
-"""Deepest nesting of values."""
+"""Deepest nesting of values: each container is a level, and each dimension of an array."""
 
 Fallback = Callable[[Any], Any]
 
@@ -45,9 +46,12 @@ _DTYPE = re.compile(
 _KINDS = "biufcSUMm"
 _BRACKETS_A_LEVEL = 3  # {"$dict": [[key, ...
 _MAX_CODE_POINT = 0x10FFFF
+_SCALARS = {type(None), bool, float, int, str}
 # Python refuses to convert very long decimal integers, and few other JSON readers take more than 64 bits.
 _EXACT_INT_BITS = 64
-_PLAIN_INT_BITS = 1024
+_PLAIN_INT_BITS = 1024  # and no integer may have more: beyond 4300 digits Python refuses to print it
+_LONG_NUMBER = re.compile(r"\d{309}")  # 1024 bits are 309 digits at most
+_SAME_HASH = 64  # keys of one hash: Python compares each of them with all others
 
 
 def dumps(value: Any, *, fallback: Fallback | None = None) -> str:
@@ -94,14 +98,14 @@ def shown(value: Any) -> str:
         return f"<{type(value).__module__}.{type(value).__qualname__}>"
 
 
-def dumps_plain(value: Any, *, fallback: Fallback | None = None) -> str:
+def dumps_plain(value: Any, *, fallback: Fallback | None = None, max_depth: int = MAX_DEPTH) -> str:
     """Return JSON text that a filter can look into: NumPy scalars are numbers, arrays and tuples are lists.
 
     What JSON has no form for (NaN, infinities, bytes, sets, complex numbers, dates) is tagged as by `dumps`.
     Keys that are numbers, booleans or None become strings as the standard library's `json` makes them, unless
-    two keys then meet. Raises as `dumps` does.
+    two keys then meet. `max_depth` is for what is printed: `loads` reads `MAX_DEPTH` levels. Raises as `dumps` does.
     """
-    return _text(_Encoder(fallback, plain=True), value)
+    return _text(_Encoder(fallback, plain=True, max_depth=max_depth), value)
 
 
 def loads(text: str | bytes) -> Any:
@@ -113,8 +117,12 @@ def loads(text: str | bytes) -> Any:
     try:
         if isinstance(text, bytes):
             text = text.decode()
-        _check_depth(text)
-        return json.loads(text, object_hook=_restore, parse_constant=_refuse_constant)
+        brackets = _depth_of(text)
+        number = _from_decimal if _LONG_NUMBER.search(text) else None
+        value = json.loads(text, object_hook=_restore, parse_constant=_refuse_constant, parse_int=number)
+        if brackets > MAX_DEPTH:  # a level takes one bracket at least
+            _check_levels(value, 0)
+        return value
     except UnicodeDecodeError as err:
         raise FormatError(f"expected JSON in UTF-8, found a bad byte at offset {err.start}") from err
     except json.JSONDecodeError as err:
@@ -147,9 +155,10 @@ def _text(encoder: _Encoder, value: Any) -> str:
 class _Encoder:
     """Turns a value into what `json.dumps` takes as it is."""
 
-    def __init__(self, fallback: Fallback | None, *, plain: bool) -> None:
+    def __init__(self, fallback: Fallback | None, *, plain: bool, max_depth: int = MAX_DEPTH) -> None:
         self.fallback = fallback
         self.plain = plain
+        self.max_depth = max_depth
         self.int_bits = _PLAIN_INT_BITS if plain else _EXACT_INT_BITS
 
     def encode(self, value: Any, depth: int) -> Any:
@@ -159,12 +168,12 @@ class _Encoder:
         if kind is float:
             return value if math.isfinite(value) else {"$float": repr(value)}
         if kind is int:
-            return self._integer(value)
+            return self._integer(value, depth)
         if kind is str:
             return _string(value)
-        if depth >= MAX_DEPTH:
+        if depth + _levels(value) > self.max_depth:
             raise ValueError(
-                f"expected at most {MAX_DEPTH} levels of nesting, found more (a value in itself?)"
+                f"expected at most {self.max_depth} levels of nesting, found more (a value in itself?)"
             )
         if isinstance(value, (np.generic, np.ndarray)):
             return self._numpy(value, depth)
@@ -179,6 +188,7 @@ class _Encoder:
             return self._items(value, depth) if self.plain else {"$tuple": self._items(value, depth)}
         if isinstance(value, (set, frozenset)):
             tag = "$set" if isinstance(value, set) else "$frozenset"
+            _check_hashes(list(value))
             # Sorted by text: the order of a set differs from process to process.
             return {tag: sorted(self._items(value, depth), key=json.dumps)}
         if isinstance(value, (bytes, bytearray)):
@@ -198,8 +208,11 @@ class _Encoder:
             raise _UnstorableError(value)
         return self.encode(self.fallback(value), depth + 1)
 
-    def _integer(self, value: int) -> Any:
-        return value if value.bit_length() <= self.int_bits else {"$int": f"{value:x}"}
+    def _integer(self, value: int, depth: int) -> Any:
+        bits = value.bit_length()
+        if bits > _PLAIN_INT_BITS:
+            return self._fall_back(value, depth)
+        return value if bits <= self.int_bits else {"$int": f"{value:x}"}
 
     def _items(self, values: Iterable[Any], depth: int) -> list[Any]:
         items: list[Any] = []
@@ -228,7 +241,8 @@ class _Encoder:
             named = {_json_key(key): item for key, item in items.items()}
             if len(named) == len(items) and all(type(name) is str for name in named):
                 return named
-        exact = _Encoder(self.fallback, plain=False)  # a list is no key
+        _check_hashes(list(value))
+        exact = _Encoder(self.fallback, plain=False, max_depth=self.max_depth)  # a list is no key
         return {"$dict": [[exact.encode(key, depth + 1), item] for key, item in items.items()]}
 
     def _numpy(self, value: Any, depth: int) -> Any:
@@ -243,7 +257,7 @@ class _Encoder:
         if self.plain and dtype.kind in "biufU":
             if dtype.char == "g":  # .item() of a long double is a long double again
                 value = value.astype(np.float64)
-            return self.encode(value.item() if value.ndim == 0 else value.tolist(), depth + 1)
+            return self.encode(value.item() if value.ndim == 0 else value.tolist(), depth)
         data = np.asarray(value)
         if dtype.kind == "b":
             data = data.view(np.uint8) != 0  # a bool made by a view may hold any byte
@@ -278,19 +292,56 @@ def _base64(data: bytes | bytearray) -> str:
     return base64.b64encode(data).decode("ascii")
 
 
-def _check_depth(text: str) -> None:
-    deepest = _BRACKETS_A_LEVEL * (MAX_DEPTH + 1)
-    if text.count("[") + text.count("{") <= deepest:
-        return
-    depth = 0
+def _depth_of(text: str) -> int:
+    """How deep brackets are nested, or their number where that is small."""
+    most = text.count("[") + text.count("{")
+    if most <= MAX_DEPTH:
+        return most
+    depth = deepest = 0
     for match in _TOKEN.finditer(text):
         token = match[0]
         if token in "[{":
             depth += 1
-            if depth > deepest:
+            deepest = max(deepest, depth)
+            if depth > _BRACKETS_A_LEVEL * (MAX_DEPTH + 1):
                 raise ValueError(f"expected at most {MAX_DEPTH} levels of nesting, found more")
         elif token in "]}":
             depth -= 1
+    return deepest
+
+
+def _levels(value: Any) -> int:
+    """How many levels a value is in itself, without what is in it."""
+    if value is None or isinstance(value, (bool, float, int, str)):
+        return 0 if type(value) in _SCALARS else 1
+    return max(1, value.ndim) if isinstance(value, np.ndarray) else 1
+
+
+def _check_levels(value: Any, depth: int) -> None:
+    """Raises ValueError where `dumps` would for the depth of a value."""
+    if type(value) in _SCALARS:
+        return
+    if depth + _levels(value) > MAX_DEPTH:
+        raise ValueError(f"expected at most {MAX_DEPTH} levels of nesting, found more")
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if type(key) is not str:
+                _check_levels(key, depth + 1)
+            _check_levels(item, depth + 1)
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        for item in value:
+            _check_levels(item, depth + 1)
+
+
+def _check_hashes(keys: list[Any]) -> None:
+    """Raises ValueError if too many keys have the same hash: making a dict or a set of them takes their number squared.
+
+    Integers have the same one if they differ by a multiple of 2**61 - 1.
+    """
+    if len(keys) > _SAME_HASH:
+        hashes = sorted(map(hash, keys))
+        if any(map(operator.eq, hashes, hashes[_SAME_HASH:])):
+            raise ValueError(f"expected at most {_SAME_HASH} keys of the same hash, found more")
 
 
 def _refuse_constant(name: str) -> Any:
@@ -331,7 +382,17 @@ def _from_float(value: Any) -> float:
 def _from_int(value: Any) -> int:
     if not re.fullmatch(r"-?[0-9a-f]+", value):
         raise ValueError("not hexadecimal")
-    return int(value, 16)
+    return _bounded(int(value, 16))
+
+
+def _from_decimal(digits: str) -> int:
+    return _bounded(int(digits))
+
+
+def _bounded(value: int) -> int:
+    if value.bit_length() > _PLAIN_INT_BITS:
+        raise ValueError(f"an integer of more than {_PLAIN_INT_BITS} bits")
+    return value
 
 
 def _from_complex(value: Any) -> complex:
@@ -351,7 +412,14 @@ def _from_base64(value: Any) -> bytes:
     return base64.b64decode(value, validate=True)
 
 
+def _from_items(value: Any) -> list[Any]:
+    items = _list(value)
+    _check_hashes(items)
+    return items
+
+
 def _from_pairs(value: Any) -> dict[Any, Any]:
+    _check_hashes([key for key, _ in _list(value)])
     pairs = {key: item for key, item in _list(value)}  # noqa: C416 (two items each, or ValueError)
     if len(pairs) != len(value):
         raise ValueError("a key occurs twice")
@@ -395,8 +463,8 @@ _RESTORE: dict[str, Callable[[Any], Any]] = {
     "$bytes": _from_base64,
     "$bytearray": lambda value: bytearray(_from_base64(value)),
     "$tuple": lambda value: tuple(_list(value)),
-    "$set": lambda value: set(_list(value)),
-    "$frozenset": lambda value: frozenset(_list(value)),
+    "$set": lambda value: set(_from_items(value)),
+    "$frozenset": lambda value: frozenset(_from_items(value)),
     "$dict": _from_pairs,
     "$numpy": _from_numpy,
     "$numpy_str": _from_numpy_str,
