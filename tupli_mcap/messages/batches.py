@@ -21,7 +21,7 @@ Array = np.ndarray[Any, Any]
 Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]  # `steps` or `finals` of a `BatchDecoder`
 LOG_TIME = "#log_time"  # the name of the times (ns), as in the rows of constant size
 _LOG_TIME_AT = 15  # in a record
-_U1, _U4 = np.dtype(np.uint8), np.dtype("<u4")
+_BOOL, _U4 = np.dtype(np.bool_), np.dtype("<u4")
 
 
 class BatchDecoder:
@@ -47,12 +47,12 @@ class BatchDecoder:
         try:
             fields = _Fields(data, records)
             found = self._leaves(fields, self._layout.step_leaves, names)
-            flags = {name: fields.take(_U1, 1, name in names) for name in ("terminal", "timeout")}
+            flags = {name: fields.take(_BOOL, 1) for name in ("terminal", "timeout")}
             fields.end()
         except FormatError:
             self._explain(data, records, self._single.step)
             raise
-        found |= {name: flag != 0 for name, flag in flags.items() if name in names}
+        found |= {name: flag for name, flag in flags.items() if name in names}
         return found | ({LOG_TIME: _log_times(data, records)} if LOG_TIME in names else {})
 
     def finals(self, data: Any, records: Array, names: Collection[str]) -> dict[str, Any]:
@@ -130,8 +130,8 @@ class _Fields:
                 found = rows[self._at].view(dtype)
             except IndexError as err:
                 raise FormatError("expected longer messages") from err
-            if dtype == np.bool_:
-                found = found.view(np.uint8) != 0
+            if dtype == np.bool_ and found.view(np.uint8).max(initial=0) > 1:
+                raise FormatError("expected bools of 0 or 1")
         self._at += size
         self._aligned = math.gcd(self._aligned, size)
         return found

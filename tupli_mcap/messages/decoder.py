@@ -26,6 +26,8 @@ class MessageDecoder:
         values, position = self._leaves(body, self._step)
         if position + 2 != len(body):
             raise FormatError(f"expected a step message of {position + 2} bytes, found {len(body)}")
+        if max(body[position], body[position + 1]) > 1:
+            raise FormatError(f"expected flags of 0 or 1, found {bytes(body[position:])!r}")
         values["terminal"], values["timeout"] = bool(body[position]), bool(body[position + 1])
         values["episode"], values["step"] = _pair(body)
         return values
@@ -57,8 +59,8 @@ class MessageDecoder:
             if position + size > len(body):
                 raise FormatError(f"{leaf.path}: expected {size} bytes at byte {position} of {len(body)}")
             value = np.frombuffer(body[position : position + size], dtype).reshape(leaf.shape).copy()
-            if dtype == np.bool_:  # a byte that is neither 0 nor 1 is no bool that NumPy knows
-                value = np.asarray(value.view(np.uint8) != 0)
+            if dtype == np.bool_ and value.view(np.uint8).max(initial=0) > 1:  # is no bool that NumPy knows
+                raise FormatError(f"{leaf.path}: expected bools of 0 or 1, found another byte")
             values[leaf.name] = value[()] if leaf.is_scalar else value
             position += size
         return values, position
