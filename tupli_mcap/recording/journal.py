@@ -52,6 +52,7 @@ _HEAD = struct.Struct("<8sII")
 PAGE = 4096
 _LOG_HEADER = 64
 _MAX_HEADER = 64 << 20
+_PIECE = 1 << 20
 # Bytes from which a journal is written once as zeros: the faults of its pages, one by one, take five times as long.
 # Of a smaller one a short recording touches a few pages only.
 _WORTH_ZEROS = 2 << 20
@@ -337,12 +338,34 @@ def read_journal(path: Path, only: Collection[str] | None = None) -> JournalCont
         offsets, _ = _place(areas, _HEAD.size + length)
         areas = [area for area in areas if only is None or area.name in only]
         for area in areas:
-            file.seek(offsets[area.name])
-            data[area.name] = read = np.empty(area.size, np.uint8)
-            size = file.readinto(read.data)  # type: ignore[attr-defined]
-            if size != area.size:
-                raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {size}")
+            data[area.name] = _read_area(file.fileno(), offsets[area.name], area.size)
     return JournalContents(info, {area.name: area for area in areas}, data)
+
+
+def _read_area(fd: int, start: int, size: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """The bytes of an area; where the file has holes, no memory is taken either: its size is a claim."""
+    area = np.zeros(size, np.uint8)
+    view, at = memoryview(area), 0
+    while at < size:
+        end = size
+        if hasattr(os, "SEEK_DATA"):
+            try:
+                at = os.lseek(fd, start + at, os.SEEK_DATA) - start
+                end = min(size, os.lseek(fd, start + at, os.SEEK_HOLE) - start)
+            except OSError as err:
+                if err.errno == errno.ENXIO:  # nothing but a hole up to the end
+                    break
+                end = size  # a file system that does not tell
+        if at >= size:
+            break
+        piece = os.pread(fd, min(end - at, _PIECE), start + at)
+        if not piece:
+            raise FormatError(
+                f"expected {size} bytes of an area at offset {start}, found {at}; the journal was cut"
+            )
+        view[at : at + len(piece)] = piece
+        at += len(piece)
+    return area
 
 
 def journal_info(path: Path) -> dict[str, Any]:
