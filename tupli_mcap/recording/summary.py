@@ -53,6 +53,10 @@ _PARSERS: dict[int, Any] = {
     Opcode.STATISTICS: Statistics,
     Opcode.METADATA: Metadata,
 }
+_STRINGS_BEFORE_MAP: dict[int, tuple[int, int]] = {  # where the first begins, and how many
+    Opcode.CHANNEL: (4, 2),
+    Opcode.METADATA: (0, 1),
+}
 
 
 class Summary(NamedTuple):
@@ -185,7 +189,19 @@ def parse_record(opcode: int, body: memoryview, offset: int, name: str) -> Any:
         raise FormatError(
             f"{name}: the record with opcode {opcode} at offset {offset} has {len(body)} bytes, not {stream.tell()}"
         )
+    if opcode in _STRINGS_BEFORE_MAP and not _map_fits(opcode, body):
+        raise FormatError(
+            f"{name}: the record with opcode {opcode} at offset {offset} is damaged: its map has another length"
+        )
     return parsed
+
+
+def _map_fits(opcode: int, body: memoryview) -> bool:
+    """Whether the map that ends a record has the length it says: the package reads pairs beyond it."""
+    at, strings = _STRINGS_BEFORE_MAP[opcode]
+    for _ in range(strings):
+        at += 4 + int.from_bytes(body[at : at + 4], "little")
+    return int.from_bytes(body[at : at + 4], "little") == len(body) - at - 4
 
 
 def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
