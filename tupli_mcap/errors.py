@@ -5,6 +5,8 @@ Every message is one sentence: what was expected, what was found, where, and wha
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 __all__ = [
@@ -20,6 +22,7 @@ __all__ = [
     "TupliError",
     "UntrustedError",
     "install_line",
+    "memory_for",
     "missing_extra",
 ]
 
@@ -103,3 +106,14 @@ def _origin() -> str | None:
         return None
     path = unquote(url.path)
     return path if url.scheme == "file" and Path(path).exists() else None
+
+
+@contextlib.contextmanager
+def memory_for(what: Callable[[], str]) -> Iterator[None]:
+    """Turns a MemoryError into a RecordingError that says what the memory was for."""
+    try:
+        yield
+    except MemoryError as err:
+        raise RecordingError(
+            f"{what()} takes more memory than there is ({err or 'out of memory'}); read fewer episodes at a time"
+        ) from err

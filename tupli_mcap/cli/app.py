@@ -111,6 +111,8 @@ def _report(err: BaseException) -> int:
         message = message.replace("pass trust=True", "pass --trust")
     elif isinstance(err, RecordingError):  # only `record` has modes
         message = message.replace('mode="a"', "--mode a").replace('"w" to replace', "w to replace")
+    elif isinstance(err, MemoryError):
+        message = f"there is not enough memory for this ({message or 'out of memory'}); see --debug for where"
     elif isinstance(err, OSError):
         name = "" if err.filename is None else f"{os.fsdecode(err.filename)}: "
         message = f"{name}{err.strerror or err}"

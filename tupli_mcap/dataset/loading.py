@@ -12,6 +12,7 @@ import numpy as np
 from tupli_mcap.dataset.columns import FieldBuilder, pick
 from tupli_mcap.dataset.selection import TupleSelector
 from tupli_mcap.dataset.sources import Source
+from tupli_mcap.errors import memory_for
 from tupli_mcap.messages.common import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
@@ -65,12 +66,15 @@ def read_columns(
         NotFoundError: an episode is not in its recording any more.
     """
     total = sum(header.n_tuples for header in headers)
-    reader = _Reader(fields, selector, known, total)
-    with progress(total, "Loading") as bar:
+    with (
+        memory_for(lambda: f"loading {', '.join(fields)} of {total} steps"),
+        progress(total, "Loading") as bar,
+    ):
+        reader = _Reader(fields, selector, known, total)
         for name, group in itertools.groupby(headers, key=lambda header: header.recording):
             with source.open(name) as recording:
                 reader.read(recording, list(group), bar)
-    return reader.finish(headers)
+        return reader.finish(headers)
 
 
 class _Reader:

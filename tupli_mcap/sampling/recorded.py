@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, memory_for
 from tupli_mcap.messages.common import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
@@ -179,6 +179,15 @@ class RecordedSteps:
         listed: Callable[[], Array],
     ) -> dict[str, Any]:
         """The columns of some listed steps, whose leaves `read` gives."""
+        with memory_for(lambda: f"reading {', '.join(fields)} of {len(listed())} steps"):
+            return self._planned(fields, read, listed)
+
+    def _planned(
+        self,
+        fields: Sequence[str],
+        read: Callable[[Rows, Sequence[str]], dict[str, Any]],
+        listed: Callable[[], Array],
+    ) -> dict[str, Any]:
         plan = self._plans.get(tuple(fields)) or self._plan(fields)
         found: dict[str, Any] = {}
         for source, names in plan.sources:
