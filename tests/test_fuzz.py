@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
@@ -13,6 +14,10 @@ from fuzzing.model import Model, load_seeds
 from fuzzing.oracle import judge, observe
 from fuzzing.plain import Mutant
 from fuzzing.run import MUTATORS, Case, Fuzzer, case_of
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording import Recording
+from tupli_mcap.sampling import steps_of
 
 SEEDS = {seed.name: seed for seed in load_seeds()}
 SAMPLE = 2_500
@@ -77,3 +82,84 @@ def test_the_judge_sees_a_lost_episode(fuzzer: Fuzzer) -> None:
     finding = fuzzer.run(Case(0, "flip_bits", seed.name, Mutant(model.encode(), None, True, "one less")))
     assert finding is not None
     assert "a complete recording of 2 episodes, not 3" in finding.problem
+
+
+# What an index, or a message, may say wrongly while every checksum is right.
+LIES = ("boundary", "row left out", "end", "numbers swapped", "step", "episode", "flags", "rows swapped")
+
+
+def lie(what: str, model: Model, random: np.random.Generator) -> bool:
+    """Changes a model; False where it has no place for this lie."""
+    index, rows = model.index, None if model.index is None else model.index.episodes
+    if index is None or rows is None or len(rows) < 2:
+        return False
+    i = int(random.integers(len(rows) - 1))
+    if what == "boundary":
+        if rows["env"][i] != rows["env"][i + 1] or rows["length"][i] < 2:
+            return False
+        rows["length"][i] -= 1
+        rows["first_row"][i + 1] -= 1
+        rows["length"][i + 1] += 1
+    elif what == "row left out":
+        index.episodes = np.delete(rows, i)
+        lengths = int(rows["metadata_length"][i])
+        at = int(rows["metadata_offset"][i])
+        index.texts = index.texts[:at] + index.texts[at + lengths :]
+    elif what == "end":
+        rows["end"][i] = (rows["end"][i] + 1) % 3
+    elif what == "numbers swapped":
+        for name in ("first_row", "length", "env"):
+            rows[name][[i, i + 1]] = rows[name][[i + 1, i]]
+    else:
+        return lie_in_a_step(what, model, random)
+    return True
+
+
+def lie_in_a_step(what: str, model: Model, random: np.random.Generator) -> bool:
+    topics = [body for opcode, body in model.summary if opcode == 4]
+    steps = [int.from_bytes(body[:2], "little") for body in topics if b"/step" in body[:40]]
+    places = [
+        (part, k)
+        for part in model.chunks()
+        for k, piece in enumerate(part.inner)
+        if piece[0] == 5 and int.from_bytes(piece[9:11], "little") in steps
+    ]
+    part, k = places[int(random.integers(len(places)))]
+    data = bytearray(part.inner[k])
+    if what == "step":
+        data[39] ^= 1
+    elif what == "episode":
+        data[35] ^= 1
+    elif what == "flags":
+        data[-2:] = b"\2\0"
+    else:
+        others = [j for j, piece in enumerate(part.inner) if piece[0] == 5 and j != k]
+        if not others:
+            return False
+        j = others[0]
+        part.inner[j], part.inner[k] = part.inner[k], part.inner[j]
+        return True
+    part.inner[k] = bytes(data)
+    return True
+
+
+@pytest.mark.parametrize("what", LIES)
+def test_what_is_read_is_what_the_messages_say(what: str, tmp_path: Path) -> None:
+    """Every checksum is right, and the index or a message lies: a FormatError, never other steps."""
+    random, told = np.random.default_rng(LIES.index(what)), 0
+    for name, seed in SEEDS.items():
+        model = seed.model()
+        if seed.journal is not None or not lie(what, model, random):
+            continue
+        path = tmp_path / f"{name}.mcap"
+        path.write_bytes(model.encode())
+        with pytest.raises(FormatError, match="expected|gives|holds"), Recording(path) as recording:
+            recording.read()
+        with pytest.raises(FormatError, match="expected|gives|holds"), Recording(path) as recording:
+            for episode in recording.episodes:
+                episode[:]
+        with pytest.raises(FormatError, match="expected|gives|holds"), Recording(path) as recording:
+            steps = steps_of(recording, threads=1)
+            steps.read(["states", "rewards", "terminals", "timeouts"], np.arange(len(steps)))
+        told += 1
+    assert told >= 3

@@ -9,10 +9,12 @@ import struct
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import lz4.frame
 import numpy as np
 import pytest
@@ -24,11 +26,15 @@ from fuzzing.crafted import checksum
 from fuzzing.model import ATTACHMENT, CHANNEL, SCHEMA, Model, Part, load_seeds, record, strings
 from fuzzing.oracle import observe
 
-from tupli_mcap.cli.app import app
+from tupli_mcap import RecordEpisodes
+from tupli_mcap.cli.app import _report, app
+from tupli_mcap.dataset import TupliDataset
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.compression import decompress
-from tupli_mcap.recording.journal import read_journal
+from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.compression import MAX_RATIO, decompress
+from tupli_mcap.recording.journal import RowArea, read_journal
+from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.listing import list_recordings
 
@@ -146,6 +152,36 @@ def with_texts(text: bytes) -> bytes:
     return file.encode()
 
 
+def with_packed(name: str, value: int) -> bytes:
+    """A claim of the first chunk of a file that is compressed."""
+    file = model("constant_zstd")
+    assert file.index is not None
+    file.index.change_chunks = lambda rows: (setting(name, value)(rows), rows)[1]
+    return file.encode()
+
+
+def with_unused_texts() -> bytes:
+    file = model()
+    assert file.index is not None
+    file.index.texts += b" " * 1000
+    return file.encode()
+
+
+def with_env(text: bytes) -> bytes:
+    """The metadata of an image channel, with its checksum."""
+    file = model("dict_with_images")
+    for at, (opcode, body) in enumerate(file.summary):
+        if opcode == CHANNEL and b"/image/" in body[:40]:
+            leaf = body[4:].split(b"/image/")[1][: body[4] - len(b"/image/")]
+            pairs = {b"env": text, b"leaf": leaf}
+            pairs[b"crc"] = b"%08x" % checksum(pairs)
+            data = strings(*[one for pair in pairs.items() for one in pair])
+            topic = body[4 : 8 + body[4]]
+            head = body[:4] + topic + strings(b"cdr")
+            file.summary[at] = (opcode, head + len(data).to_bytes(4, "little") + data)
+    return file.encode()
+
+
 def footer(start: int) -> bytes:
     data = SEEDS["constant_none"].data
     return data[: -8 - 20] + struct.pack("<Q", start) + data[-8 - 12 :]
@@ -189,6 +225,12 @@ REFUSED: dict[str, Callable[[], bytes]] = {
     "a chunk in a journal's place": lambda: with_chunk(setting("offset", 1 << 63)),
     "a chunk of 2**63 bytes": lambda: with_chunk(setting("length", 1 << 63)),
     "a chunk of 2**40 bytes unpacked": lambda: with_chunk(setting("uncompressed", 1 << 40)),
+    "more bytes than its compressed ones hold": lambda: with_packed("uncompressed", 1 << 27),
+    "bytes that are not compressed, and others": lambda: with_chunk(setting("uncompressed", 100)),
+    "more rows than its compressed bytes tell apart": lambda: with_packed("rows", 1 << 20),
+    "rows of another size": lambda: with_packed("rows", 2),
+    "metadata that no episode has": lambda: with_unused_texts(),
+    "an image channel of no sub-environment": lambda: with_env(b"null"),
     "more rows than bytes": lambda: with_chunk(setting("rows", 1 << 31)),
     "a skip beyond the chunk": lambda: with_chunk(setting("skip", 1 << 31)),
     "a compression without a name": lambda: with_chunk(setting("compression", 9)),
@@ -447,3 +489,119 @@ def test_records_beyond_the_file(tmp_path: Path) -> None:
         with Recording(path) as recording:
             assert not recording.complete
             assert len(recording) == 0
+
+
+def test_zeros_compress_as_far_as_they_do() -> None:
+    """Honest extremes are within the bounds: a chunk of zeros by each compressor."""
+    data = bytes(1 << 26)
+    for name, packed in (
+        ("zstd", zstandard.ZstdCompressor(level=-1).compress(data)),
+        ("zstd", zstandard.ZstdCompressor(level=19).compress(data)),
+        ("lz4", lz4.frame.compress(data, compression_level=12, block_size=lz4.frame.BLOCKSIZE_MAX4MB)),
+    ):
+        assert len(data) <= MAX_RATIO[name] * len(packed)
+        assert len(data) > MAX_RATIO[name] // 2 * len(packed)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_recording_of_nothing_but_zeros(compression: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(Zeros(), path, compression=compression, chunk_size=1 << 22) as env:
+        for _ in range(3):
+            env.reset()
+            for _ in range(2000):
+                env.step(0)
+    with Recording(path) as recording:
+        assert not recording.read().states.any()
+    assert verify_recording(path).ok
+
+
+class Zeros(gym.Env[Any, Any]):
+    observation_space = gym.spaces.Box(0, 255, (16, 16, 3), np.uint8)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return np.zeros((16, 16, 3), np.uint8), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros((16, 16, 3), np.uint8), 0.0, False, False, {}
+
+
+def test_lengths_of_maps_are_looked_at(tmp_path: Path) -> None:
+    """Every bit of the length of the map in the first metadata record, and in a channel outside of chunks."""
+    data = SEEDS["constant_zstd"].data
+    name = data.index(b"tupli_mcap.recording")
+    for bit in range(8):
+        damaged = bytearray(data)
+        damaged[name + len("tupli_mcap.recording")] ^= 1 << bit
+        path = tmp_path / "a.mcap"
+        path.write_bytes(damaged)
+        with pytest.raises(FormatError, match="damaged|expected|has \\d+ bytes"):
+            Recording(path)
+        assert not verify_recording(path).ok
+    channel = data.index(b"/step", name)
+    at = channel + len("/step") + 4 + len("cdr")
+    assert data[channel + len("/step") : at] == b"\3\0\0\0cdr"
+    for bit in range(8):
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << bit
+        path.write_bytes(damaged)
+        assert not verify_recording(path).ok
+
+
+def test_holes_of_a_journal_take_no_memory(tmp_path: Path) -> None:
+    area = RowArea("steps", 64, 1 << 24)
+    path = tmp_path / "a.journal"
+    text = json.dumps({"info": {}, "areas": [area.to_json()]}).encode()
+    head = struct.pack("<8sII", b"TMCAPJ1\0", len(text), zlib.crc32(text)) + text
+    with path.open("wb") as file:
+        file.write(head)
+        file.seek(4096 + 100)
+        file.write(b"here")
+        file.truncate(4096 + area.size)
+    if path.stat().st_blocks * 512 > area.size:
+        pytest.skip("this file system has no holes")
+    script = MEASURE.split("def read")[0] + (
+        "from tupli_mcap.recording.journal import read_journal\n"
+        "Path('/proc/self/clear_refs').write_text('5')\nbefore = peak()\n"
+        "found = read_journal(Path(sys.argv[1])).data['steps']\n"
+        "assert found[100:104].tobytes() == b'here' and not found[200:300].any()\nprint(peak() - before)\n"
+    )
+    command = [sys.executable, "-c", script, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=True)
+    assert int(done.stdout) < 64 << 20
+
+
+@pytest.mark.parametrize("place", ["open", "read", "window", "load"])
+def test_memory_that_runs_out_is_told(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By one error of ours, which says what the memory was for."""
+    path = tmp_path / "a.mcap"
+    path.write_bytes(SEEDS["constant_zstd"].data)
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise MemoryError("Unable to allocate 18.3 GiB")
+
+    if place == "open":
+        monkeypatch.setattr(ChunkStore, "__init__", refuse)
+        with pytest.raises(
+            RecordingError, match=r"opening a file of \d+ bytes takes more memory than there is"
+        ):
+            Recording(path)
+        return
+    dataset = TupliDataset.from_files(path)
+    with Recording(path) as recording:
+        monkeypatch.setattr(ChunkStore, "rows", refuse)
+        with pytest.raises(RecordingError, match=r"of \d+ steps takes more memory than there is \(Unable"):
+            if place == "read":
+                recording.read()
+            elif place == "window":
+                recording.episodes[0][:1]
+            else:
+                dataset.convert_to_numpy()
+
+
+def test_the_command_line_tells_that_memory_ran_out(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert _report(MemoryError("Unable to allocate 18.3 GiB")) == 1
+    assert "error: there is not enough memory" in capsys.readouterr().err

@@ -6,8 +6,10 @@ import json
 import os
 import random
 import shutil
+import struct
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,10 @@ from test_golden import GOLDEN, NAMES, UNFINISHED, place
 from test_repair import BOX, chunks, flip, foreign, hit, places, record
 from typer.testing import CliRunner
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+
+from fuzzing.model import Model
+
 from tupli_mcap import (
     FileStorage,
     RecordEpisodes,
@@ -31,11 +37,13 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
+from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording import VerifyReport, rewrite, transfer
+from tupli_mcap.recording import VerifyReport, headers, rewrite, transfer
 from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
+from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage.verify import verify_paths, verify_storage
 
@@ -315,7 +323,7 @@ MISTAKES = {
     "end": "its end and the index differ",
     "start": "its start and the index differ",
     "final": "is the final state of no episode",
-    "length": "belong to no episode",
+    "length": "gives 59 of the 60 steps of sub-environment 0 to episodes",
     "index_return": "its end and the index differ",
     "index_seed": "its start and the index differ",
     "index_end": "other flags than the end",
@@ -566,3 +574,40 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.mcap")
     with pytest.raises(RecordingError, match="a device, a pipe or a socket"):
         recover_recording(tmp_path / "pipe.mcap")
+
+
+def test_bools_other_than_0_and_1_are_found(tmp_path: Path) -> None:
+    space = spaces.Box(0, 1, (3,), np.bool_)
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(Sampler(space, spaces.Discrete(2)), path, compression="none") as env:
+        roll(env, 30)
+    model = Model.of(path.read_bytes())
+    (part,) = (part for part in model.chunks() if b"/step" in part.inner[1][:60])
+    row = bytearray(part.inner[-1])
+    row[35 + 8] = 7
+    part.inner[-1] = bytes(row)
+    path.write_bytes(model.encode())
+    assert "has a bool in 'state' other than 0 and 1" in said(verify_recording(path))
+    with (
+        pytest.raises(FormatError, match="expected bools of 0 or 1 in 'state'"),
+        Recording(path) as recording,
+    ):
+        recording.read()
+
+
+def test_a_chunk_of_too_many_messages_is_left_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No more of them are looked at than its compressed bytes can stand for."""
+    sizes = [35, 36] * 5000
+    data = b"".join(struct.pack("<BQ", 5, size - 9) + bytes(size - 9) for size in sizes)
+    seen: list[int] = []
+
+    def counted(view: memoryview) -> Iterator[Any]:
+        for found in iter_records(view):
+            seen.append(found[0])
+            yield found
+
+    monkeypatch.setattr(headers, "iter_records", counted)
+    with pytest.raises(FormatError, match="expected at most 1600 messages"):
+        headers.chunk_records(memoryview(data), "the chunk", packed=100)
+    assert len(seen) == 1601
+    assert len(headers.message_headers(memoryview(data))) == 10_000

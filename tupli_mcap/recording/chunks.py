@@ -20,7 +20,7 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording.claims import MAX_CHUNK
+from tupli_mcap.recording.claims import MAX_CHUNK, StepClaims
 from tupli_mcap.recording.compression import decompress
 from tupli_mcap.recording.container import COMPRESSIONS
 from tupli_mcap.recording.crc import crc32
@@ -37,8 +37,16 @@ _CHUNK_HEAD = struct.Struct(
 
 _LENGTH = struct.Struct("<Q")  # of a record, after its opcode
 _MESSAGE_HEAD = np.dtype(
-    {"names": ["opcode", "channel"], "formats": ["u1", "<u2"], "offsets": [0, 9], "itemsize": 11}
+    {
+        "names": ["opcode", "channel", "sequence"],
+        "formats": ["u1", "<u2", "<u4"],
+        "offsets": [0, 9, 11],
+        "itemsize": 15,
+    }
 )
+_U2, _U4 = np.dtype("<u2"), np.dtype("<u4")
+_SEQUENCE_AT = 11  # in a record
+_LEAST_STEP = BODY + 8 + 2  # bytes of a step's record: episode and step, terminal and timeout
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
 _MANY_ROWS = 1 << 16
 _HEAD, _REST = (
@@ -134,7 +142,7 @@ class Decoder(Protocol):
 _numbers = itertools.count()
 
 
-@functools.lru_cache(maxsize=4)  # most chunks of a channel have as many rows
+@functools.lru_cache(maxsize=4)
 def _heads(rows: int, length: int, channel: int) -> tuple[bytes, bytes]:
     """What all the rows of a chunk begin with, as `_HEAD` and `_REST`."""
     head = _ROW_HEAD.pack(5, length, channel)
@@ -145,9 +153,22 @@ def _are_rows(data: Any, rows: int, size: int, channel: int) -> bool:
     """Whether each of the rows, `size` bytes long, begins as a row of the channel does."""
     if not rows:
         return True
-    heads, rests = (_heads if rows < _MANY_ROWS else _heads.__wrapped__)(rows, size - 9, channel)
-    found: bool = np.ndarray(rows, _HEAD, data, 0, (size,)).tobytes() == heads
-    return found and np.ndarray(rows, _REST, data, 7, (size,)).tobytes() == rests
+    if rows < _MANY_ROWS:  # chunks of a few numbers of rows share what they begin with
+        heads, rests = _heads(1 << rows.bit_length(), size - 9, channel)
+    else:
+        heads, rests = _heads.__wrapped__(rows, size - 9, channel)
+    found = heads.startswith(np.ndarray(rows, _HEAD, data, 0, (size,)).tobytes())
+    return found and rests.startswith(np.ndarray(rows, _REST, data, 7, (size,)).tobytes())
+
+
+def _check_sequence(sequences: Array, first: int, where: str) -> None:
+    """Raises FormatError unless rows are numbered from `first` on."""
+    wrong = sequences != np.arange(first, first + len(sequences))
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        raise FormatError(
+            f"{where}: expected row {first + i}, found row {sequences[i]}; recover it into a new file"
+        )
 
 
 class ChunkStore:
@@ -168,8 +189,12 @@ class ChunkStore:
         self._memory = memory
         self._cache = ChunkCache(cache) if isinstance(cache, int) else cache
         self._checked = np.zeros(len(table), np.bool_)
+        self._held = np.zeros(len(table), np.bool_)  # against `claims`
         self._number = next(_numbers)  # tells the stores apart that share a cache
         self.codecs: Mapping[int, Decoder] = {}  # of the channels whose rows have to be decoded
+        # What the episode index says of the step channels: the rows of all channels are held against it and the chunk
+        # table before they are given out. None: they are given out as they are.
+        self.claims: Mapping[int, StepClaims] | None = None
         self._by_channel: dict[int, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
         self._counts: dict[int, int] = {}
         for channel in np.unique(table["channel"]):
@@ -185,6 +210,11 @@ class ChunkStore:
             raise FormatError(
                 f"{self._source.name}: the chunks of channel {channel} do not hold its rows without gaps"
             )
+
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self._source.name
 
     def count(self, channel: int) -> int:
         """Rows of a channel."""
@@ -218,13 +248,14 @@ class ChunkStore:
     def elsewhere(self, source: Source, cache: ChunkCache) -> ChunkStore:
         """The same chunks, read from another source, kept in another cache."""
         store = ChunkStore(source, self.table, self._memory, cache)
-        store.codecs = self.codecs
+        store.codecs, store.claims = self.codecs, self.claims
         return store
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._number = next(_numbers)
         self._checked = np.zeros(len(self.table), np.bool_)
+        self._held = np.zeros(len(self.table), np.bool_)
 
     def locate(self, channel: int, first: np.ndarray[Any, Any], counts: np.ndarray[Any, Any]) -> Located:
         """Where the runs `first[i]:first[i] + counts[i]` (int64) of a channel's rows lie, in their order."""
@@ -308,8 +339,33 @@ class ChunkStore:
         rows = np.frombuffer(data, dtype)
         if not _are_rows(data, n, dtype.itemsize, channel):
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
+        if self.claims is not None and not self._held[i]:
+            self._hold_rows(i, data, n, dtype.itemsize)
         kept.rows = rows
         return rows
+
+    def _hold_rows(self, i: int, data: Any, n: int, size: int) -> None:
+        """Raises FormatError unless the rows of a chunk are those that the index says."""
+        first, where = int(self.table["first"][i]), f"{self._source.name}: chunk {i}"
+        claims = None if self.claims is None else self.claims.get(int(self.table["channel"][i]))
+        if claims is None:
+            _check_sequence(np.ndarray(n, _U4, data, _SEQUENCE_AT, (size,)), first, where)
+        else:
+            numbers = np.ndarray(n, _HEAD, data, BODY, (size,)).tobytes()
+            claims.check(first, numbers, np.ndarray(n, _U2, data, size - 2, (size,)), where)
+        self._held[i] = True  # its CRC says that it stays the same
+
+    def _hold_records(self, i: int, data: Any, records: Array) -> None:
+        """The same for a chunk of variable layout."""
+        first, where = int(self.table["first"][i]), f"{self._source.name}: chunk {i}"
+        claims = None if self.claims is None else self.claims.get(int(self.table["channel"][i]))
+        if claims is not None and len(records):
+            starts, stops = records[:, 0], records[:, 1]
+            if int((stops - starts).min()) < _LEAST_STEP:
+                raise FormatError(f"{where} holds messages that are no steps")
+            numbers = np.ndarray(len(data) - 7, _HEAD, data, 0, (1,))[starts + BODY].tobytes()
+            claims.check(first, numbers, np.ndarray(len(data) - 1, _U2, data, 0, (1,))[stops - 2], where)
+        self._held[i] = True
 
     def _decoded(self, i: int, codec: Decoder, *, keep: bool) -> KeptChunk:
         """A chunk as rows of constant size, which are kept instead of what it holds."""
@@ -325,22 +381,27 @@ class ChunkStore:
         """A chunk of variable layout, and where each message record begins and ends in it: int64 (rows, 2)."""
         kept = self.chunk(i, keep=keep)
         if kept.records is None:
-            kept.records = self._find_records(i, kept.data)
+            records = self._find_records(i, kept.data)
+            if self.claims is not None and not self._held[i]:
+                self._hold_records(i, kept.data, records)
+            kept.records = records
         return kept.data, kept.records
 
     def _find_records(self, i: int, data: Any) -> Array:
         rows, channel, size = int(self.table["rows"][i]), int(self.table["channel"][i]), len(data)
+        where = f"{self._source.name}: chunk {i}"
         starts, at, length_at = [], 0, _LENGTH.unpack_from
         while at + BODY <= size:
             starts.append(at)
             at += 9 + length_at(data, at + 1)[0]
         if at == size and len(starts) == rows:
             found = np.array([starts, [*starts[1:], at][:rows]], np.int64).T
-            heads = np.ndarray(max(0, size - 10), _MESSAGE_HEAD, data, 0, (1,))[found[:, 0]]
+            heads = np.ndarray(max(0, size - 14), _MESSAGE_HEAD, data, 0, (1,))[found[:, 0]]
             sound = (heads["opcode"] == 5).all() and (found[:, 1] - found[:, 0] >= BODY).all()
             if sound and (heads["channel"] == channel).all():
+                if self.claims is not None:
+                    _check_sequence(heads["sequence"], int(self.table["first"][i]), where)
                 return found
-        where = f"{self._source.name}: chunk {i}"
         for _, _, other, _, _ in iter_records(memoryview(data)):
             if other != channel:
                 raise FormatError(f"{where} holds a message of channel {other}")

@@ -14,6 +14,7 @@ from tupli_mcap.messages.batches import LOG_TIME, BatchDecoder, Decode
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.claims import check_bools
 from tupli_mcap.recording.pieces import Pieces, Runs, final_runs, items, items_dtype, put
 from tupli_mcap.recording.together import do_all
 
@@ -100,6 +101,8 @@ class ColumnReader:
                 dtype = layout.image_messages[leaf.name].dtype
                 tasks += self._tasks(moved, ["data"], {"data": out[leaf.name]}, dtype, keep, leaf)
         do_all(tasks, threads)
+        for name in plain:
+            check_bools(out[name], name, self._store.name)
         nest = {"states": layout.nest_state, "actions": layout.nest_action, "rewards": layout.nest_reward}
         columns = {
             field: nest[field]([out[leaf.name] for leaf in group])

@@ -10,7 +10,11 @@ import zstandard
 
 from tupli_mcap.errors import FormatError
 
-__all__ = ["decompress"]
+__all__ = ["MAX_RATIO", "decompress"]
+
+MAX_RATIO = {"": 1, "none": 1, "lz4": 255, "zstd": 1 << 15}
+"""How many bytes a compressed one may stand for at most: LZ4 counts a match in bytes of 255, and a block of zstd takes
+4 bytes at least and holds 128 KiB at most. Zeros come close to both."""
 
 _local = threading.local()
 
@@ -45,7 +49,7 @@ def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
             found = data
         else:
             raise FormatError(f"{where}: expected compression zstd, lz4 or none, found {name[:20]!r}")
-    except (zstandard.ZstdError, RuntimeError, MemoryError) as err:
+    except (zstandard.ZstdError, RuntimeError) as err:
         raise FormatError(f"{where}: the compressed data is damaged: {err}") from err
     if len(found) != size:
         raise FormatError(f"{where}: expected {size} bytes after decompression, found {len(found)}")

@@ -37,6 +37,7 @@ CHANNEL_KEYS = (
     "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields", "camera",
 )  # fmt: skip
 _VERSIONS = ("1", "2")
+_PLACE = re.compile("(?:/env_([0-9]+))?/(image|frame)/(.+)", re.DOTALL)
 _ATTEMPTS = 5
 _PAUSE = 0.01  # seconds: a writer begins, ends or goes on within that
 _VALUES = (
@@ -143,6 +144,7 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
     for channel in channels.values():
         if is_ours(channel.topic):
             check_crc(channel.metadata, CHANNEL_KEYS, f"{name}: the metadata of channel {channel.topic}")
+            check_place(channel, name)
     found = [channel for channel in channels.values() if channel.topic.endswith("/step")]
     by_env = {channel.metadata.get("env", ""): channel for channel in found}
     numbers = [str(i) for i in range(len(found))]
@@ -151,6 +153,20 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
             f"{name}: expected step channels of sub-environments 0 to {len(found) - 1}, found {list(by_env)}"
         )
     return [by_env[number] for number in numbers]
+
+
+def check_place(channel: Channel, name: str) -> None:
+    """Raises FormatError unless the metadata of a channel of images or frames says the place that its topic says."""
+    found = _PLACE.fullmatch(channel.topic)
+    if found is None:
+        return
+    key = "leaf" if found[2] == "image" else "camera"
+    expected = {"env": found[1] or "0", key: found[3]}
+    told = {key: channel.metadata.get(key) for key in expected}
+    if told != expected:
+        raise FormatError(
+            f"{name}: expected {expected} in the metadata of channel {channel.topic}, found {told!r:.100}"
+        )
 
 
 def is_ours(topic: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,12 +12,14 @@ from mcap.records import Channel, Schema
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.layout import BODY, HEADER_FIELDS
+from tupli_mcap.recording.claims import MAX_ROWS_A_BYTE
 from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.summary import parse_record
 
 __all__ = ["HEADERS", "ChunkRecords", "chunk_records", "message_headers"]
 
 _RECORD = struct.Struct("<BQ")
+_BLOCK = 1 << 16  # records whose headers are looked at together
 HEADERS = np.dtype([(name, kind) for name, kind, _ in HEADER_FIELDS] + [("#offset", "<u8")])
 Array = np.ndarray[Any, Any]
 
@@ -48,8 +51,8 @@ class ChunkRecords(NamedTuple):
         return int(self.headers["#sequence"][0])
 
 
-def chunk_records(data: memoryview, where: str) -> ChunkRecords:
-    """The records of a chunk of ours.
+def chunk_records(data: memoryview, where: str, packed: int | None = None) -> ChunkRecords:
+    """The records of a chunk of ours, which had `packed` bytes.
 
     Raises:
         FormatError: it holds other than definitions and then messages, of one channel, in the order of their rows.
@@ -63,7 +66,7 @@ def chunk_records(data: memoryview, where: str) -> ChunkRecords:
         schemas.append(record) if opcode == Opcode.SCHEMA else channels.append(record)
         skip += 9 + length
     try:
-        headers = message_headers(data[skip:])
+        headers = message_headers(data[skip:], None if packed is None else MAX_ROWS_A_BYTE * packed)
     except FormatError as err:
         raise FormatError(f"{where}: {err}") from err
     if not len(headers):
@@ -75,35 +78,53 @@ def chunk_records(data: memoryview, where: str) -> ChunkRecords:
     return ChunkRecords(skip, schemas, channels, headers)
 
 
-def message_headers(data: memoryview) -> Array:
-    """The headers of consecutive Message records; FormatError for bytes that are none."""
-    even = _even(data)
+def message_headers(data: memoryview, most: int | None = None) -> Array:
+    """The headers of consecutive Message records; FormatError for bytes that are none, or for more than `most`."""
+    even = _even(data, most)
     if even is not None:
         return even
-    offsets = np.array([start for start, *_ in iter_records(data)], dtype=np.int64)
+    offsets = np.fromiter(_starts(data, most), np.int64)
     found = np.empty(len(offsets), HEADERS)
-    raw = np.frombuffer(data, np.uint8)
-    for name, kind, at in HEADER_FIELDS:
-        size = np.dtype(kind).itemsize
-        found[name] = raw[offsets[:, None] + (at + np.arange(size))].view(kind)[:, 0]
+    for begin in range(0, len(offsets), _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        heads = np.ndarray(max(0, len(data) - BODY + 1), _packed(BODY), data, 0, (1,))[offsets[part]]
+        for name, _, _ in HEADER_FIELDS:
+            found[name][part] = heads[name]
     found["#offset"] = offsets
     return found
 
 
-def _even(data: memoryview) -> Array | None:
-    """The headers where all records have the same size, else None."""
-    if len(data) < BODY:
-        return None
-    size = 9 + int.from_bytes(data[1:9], "little")
-    if size < BODY or len(data) % size:
-        return None
+def _starts(data: memoryview, most: int | None) -> Iterator[int]:
+    for i, (start, *_) in enumerate(iter_records(data)):
+        if i == most:
+            raise FormatError(
+                f"expected at most {most} messages in the compressed bytes of a chunk, found more"
+            )
+        yield start
+
+
+def _packed(size: int) -> np.dtype[Any]:
+    """A record of `size` bytes, as its header."""
     spec: Any = {
         "names": [name for name, _, _ in HEADER_FIELDS],
         "formats": [kind for _, kind, _ in HEADER_FIELDS],
         "offsets": [at for _, _, at in HEADER_FIELDS],
         "itemsize": size,
     }
-    rows = np.frombuffer(data, np.dtype(spec))
+    dtype: np.dtype[Any] = np.dtype(spec)
+    return dtype
+
+
+def _even(data: memoryview, most: int | None) -> Array | None:
+    """The headers where all records have the same size, else None."""
+    if len(data) < BODY:
+        return None
+    size = 9 + int.from_bytes(data[1:9], "little")
+    if size < BODY or len(data) % size:
+        return None
+    if most is not None and len(data) // size > most:
+        raise FormatError(f"expected at most {most} messages in the compressed bytes of a chunk, found more")
+    rows = np.frombuffer(data, _packed(size))
     if (rows["#opcode"] != Opcode.MESSAGE).any() or (rows["#length"] != size - 9).any():
         return None
     found = np.empty(len(rows), HEADERS)

@@ -12,7 +12,7 @@ import numpy as np
 import zstandard
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.compression import decompress
+from tupli_mcap.recording.compression import MAX_RATIO, decompress
 from tupli_mcap.recording.container import CHUNK_ROWS
 
 __all__ = ["EPISODE_ROWS", "INDEX_NAME", "EpisodeIndex", "IndexBuilder"]
@@ -23,7 +23,9 @@ _HEAD = struct.Struct("<8sQQQ")
 _MAGIC = b"TMIDX\0\0\1"
 _SIZE = struct.Struct("<Q")
 _MAX_METADATA = 1 << 26
-_MAX_RATIO = 1 << 16  # zstd cannot compress further than about 1 : 32,000
+_MAX_ROW_RATIO = (
+    256  # rows differ, in the numbers of episodes and the checksums of chunks: they compress to a tenth
+)
 
 EPISODE_ROWS = np.dtype(
     [
@@ -115,8 +117,10 @@ def _compress(data: bytes) -> bytes:
     return _SIZE.pack(len(packed)) + packed
 
 
-def _decompress(data: bytes, at: int, size: int, where: str) -> tuple[bytes, int]:
-    """A part of `size` bytes and where the next one starts; a claim that zstd could not have made is refused."""
+def _decompress(
+    data: bytes, at: int, size: int, where: str, ratio: int = _MAX_ROW_RATIO
+) -> tuple[bytes, int]:
+    """A part of `size` bytes, at most `ratio` times its compressed ones, and where the next one starts."""
     if at + _SIZE.size > len(data):
         raise FormatError(
             f"{where}: expected a part of the episode index at byte {at}, found {len(data)} bytes"
@@ -124,7 +128,7 @@ def _decompress(data: bytes, at: int, size: int, where: str) -> tuple[bytes, int
     (packed,) = _SIZE.unpack_from(data, at)
     start = at + _SIZE.size
     end = start + packed
-    if end > len(data) or size > _MAX_RATIO * packed:
+    if end > len(data) or size > ratio * packed:
         raise FormatError(f"{where}: the episode index claims {packed} bytes that hold {size} at byte {at}")
     part = decompress("zstd", memoryview(data)[start:end], size, f"{where}: episode index")
     return bytes(part), end
@@ -149,15 +153,18 @@ class EpisodeIndex(NamedTuple):
             raise FormatError(f"{where}: expected an episode index of version 1, found {magic!r}")
         rows, at = _decompress(data, _HEAD.size, episodes * EPISODE_ROWS.itemsize, where)
         table, at = _decompress(data, at, chunks * CHUNK_ROWS.itemsize, where)
-        texts, at = _decompress(data, at, metadata, where)
-        if rows and (np.frombuffer(rows, EPISODE_ROWS)["end"] > 2).any():
-            raise FormatError(f"{where}: the episode index names ends that do not exist")
         found = np.frombuffer(rows, EPISODE_ROWS)
-        if int(found["metadata_length"].sum(dtype=np.uint64)) > len(texts):
-            raise FormatError(f"{where}: the episode index claims more metadata than its {len(texts)} bytes")
+        if (found["end"] > 2).any():
+            raise FormatError(f"{where}: the episode index names ends that do not exist")
+        told = int(found["metadata_length"].sum(dtype=np.uint64))
+        if told != metadata:
+            raise FormatError(
+                f"{where}: the episode index claims {metadata} bytes of metadata, {told} of which are of episodes"
+            )
+        texts, at = _decompress(data, at, metadata, where, MAX_RATIO["zstd"])
         if at != len(data):
             raise FormatError(f"{where}: expected an episode index of {at} bytes, found {len(data)}")
-        return cls(np.frombuffer(rows, EPISODE_ROWS), np.frombuffer(table, CHUNK_ROWS), texts)
+        return cls(found, np.frombuffer(table, CHUNK_ROWS), texts)
 
     def metadata_text(self, i: int) -> str:
         """The JSON text of an episode's metadata."""

@@ -14,16 +14,18 @@ import numpy as np
 from mcap.records import Channel
 
 from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, memory_for
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.labels import LABELS_NAME, MAX_LABELS, Labels
+from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.claims import EPISODE_TOPICS, check_episodes
+from tupli_mcap.recording.claims import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
 from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns
 from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
-from tupli_mcap.recording.events import EpisodeStart
+from tupli_mcap.recording.events import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA, EpisodeStart
 from tupli_mcap.recording.frames import Cameras, Frames
 from tupli_mcap.recording.imagecodecs import image_codecs
 from tupli_mcap.recording.infos import InfoDecoder
@@ -98,9 +100,12 @@ class Recording:
         self.name = self._source.name
         self.path: Path | None = self._source.path
         try:
-            self._contents: Contents = read_contents(self._source)
-            self._store = ChunkStore(self._source, self._contents.table, self._contents.memory, cache_bytes)
-            self._prepare()
+            with memory_for(lambda: f"{self.name}: opening a file of {self._source.size} bytes"):
+                self._contents: Contents = read_contents(self._source)
+                self._store = ChunkStore(
+                    self._source, self._contents.table, self._contents.memory, cache_bytes
+                )
+                self._prepare()
         except BaseException:
             self._source.close()
             raise
@@ -119,7 +124,8 @@ class Recording:
         self._images: dict[str, dict[int, int]] = {}  # leaf -> step channel -> image channel
         self._infos: dict[int, dict[int, dict[str, Any]]] | None = None
         counts = {topic: self._store.count(self._topics.get(topic, 0)) for topic in EPISODE_TOPICS}
-        check_episodes(self.index, [self._store.count(c) for c in self._step_channels], counts, self.name)
+        rows = [self._store.count(channel) for channel in self._step_channels]
+        check_episodes(self.index, rows, counts, self.name, whole=contents.complete)
         self._cameras = Cameras(contents, self._store, self.is_vector, len(steps), self.name)
         if steps:
             self._layout = StepLayout.from_metadata(steps[0].metadata)
@@ -141,8 +147,41 @@ class Recording:
                 }
                 for leaf in self._layout.images
             }
+            self._check_others(topics)
             self._store.codecs = image_codecs(self._layout, contents.channels)
+            if contents.complete:
+                self._check_sizes(self._layout, rows)
+            self._store.claims = {
+                channel: StepClaims(self.index[self.index["env"] == env])
+                for env, channel in enumerate(self._step_channels)
+            }
             self._columns = ColumnReader(self._layout, self._store, self._images)
+
+    def _check_others(self, topics: Mapping[str, Channel]) -> None:
+        """The messages of episodes are what their topics say."""
+        for topic, name, text in (
+            ("/episode_start", START_NAME, START_SCHEMA), ("/episode_end", END_NAME, END_SCHEMA),
+        ):  # fmt: skip
+            if topic in topics:
+                self._check_schema(topics[topic], name, text)
+
+    def _check_sizes(self, layout: StepLayout, steps: Sequence[int]) -> None:
+        """The chunks hold the rows that the index says, and each step has its images, before columns are allocated."""
+        least = BODY + 10 + sum(_stored_bytes(layout, leaf) for leaf in layout.step_leaves)
+        step = (layout.step_message.record_size, True) if layout.constant else (least, False)
+        sizes = dict.fromkeys(self._step_channels, step)
+        if layout.constant and "/final_state" in self._topics:
+            sizes[self._topics["/final_state"]] = (layout.final_message.record_size, True)
+        for leaf in layout.images:
+            for count, channel in zip(steps, self._images[leaf.name].values(), strict=True):
+                if self._store.count(channel) != count:
+                    raise FormatError(
+                        f"{self.name}: expected {count} images of {leaf.path}, found {self._store.count(channel)}; "
+                        "recover it into a new file"
+                    )
+                if channel not in self._store.codecs:
+                    sizes[channel] = (layout.image_messages[leaf.name].dtype.itemsize, True)
+        check_rows(self._contents.table, sizes, self.name)
 
     def _check_schema(self, channel: Channel, name: str, text: str) -> None:
         schema = self._contents.schemas.get(channel.schema_id)
@@ -418,9 +457,11 @@ class Recording:
         needed = [field for field in fields if field != "next_states"]
         if "next_states" in fields and "states" not in needed:
             needed.append("states")
-        found = self._reader.read(runs_of(rows, self._step_channels), total, needed, threads, keep, images)
-        if "next_states" in fields:
-            columns.next_states = self._next_states(found["states"], rows, lengths)
+        with memory_for(lambda: f"{self.name}: reading {', '.join(fields)} of {total} steps"):
+            runs = runs_of(rows, self._step_channels)
+            found = self._reader.read(runs, total, needed, threads, keep, images)
+            if "next_states" in fields:
+                columns.next_states = self._next_states(found["states"], rows, lengths)
         for field in fields:
             if field in found:
                 setattr(columns, field, found[field])
@@ -457,8 +498,9 @@ class Recording:
         channel = self._step_channels[int(row["env"])]
         run = Runs([channel], [int(row["first_row"]) + start], [count])
         columns = Columns(np.array([count]))
-        for field, values in self._reader.read(run, count, fields, 1, True, images).items():
-            setattr(columns, field, values)
+        with memory_for(lambda: f"{self.name}: reading {', '.join(fields)} of {count} steps"):
+            for field, values in self._reader.read(run, count, fields, 1, True, images).items():
+                setattr(columns, field, values)
         return columns
 
     def _next_states(self, states: Any, rows: Any, lengths: Any) -> Any:
@@ -550,6 +592,11 @@ class Recording:
     def __repr__(self) -> str:
         state = "" if self.complete else ", recovered"
         return f"<Recording {self.name}: {len(self.index)} episodes, {self.num_steps} steps{state}>"
+
+
+def _stored_bytes(layout: StepLayout, leaf: Leaf) -> int:
+    """What a leaf takes in a message, at least."""
+    return 1 if leaf.kind == "variable" else leaf.size * layout.dtypes[leaf.name].itemsize
 
 
 def _spaces_of(channel: Channel) -> dict[str, str]:

@@ -20,7 +20,7 @@ from mcap.records import AttachmentIndex
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.checked import attachment_index, checked_attachment, message_index
 from tupli_mcap.recording.claims import MAX_CHUNK
-from tupli_mcap.recording.compression import decompress
+from tupli_mcap.recording.compression import MAX_RATIO, decompress
 from tupli_mcap.recording.container import MAGIC
 from tupli_mcap.recording.source import Source
 from tupli_mcap.recording.summary import parse_record
@@ -32,7 +32,6 @@ _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, len
 _PIECE = 1 << 20
 _FIRST_PIECE = 1 << 12
 _PARSING = 16  # times as long as a checksum of as many bytes takes
-_MAX_RATIO = 1 << 16  # zstd cannot compress further
 _SUMMARY = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 _END = (Opcode.DATA_END, Opcode.FOOTER, Opcode.SUMMARY_OFFSET, *_SUMMARY)
 _PARSED = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, *_SUMMARY)
@@ -257,7 +256,7 @@ class Survey:
 
     def unpack(self, position: int, packed: int, name: str, size: int, crc: int) -> Any:
         """The records of a chunk, or why they are damaged."""
-        if packed < 0 or size > MAX_CHUNK or size > _MAX_RATIO * (packed + 1) or self._budget < 0:
+        if packed < 0 or size > MAX_CHUNK or size > MAX_RATIO.get(name, 0) * packed or self._budget < 0:
             return f"the chunk claims {size} bytes in {packed}"
         start = position + 9 + _CHUNK_HEAD.size + len(name) + 8
         if start + packed > self._end:

@@ -142,6 +142,7 @@ def _contents(source: Source, structure: Structure, findings: Findings) -> None:
         if not damaged:  # else the reader says again what is known, or what follows from it
             findings.error("layout", str(err).removeprefix(f"{source.name}: "))
         return
+    recording._store.claims = None  # which rows differ from the index is said one by one
     with recording:
         findings.report.attachments = len(recording.attachments)
         _layout(recording, structure, findings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY
+from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
@@ -36,6 +37,8 @@ def verify_episodes(recording: Recording, findings: Findings) -> None:
     for env, channel in enumerate(recording._step_channels):
         checker.steps(env, channel)
         checker.images(env, channel)
+        checker.bools(channel, recording.layout.step_leaves)
+    checker.bools(recording._topics.get("/final_state", 0), recording.layout.final_leaves)
     checker.starts()
     checker.ends()
     checker.finals()
@@ -142,6 +145,31 @@ class _Checker:
                         self._error("image", f"a header in rows from {first} on is damaged", channel=topic)
             except FormatError as err:
                 self._error("image", _plain(err, self._recording), channel=topic)
+
+    def bools(self, channel: int, leaves: Sequence[Leaf]) -> None:
+        """The bools of rows of constant size; decoding looks at others."""
+        names = [leaf.name for leaf in leaves if leaf.size and self._layout.dtypes.get(leaf.name) == np.bool_]
+        if not names or not self._layout.constant:
+            return
+        step = channel in self._recording._step_channels
+        dtype = (self._layout.step_message if step else self._layout.final_message).dtype
+        try:
+            for chunk in self._store.chunks(channel):
+                rows, first = (
+                    self._store.rows(chunk, dtype, keep=False),
+                    int(self._store.table["first"][chunk]),
+                )
+                for name in names:
+                    wrong = (rows[name].view(np.uint8) > 1).reshape(len(rows), -1).any(axis=1)
+                    for i in np.flatnonzero(wrong)[:3].tolist():
+                        place = self._recording._contents.channels[channel].topic
+                        self._error(
+                            "rows",
+                            f"row {first + i} has a bool in {name!r} other than 0 and 1",
+                            channel=place,
+                        )
+        except FormatError:
+            return  # said of the steps already
 
     # ---- messages of episodes
 

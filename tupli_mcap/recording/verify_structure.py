@@ -214,7 +214,7 @@ class Structure:
         if found.repaired:
             self._findings.error("chunk", found.repaired, offset=found.offset)
         try:
-            content = chunk_records(chunk.data, "the chunk")
+            content = chunk_records(chunk.data, "the chunk", chunk.packed)
         except FormatError as err:
             self._findings.error("chunk", str(err), offset=found.offset)
             return

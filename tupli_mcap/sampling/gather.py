@@ -11,6 +11,7 @@ import numpy as np
 from tupli_mcap.messages.batches import LOG_TIME, Decode
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.claims import check_bools
 from tupli_mcap.recording.pieces import items, items_dtype, put
 from tupli_mcap.recording.together import do_all
 from tupli_mcap.sampling.segments import Piece, Segments
@@ -134,6 +135,7 @@ class ConstantRows:
         chunk = source.store.rows(int(self.segments.chunk_of[piece.unit]), source.dtype)
         for name in names:
             out[name][piece.out] = _shaped(source.values(chunk, name)[piece.rows], out[name])
+            check_bools(out[name][piece.out], name, source.store.name)
 
     def _fill(self, held: _HeldColumns, rows: Array, threads: int) -> None:
         missing = held.missing(rows)
@@ -191,6 +193,7 @@ class _HeldColumns:
                 target[place] = values
             else:
                 self.columns[name][place] = _shaped(values, self.columns[name])
+            check_bools(self.columns[name][place], name, source.store.name)
         self.there[unit] = True  # last: another thread may be looking
 
 
