@@ -345,7 +345,7 @@ def read_journal(path: Path, only: Collection[str] | None = None) -> JournalCont
 def _read_area(fd: int, start: int, size: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """The bytes of an area; where the file has holes, no memory is taken either: its size is a claim."""
     area = np.zeros(size, np.uint8)
-    view, at = memoryview(area), 0
+    view, at = memoryview(area.data), 0
     while at < size:
         end = size
         if hasattr(os, "SEEK_DATA"):
