@@ -343,28 +343,15 @@ def read_journal(path: Path, only: Collection[str] | None = None) -> JournalCont
 
 
 def _read_area(fd: int, start: int, size: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """The bytes of an area; where the file has holes, no memory is taken either: its size is a claim."""
+    """The bytes of an area. Its size is a claim, and a file may have holes: zeros take no memory."""
     area = np.zeros(size, np.uint8)
-    view, at = memoryview(area.data), 0
-    while at < size:
-        end = size
-        if hasattr(os, "SEEK_DATA"):
-            try:
-                at = os.lseek(fd, start + at, os.SEEK_DATA) - start
-                end = min(size, os.lseek(fd, start + at, os.SEEK_HOLE) - start)
-            except OSError as err:
-                if err.errno == errno.ENXIO:  # nothing but a hole up to the end
-                    break
-                end = size  # a file system that does not tell
-        if at >= size:
-            break
-        piece = os.pread(fd, min(end - at, _PIECE), start + at)
-        if not piece:
-            raise FormatError(
-                f"expected {size} bytes of an area at offset {start}, found {at}; the journal was cut"
-            )
-        view[at : at + len(piece)] = piece
-        at += len(piece)
+    for at in range(0, size, _PIECE):
+        length = min(_PIECE, size - at)
+        piece = np.frombuffer(os.pread(fd, length, start + at), np.uint8)
+        if len(piece) != length:
+            raise FormatError(f"expected {size} bytes of an area at offset {start}, found {at + len(piece)}")
+        if piece.any():
+            area[at : at + length] = piece
     return area
 
 
