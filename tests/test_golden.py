@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import re
 import shutil
 import sys
 from collections.abc import Iterator
@@ -260,6 +261,10 @@ def test_another_version_is_refused(version: bytes, tmp_path: Path) -> None:
     assert data.count(key + b"1") == 1
     path = tmp_path / "other.mcap"
     path.write_bytes(data.replace(key + b"1", key + version))
+    with pytest.raises(FormatError, match="is damaged: expected crc") as damaged:
+        Recording(path)
+    crc, found = re.findall("crc ([0-9a-f]{8}), found '([0-9a-f]{8})'", str(damaged.value))[0]
+    path.write_bytes(path.read_bytes().replace(found.encode(), crc.encode()))
     with pytest.raises(FormatError, match=f"expected format version '1' or '2', found '{version.decode()}'"):
         Recording(path)
 

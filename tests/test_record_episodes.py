@@ -570,13 +570,13 @@ def test_a_nul_in_a_path_is_refused(options: dict[str, Any]) -> None:
             wrap(env, "a\0b", **options)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("now", [0, -1, 1 << 63, 1 << 64])
+@pytest.mark.parametrize("now", [0, -1, 1 << 34, 1 << 64])
 def test_a_clock_that_rows_cannot_hold_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, now: int
 ) -> None:
     env = gym.make("CartPole-v1")
-    monkeypatch.setattr("time.time_ns", lambda: now)
-    with pytest.raises(RecordingError, match=f"expected a clock between 1970 and 2262, found {now} ns"):
+    monkeypatch.setattr("time.time", lambda: now)
+    with pytest.raises(RecordingError, match=f"expected a clock between 1970 and 2262, found {now} s"):
         RecordEpisodes(env, tmp_path / "r.mcap")
     assert not list(tmp_path.iterdir())
 

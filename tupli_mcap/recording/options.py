@@ -56,10 +56,10 @@ def check_local(path: str | os.PathLike[str]) -> None:
 
 def _check_clock(path: str | os.PathLike[str]) -> None:
     """Raises RecordingError if the clock is not within what rows hold: a `log_time` of 0 says that there is no row."""
-    now = time.time_ns()
-    if not 0 < now < 1 << 63:
+    now = time.time()
+    if not 0 < now < (1 << 63) / 1e9:
         raise RecordingError(
-            f"{path}: expected a clock between 1970 and 2262, found {now} ns since 1970; set the system's clock"
+            f"{path}: expected a clock between 1970 and 2262, found {now:.0f} s since 1970; set the system's clock"
         )
 
 
