@@ -474,10 +474,10 @@ class RecordingWriter:
         _live.discard(self)
         try:
             self.worker.close()
-            if self._stores is not None and not self.is_watched:  # who watches may be looking
+            if self._stores is not None and not self.is_watched:  # who watches has yet to show the rest
                 self._stores.let_go()
-            self._stores = self.rows = self.vector = self.events = self.infos = None
-            self.images, self.frames = [], []
+                self._stores = self.rows = self.vector = self.events = self.infos = None
+                self.images, self.frames = [], []
             if self.journal is not None:
                 self.journal.close()
         finally:
