@@ -44,7 +44,7 @@ _MESSAGE_HEAD = np.dtype(
         "itemsize": 15,
     }
 )
-_U2, _U4 = np.dtype("<u2"), np.dtype("<u4")
+_U2, _U4, _U8 = np.dtype("<u2"), np.dtype("<u4"), np.dtype("<u8")
 _SEQUENCE_AT = 11  # in a record
 _LEAST_STEP = BODY + 8 + 2  # bytes of a step's record: episode and step, terminal and timeout
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
@@ -351,7 +351,7 @@ class ChunkStore:
         if claims is None:
             _check_sequence(np.ndarray(n, _U4, data, _SEQUENCE_AT, (size,)), first, where)
         else:
-            numbers = np.ndarray(n, _HEAD, data, BODY, (size,)).tobytes()
+            numbers = np.ndarray(n, _U8, data, BODY, (size,))
             claims.check(first, numbers, np.ndarray(n, _U2, data, size - 2, (size,)), where)
         self._held[i] = True  # its CRC says that it stays the same
 
@@ -363,7 +363,7 @@ class ChunkStore:
             starts, stops = records[:, 0], records[:, 1]
             if int((stops - starts).min()) < _LEAST_STEP:
                 raise FormatError(f"{where} holds messages that are no steps")
-            numbers = np.ndarray(len(data) - 7, _HEAD, data, 0, (1,))[starts + BODY].tobytes()
+            numbers = np.ndarray(len(data) - 7, _U8, data, 0, (1,))[starts + BODY]
             claims.check(first, numbers, np.ndarray(len(data) - 1, _U2, data, 0, (1,))[stops - 2], where)
         self._held[i] = True
 

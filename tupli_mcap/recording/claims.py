@@ -26,8 +26,7 @@ __all__ = [
 
 MAX_CHUNK = 1 << 31
 EPISODE_TOPICS = ("/episode_start", "/episode_end", "/final_state")
-_U32, _U64 = 2**32 - 1, 2**64 - 1
-_MANY_ROWS = 1 << 16
+_U32 = 2**32 - 1
 _CHUNK_FIXED = 9 + 40  # of a Chunk record, before and after the name of its compression
 MAX_ROWS_A_BYTE = 16
 """Messages that a byte of a compressed chunk may stand for at most: each has a number of its own (`sequence`), so that
@@ -148,9 +147,10 @@ def check_bools(column: Any, what: str, name: str) -> None:
 
 
 class StepClaims:
-    """What the episode index says of the rows of a step channel: which episode and step each is, and how episodes end.
+    """What the episode index says of the rows of a step channel: where episodes begin and end, and how.
 
-    Nothing changes in it; it may be shared by threads and stores.
+    The index is held against the first and the last row of each episode, and against the first row of each chunk: that
+    finds every boundary that is not where the rows have it. Nothing changes in it; threads and stores may share it.
 
     Args:
         episodes: EPISODE_ROWS of one sub-environment, which share no row.
@@ -158,72 +158,54 @@ class StepClaims:
 
     def __init__(self, episodes: Array) -> None:
         rows = episodes[np.argsort(episodes["first_row"].astype(np.int64), kind="stable")]
-        self._firsts = rows["first_row"].astype(np.int64)
-        self._stops = self._firsts + rows["length"].astype(np.int64)
+        firsts, lengths = rows["first_row"].astype(np.int64), rows["length"].astype(np.int64)
         self._how = np.ascontiguousarray(rows["end"])
-        # The two numbers of row r, as one of 64 bits, are this of its episode and r << 32.
-        self._bases = (rows["episode"] - (rows["first_row"] << np.uint64(32))).astype("<u8")
+        # `episode` and `step` of a row, as one number of 64 bits
+        self._numbers = np.stack(
+            [rows["episode"], rows["episode"] + (rows["length"] - 1 << np.uint64(32))], 1
+        )
+        self._numbers = self._numbers.astype(np.uint64).reshape(-1)
+        self._rows = np.stack([firsts, firsts + lengths - 1], 1).reshape(-1)  # the first and the last of each
 
-    def check(self, first: int, numbers: bytes, flags: Array, where: str) -> None:
+    def check(self, first: int, numbers: Array, flags: Array, where: str) -> None:
         """Holds consecutive rows against the index.
 
         Args:
             first: the number of the first row.
-            numbers: the bytes of `episode` and `step` of each row.
+            numbers: `episode` and `step` of each row, as one number (`<u8`).
             flags: the bytes of `terminal` and `timeout` of each row, as one number (`<u2`).
             where: the file, and what of it is read.
 
         Raises:
             FormatError: a row is of another episode or step, or the flags of an episode's last row say another end.
         """
-        n = len(flags)
-        stop = first + n
-        low = int(self._stops.searchsorted(first, side="right"))
-        high = int(self._firsts.searchsorted(stop, side="left"))
-        stops = self._stops[low:high]
-        lengths = stops - self._firsts[low:high]
-        if low < high:  # the first and the last episode may go on beyond these rows
-            lengths[0] = stops[0] - max(first, int(self._firsts[low]))
-            lengths[-1] -= max(0, int(stops[-1]) - stop)
-        expected = np.repeat(self._bases[low:high] + np.uint64(first << 32 & _U64), lengths)
-        rows: Array | None = None
-        if len(expected) != n:  # a recovered file may have rows of no episode, which are never given out
-            begins = np.maximum(self._firsts[low:high], first) - first
-            rows = np.repeat(begins - np.cumsum(lengths) + lengths, lengths) + np.arange(len(expected))
-            numbers = np.frombuffer(numbers, "<u8")[rows].tobytes()
-        expected += _steps_up()[:n] if rows is None and n <= _MANY_ROWS else _steps_at(n, rows)
-        if numbers != expected.tobytes():
-            found = np.frombuffer(numbers, "<u8")
-            i = int(np.argmax(found != expected))
-            told, is_of = (
-                f"step {int(one[i]) >> 32} of episode {int(one[i]) & _U32}" for one in (expected, found)
-            )
+        if not len(numbers):
+            return
+        low, high = self._rows.searchsorted((first, first + len(numbers))).tolist()
+        if low % 2:  # the first row belongs to an episode that began before
+            steps = first - int(self._rows[low - 1])
+            self._compare(first, [int(numbers[0])], [int(self._numbers[low - 1]) + (steps << 32)], where)
+        places = self._rows[low:high] - first
+        found, expected = numbers[places], self._numbers[low:high]
+        if found.tobytes() != expected.tobytes():
+            self._compare(self._rows[low:high], found.tolist(), expected.tolist(), where)
+        ends = _end_of()[flags[places[1 - low % 2 :: 2]]]
+        how = self._how[low // 2 : high // 2]
+        if ends.tobytes() != how.tobytes():
+            i = int(np.argmax(ends != how))
+            at = int(self._rows[low:high][1 - low % 2 :: 2][i])
             raise FormatError(
-                f"{where}: expected {told} in row {first + (i if rows is None else int(rows[i]))} as the episode index "
-                f"says, found {is_of}; recover it into a new file"
-            )
-        if low < high and int(stops[-1]) > stop:
-            stops = stops[:-1]
-        ends = _end_of()[flags[stops - (first + 1)]]
-        told_ends = self._how[low : low + len(ends)]
-        if ends.tobytes() != told_ends.tobytes():
-            i = low + int(np.argmax(ends != told_ends))
-            raise FormatError(
-                f"{where}: expected the end {self._how[i]} of episode {int(self._bases[i]) & _U32} as the episode "
-                f"index says, found other flags in its last row, {int(self._stops[i]) - 1}; recover it into a new file"
+                f"{where}: expected the end {how[i]} of episode {int(self._numbers[low // 2 * 2 + 2 * i]) & _U32} as "
+                f"the episode index says, found other flags in its last row, {at}; recover it into a new file"
             )
 
-
-@functools.cache
-def _steps_up() -> Array:
-    """What the numbers of rows grow by within an episode."""
-    return np.arange(_MANY_ROWS, dtype=np.uint64) << np.uint64(32)
-
-
-def _steps_at(n: int, rows: Array | None) -> Array:
-    """The same for more rows, or for some of them."""
-    found: Array = (np.arange(n) if rows is None else rows).astype(np.uint64) << np.uint64(32)
-    return found
+    def _compare(self, rows: Any, found: Sequence[int], expected: Sequence[int], where: str) -> None:
+        for row, one, other in zip(np.atleast_1d(rows).tolist(), found, expected, strict=True):
+            if one != other:
+                raise FormatError(
+                    f"{where}: expected step {other >> 32} of episode {other & _U32} in row {row} as the episode index "
+                    f"says, found step {one >> 32} of episode {one & _U32}; recover it into a new file"
+                )
 
 
 @functools.cache
