@@ -51,7 +51,7 @@ class ChunkRecords(NamedTuple):
         return int(self.headers["#sequence"][0])
 
 
-def chunk_records(data: memoryview, where: str, packed: int | None = None) -> ChunkRecords:
+def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
     """The records of a chunk of ours, which had `packed` bytes.
 
     Raises:
@@ -66,7 +66,7 @@ def chunk_records(data: memoryview, where: str, packed: int | None = None) -> Ch
         schemas.append(record) if opcode == Opcode.SCHEMA else channels.append(record)
         skip += 9 + length
     try:
-        headers = message_headers(data[skip:], None if packed is None else MAX_ROWS_A_BYTE * packed)
+        headers = message_headers(data[skip:], MAX_ROWS_A_BYTE * packed)
     except FormatError as err:
         raise FormatError(f"{where}: {err}") from err
     if not len(headers):

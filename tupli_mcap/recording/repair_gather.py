@@ -283,7 +283,7 @@ def _take_chunk(gathered: Gathered, found: Found, chunk: Chunk, pieces: dict[int
     """Adds a chunk to the `pieces` of its channel."""
     gathered.awaited = None
     try:
-        records = chunk_records(chunk.data, "the chunk")
+        records = chunk_records(chunk.data, "the chunk", chunk.packed)
         if not chunk.crc:
             raise FormatError("the chunk has no CRC")
     except FormatError as err:
