@@ -283,7 +283,7 @@ def _check(
             with Recording(file) as recording:
                 assert recording.complete or not recording.num_steps
             report = verify_recording(file)
-            assert report.ok, (file.name, report.findings)
+            assert report.ok, (file.name, report.problems)
     if before:
         assert path.exists()
         if mode == "a":

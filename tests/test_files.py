@@ -143,16 +143,18 @@ def test_an_error_names_the_file_and_not_the_temporary_one(tmp_path: Path) -> No
 
 
 def test_what_a_killed_process_left_is_told_from_what_is_in_use(tmp_path: Path) -> None:
-    with writer(tmp_path / "file") as process:
-        (temporary,) = tmp_path.iterdir()
+    below = tmp_path / "below"
+    below.mkdir()
+    with writer(below / "file") as process:
+        (temporary,) = below.iterdir()
         assert files.is_temporary(temporary.name)
-        assert files.left_in(tmp_path) == [] == list(files.left_below(tmp_path))
+        assert files.left_in(below) == [] == list(files.left_below(tmp_path))
         assert files.remove_left([temporary]) == 0
         process.send_signal(signal.SIGKILL)
         process.wait()
-        assert files.left_in(tmp_path) == [temporary] == list(files.left_below(tmp_path.parent))
-    assert files.remove_left(files.left_in(tmp_path)) == len(b"half of it")
-    assert list(tmp_path.iterdir()) == []
+        assert files.left_in(below) == [temporary] == list(files.left_below(tmp_path))
+    assert files.remove_left(files.left_in(below)) == len(b"half of it")
+    assert list(below.iterdir()) == []
 
 
 def test_a_file_that_was_just_made_is_left_alone(tmp_path: Path) -> None:
@@ -221,7 +223,7 @@ def test_a_journal_that_is_not_in_its_place_yet_is_in_use(
     found = []
     monkeypatch.setattr(
         "tupli_mcap.recording.journal.Journal.publish",
-        lambda self, *, durable: found.extend([self._temporary.exists(), *files.left_in(tmp_path)]),
+        lambda self, **_: found.extend([self._temporary.exists(), *files.left_in(tmp_path)]),
     )
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
         env.reset(seed=0)

@@ -548,8 +548,12 @@ def test_replacing_a_recording_removes_its_journal(tmp_path: Path) -> None:
     abandon(path, cart_pole, 7)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        cart_pole(path, mode="w").close()
-    assert list(tmp_path.iterdir()) == []
+        cart_pole(path, mode="w").close()  # without a step
+        assert Recording(path).num_steps == 7
+        with cart_pole(path, mode="w") as env:
+            roll(env, 3)
+    assert Recording(path).num_steps == 3
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def killed(work: Callable[[], Any]) -> None:

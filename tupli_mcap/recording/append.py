@@ -189,8 +189,7 @@ def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:
 def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> None:
     writer.uuid = contents.metadata["uuid"]
     writer.rewritten = contents.metadata.get("rewritten", "")
-    if not contents.channels:  # else its own journal has taken the place
-        writer.replaced = contents.metadata.get("replaced", "")
+    writer.replaced = contents.metadata.get("replaced", "")
     _keep_journal_place(writer, contents)
     restore_container(writer.container, contents, source)
     index_rows = contents.index.episodes

@@ -15,7 +15,7 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
+from tupli_mcap.recording.events import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.recording.facts import StepFacts, step_facts
 from tupli_mcap.recording.findings import Findings
 from tupli_mcap.recording.headers import message_headers
@@ -272,6 +272,8 @@ class _Checker:
             number = int.from_bytes(body[:4], "little")
             place = {"channel": topic, "episode": number}
             told = rows.pop(row, None)
+            if told is None and self._is_of_an_unfinished_step(row, number):
+                continue
             if (
                 told is None
                 or int(told["episode"]) != number
@@ -291,6 +293,14 @@ class _Checker:
                     )
         for told in rows.values():
             self._error("final_state", "it is missing", episode=int(told["episode"]), channel=topic)
+
+    def _is_of_an_unfinished_step(self, row: int, number: int) -> bool:
+        """Whether a final state was written ahead of a step that its recorder did not finish, and does not count."""
+        i = self._at.get(number)
+        if i is None:
+            return False
+        end, final_row = int(self._rows["end"][i]), int(self._rows["final_row"][i])
+        return end == INTERRUPTED and not 0 <= final_row <= row
 
     def infos(self) -> None:
         """Infos are those of steps that are there, at most one each."""

@@ -122,9 +122,10 @@ class RecordingWriter:
             self._is_cut = False
             resume(self)
             self._old_journal = self.journal_place
-            self._remove_replaced()
+            self._remove_journal_of(self.replaced)
             return
         there = _metadata_of(self._place) if self.options.mode == "w" else {}
+        self._remove_journal_of(there.get("replaced", ""))  # whose file is gone
         self.replaced = owner_among(
             journal_path(self._place), [there[key] for key in ("uuid", "replaced") if key in there]
         )
@@ -153,7 +154,6 @@ class RecordingWriter:
             self.container.add_attachment(name, media_type, data, now)
         if not self.lock.replaces:
             self.lock.publish()
-            self._remove_replaced()
 
     # ---- the first step
 
@@ -194,7 +194,7 @@ class RecordingWriter:
         """The file that this one replaces goes when nothing more is needed to record to this one."""
         if self.lock.replaces:
             self.lock.publish()
-            self._remove_replaced()
+            self._remove_journal_of(self.replaced)
 
     def _png(self, layout: StepLayout) -> frozenset[str]:
         """The image leaves stored as PNG: as the options say, on append as they are in the file."""
@@ -497,12 +497,14 @@ class RecordingWriter:
             self._leave()
             return
         options = WriterOptions(self.options.compression, "a", durability=self.options.durability)
+        # errors name the file as its user does, unless the process has changed its directory since
+        is_there = os.path.realpath(self.path) == str(self._place)
         try:
             self.let_go()
             self._remove_unnamed(self.journal_place)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
-                finish_recording(self._place, options)
+                finish_recording(self.path if is_there else self._place, options)
         except TupliError:
             self.leave_unfinished()
             raise
@@ -524,12 +526,12 @@ class RecordingWriter:
         with contextlib.suppress(OSError):
             place.with_name(f"{place.name}.tmp").unlink()
 
-    def _remove_replaced(self) -> None:
-        """The journal of the recording that this one took the place of."""
+    def _remove_journal_of(self, uuid: str) -> None:
+        """The journal of a recording that this one, or the one before it, took the place of."""
         beside = journal_path(self._place)
-        for place in (beside, journal_aside(beside, self.replaced)):
+        for place in (beside, journal_aside(beside, uuid)):
             with contextlib.suppress(OSError):
-                if owner_among(place, [self.replaced]):
+                if owner_among(place, [uuid]):
                     place.unlink()
 
     def _is_new_and_empty(self) -> bool:
