@@ -26,7 +26,6 @@ _UNUSUAL: Final = re.compile('[\\\\\x01\ud7ff\ud800-\udfff]|"\\$')
 _TO_ESCAPE: Final = re.compile("[\x00\x01\ud7ff\ud800-\udfff]")
 _ESCAPED: Final = re.compile("\x01[\x01\x02]|\ud7ff[\x01\u0100-\u08ff]")
 _SURROGATES_AT: Final = 0x100
-_LONGEST_INT_BITS: Final = 1024  # what a float can hold
 
 
 class RecordingStamp(NamedTuple):
@@ -212,9 +211,6 @@ def _search_form(value: object) -> Any:
         return escape_text(scalar.value)
     if isinstance(scalar.value, float):
         return tag_float(scalar.value)
-    if isinstance(scalar.value, int) and scalar.value.bit_length() > _LONGEST_INT_BITS:
-        # SQLite reads an infinity here, and asks Python wherever it meets one.
-        return tag_float(math.inf if scalar.value > 0 else -math.inf)
     if scalar.kind != "other":
         return scalar.value
     if isinstance(value, Mapping):
