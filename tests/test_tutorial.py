@@ -118,8 +118,13 @@ def test_benchmarks_of_one_wind_share_it(tutorial: ModuleType, storage: FileStor
 
 
 def test_the_command_line_lists_the_benchmark(
-    tutorial: ModuleType, storage: FileStorage, env: TupliEnvWrapper, capfd: pytest.CaptureFixture[str]
+    tutorial: ModuleType,
+    storage: FileStorage,
+    env: TupliEnvWrapper,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "80")  # pytest loads readline, which sets it unseen by os.environ
     tutorial.list_benchmarks(storage.root)
     out = capfd.readouterr().out
     assert "windy-mountain-car" in out

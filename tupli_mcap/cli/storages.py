@@ -30,7 +30,7 @@ from tupli_mcap.cli.terminal import say, terminal_width
 
 __all__ = ["register"]
 
-_ROOMY = 80  # columns of a terminal on which benchmarks and their environments fit side by side
+_ROOMY = 100  # columns of a terminal on which benchmarks and their environments fit side by side
 
 
 def register(app: typer.Typer) -> None:
