@@ -144,7 +144,7 @@ def _compact(
         if found or not left:
             print_table(columns, rows, empty="nothing to compact")
         if left:
-            print(f"would remove {counted(len(left), 'temporary file')} of killed processes")
+            say(f"would remove {counted(len(left), 'temporary file')} of killed processes")
         return
     say(
         f"rewrote {counted(len(found), 'recording')}, freed {bytes_of(freed)}"
