@@ -95,7 +95,7 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
         end=row.end,
         episode_return=store_number(row.episode_return),
         seed=store_number(row.seed),
-        created_at=row.created_at // 1000 * 1000,
+        created_at=max(row.created_at // 1000 * 1000, INT64_MIN),
         created_by=escape_text(row.created_by),
         published_in=row.published_in,
         metadata=metadata,
