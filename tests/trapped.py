@@ -78,6 +78,7 @@ CHANGING = {
     **dict.fromkeys(("shutil.copyfile", "shutil.copytree", "shutil.move"), (1,)),
     **dict.fromkeys(("tempfile.mkstemp", "tempfile.mkdtemp"), (0,)),
 }
+_RELATIVE = {"os.remove": 1, "os.rmdir": 1}  # where the descriptor is of the directory that the path is in, or -1
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
@@ -122,7 +123,7 @@ class Trap:
                     flags & _WRITING or (isinstance(mode, str) and set(mode) & set("wax+"))
                 ) and self._outside(path):
                     self.spring(f"open({path!r}, {mode!r}, {flags:o})")
-            elif event in CHANGING and any(self._outside(args[i]) for i in CHANGING[event] if i < len(args)):
+            elif event in CHANGING and any(map(self._outside, _changed(event, args))):
                 self.spring(f"{event}{args!r:.200}")
         finally:
             self._busy = False
@@ -141,6 +142,8 @@ class Trap:
         if isinstance(path, int) or path is None:
             return False
         text = os.fsdecode(path)
+        if text == ":memory:":  # sqlite3: no file
+            return False
         if text.startswith("file:"):  # sqlite3
             text = urllib.parse.unquote(text.removeprefix("file:").partition("?")[0])
         real = os.path.realpath(text)
@@ -149,6 +152,14 @@ class Trap:
     def spring(self, what: str) -> None:
         self.trapped.append(f"{self.doing}: {what}")
         raise RuntimeError(f"trapped: {what}")
+
+
+def _changed(event: str, args: tuple[Any, ...]) -> list[Any]:
+    """The paths that an event changes."""
+    at = args[_RELATIVE[event]] if event in _RELATIVE else -1
+    if at != -1:  # how `shutil.rmtree` goes down into a directory
+        return [os.path.join(os.readlink(f"/proc/self/fd/{at}"), os.fsdecode(args[0]))]
+    return [args[i] for i in CHANGING[event] if i < len(args)]
 
 
 def _encoding() -> bool:
@@ -332,6 +343,7 @@ def _cli(*words: str) -> Callable[[], Any]:
 
 def main(corpus: Path, target: Path) -> None:
     os.environ["TUPLI_MCAP_CONFIG_DIR"] = str(target / "config")
+    os.environ["TUPLI_MCAP_CACHE_DIR"] = str(target / "cache")
     os.environ.pop("TUPLI_MCAP_STORAGE", None)
     tempfile.tempdir = str(target)
     warnings.simplefilter("ignore")
@@ -357,6 +369,7 @@ def main(corpus: Path, target: Path) -> None:
 
     # Lazy imports of our own first, on a harmless file: what is imported after that was named by a file.
     named_imports(b"Vx\n.")  # the codecs of texts in pickles
+    "\x1b".encode("unicode_escape")  # how the terminal shows such characters
     rich.cells.get_character_cell_size("\N{HORIZONTAL ELLIPSIS}")  # tables of characters' widths
     warm = target / "warm"
     warm.mkdir()
