@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from fuzzing.run import MUTATORS, Case, Fuzzer, case_of
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.sampling import steps_of
 
 SEEDS = {seed.name: seed for seed in load_seeds()}
@@ -75,13 +77,11 @@ def test_the_judge_sees_a_single_wrong_bit(fuzzer: Fuzzer) -> None:
 
 
 def test_the_judge_sees_a_lost_episode(fuzzer: Fuzzer) -> None:
-    seed = SEEDS["constant_zstd"]
-    model = Model.of(seed.data)
-    assert model.index is not None
-    model.index.episodes = model.index.episodes[:-1]
-    finding = fuzzer.run(Case(0, "flip_bits", seed.name, Mutant(model.encode(), None, True, "one less")))
-    assert finding is not None
-    assert "a complete recording of 2 episodes, not 3" in finding.problem
+    """Reading refuses an index that leaves an episode out, so that the judge is asked without a file."""
+    truth = fuzzer.truths["constant_zstd"]
+    episodes = dict(list(truth["episodes"].items())[:-1])
+    (problem,) = judge({**truth, "episodes": episodes}, truth)
+    assert problem == "a complete recording of 2 episodes, not 3"
 
 
 # What an index, or a message, may say wrongly while every checksum is right.
@@ -115,7 +115,11 @@ def lie(what: str, model: Model, random: np.random.Generator) -> bool:
     return True
 
 
-def lie_in_a_step(what: str, model: Model, random: np.random.Generator) -> bool:
+def lie_in_a_step(what: str, model: Model, random: np.random.Generator, *, inside: bool = False) -> bool:
+    """Changes a message: where reading holds it against the index, or `inside` of an episode and of a chunk."""
+    assert model.index is not None
+    rows = model.index.episodes
+    ends = {(int(row["episode"]), step) for row in rows for step in (0, int(row["length"]) - 1)}
     topics = [body for opcode, body in model.summary if opcode == 4]
     steps = [int.from_bytes(body[:2], "little") for body in topics if b"/step" in body[:40]]
     places = [
@@ -123,7 +127,11 @@ def lie_in_a_step(what: str, model: Model, random: np.random.Generator) -> bool:
         for part in model.chunks()
         for k, piece in enumerate(part.inner)
         if piece[0] == 5 and int.from_bytes(piece[9:11], "little") in steps
+        if (k > 0 and part.inner[k - 1][0] == 5) or not inside
+        if (struct.unpack_from("<II", piece, 35) in ends) != inside
     ]
+    if not places:
+        return False
     part, k = places[int(random.integers(len(places)))]
     data = bytearray(part.inner[k])
     if what == "step":
@@ -161,5 +169,22 @@ def test_what_is_read_is_what_the_messages_say(what: str, tmp_path: Path) -> Non
         with pytest.raises(FormatError, match="expected|gives|holds"), Recording(path) as recording:
             steps = steps_of(recording, threads=1)
             steps.read(["states", "rewards", "terminals", "timeouts"], np.arange(len(steps)))
+        told += 1
+    assert told >= 3
+
+
+@pytest.mark.parametrize("what", ["step", "episode"])
+def test_what_messages_inside_of_an_episode_say_is_left_to_verify(what: str, tmp_path: Path) -> None:
+    """Reading compares the rows at which episodes and chunks begin, and those at which episodes end."""
+    random, told = np.random.default_rng(7), 0
+    for name, seed in SEEDS.items():
+        model = seed.model()
+        if seed.journal is not None or model.index is None:
+            continue
+        if not lie_in_a_step(what, model, random, inside=True):
+            continue
+        path = tmp_path / f"{name}.mcap"
+        path.write_bytes(model.encode())
+        assert not verify_recording(path).ok
         told += 1
     assert told >= 3
