@@ -78,7 +78,10 @@ CHANGING = {
     **dict.fromkeys(("shutil.copyfile", "shutil.copytree", "shutil.move"), (1,)),
     **dict.fromkeys(("tempfile.mkstemp", "tempfile.mkdtemp"), (0,)),
 }
-_RELATIVE = {"os.remove": 1, "os.rmdir": 1}  # where the descriptor is of the directory that the path is in, or -1
+_RELATIVE = {
+    "os.remove": 1,
+    "os.rmdir": 1,
+}  # where the descriptor is of the directory that the path is in, or -1
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
@@ -158,7 +161,7 @@ def _changed(event: str, args: tuple[Any, ...]) -> list[Any]:
     """The paths that an event changes."""
     at = args[_RELATIVE[event]] if event in _RELATIVE else -1
     if at != -1:  # how `shutil.rmtree` goes down into a directory
-        return [os.path.join(os.readlink(f"/proc/self/fd/{at}"), os.fsdecode(args[0]))]
+        return [Path(f"/proc/self/fd/{at}").readlink() / os.fsdecode(args[0])]
     return [args[i] for i in CHANGING[event] if i < len(args)]
 
 
