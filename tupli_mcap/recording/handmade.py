@@ -12,6 +12,7 @@ import gymnasium as gym
 
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages import jsonvalue
+from tupli_mcap.messages.exact import exact_flag, shorten
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.cameras import EncodedFrame
 from tupli_mcap.recording.events import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
@@ -30,7 +31,8 @@ class EpisodeData:
     """An episode as sequences of one value a step.
 
     `final_state` None: not known, and then the last step has no next state. `end` None: from the last step's flags,
-    "interrupted" if neither is set. `frames` are (step, frame), in order; they get the times of the new recording.
+    "interrupted" if neither is set; another one is refused. `frames` are (step, frame), in order; they get the times of
+    the new recording.
     """
 
     states: Sequence[Any]
@@ -65,7 +67,8 @@ def write_recording(
     `frames` says that some of them have frames.
 
     Raises:
-        StepError: an episode without steps, of unequal columns, or with values that cannot be stored exactly.
+        StepError: an episode without steps, of unequal columns, with values that cannot be stored exactly, or with an
+            `end` that its last step's flags do not say.
     """
     spaces = StepLayout(observation_space, action_space, reward_space)
     cameras = (CAMERA,) if frames else ()
@@ -97,6 +100,7 @@ def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeDa
         raise StepError(
             f"expected as many states, actions, rewards, terminals and timeouts, at least one each, found {found}"
         )
+    end = _end(episode, n - 1)
     options = "" if episode.options is None else jsonvalue.dumps(episode.options, fallback=repr)
     recorder.reset(episode.states[0], ResetFacts(episode.seed, None, options, "{}", time.time_ns()))
     for i in range(n):
@@ -111,7 +115,17 @@ def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeDa
             if step in frames:
                 frame = frames[step]._replace(time_ns=time.time_ns())
                 put_frame(writer, 0, recorder.running[0], step, frame)
-    flags = TERMINAL if episode.terminals[n - 1] else TIMEOUT if episode.timeouts[n - 1] else INTERRUPTED
-    end = flags if episode.end is None else END_NAMES.index(episode.end)
     recorder.metadata = jsonvalue.dumps_plain(dict(episode.metadata)) if episode.metadata else "{}"
     recorder.end(end, has_final_state=episode.final_state is not None)
+
+
+def _end(episode: EpisodeData, last: int) -> int:
+    terminal = exact_flag(episode.terminals[last], "terminal")
+    timeout = exact_flag(episode.timeouts[last], "timeout")
+    end = TERMINAL if terminal else TIMEOUT if timeout else INTERRUPTED
+    if episode.end is not None and episode.end != END_NAMES[end]:
+        raise StepError(
+            f"expected the end {END_NAMES[end]!r}, as the flags of the last step say, or None, "
+            f"found {shorten(episode.end)}"
+        )
+    return end
