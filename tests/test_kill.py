@@ -18,7 +18,7 @@ from killing.check import Found, problems_of
 from killing.kinds import KINDS
 from killing.moments import MOMENTS, die
 
-from tupli_mcap import RecordEpisodes, Recording, journal_path, recover_recording
+from tupli_mcap import RecordEpisodes, Recording, files, journal_path, recover_recording
 from tupli_mcap.recording.journal import Journal
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.vector import VectorRecorder
@@ -285,3 +285,24 @@ def test_the_journal_of_what_was_renamed_stays_though_its_successor_was_killed(
     (journal,) = tmp_path.glob("*.journal")
     journal.rename(journal_path(kept))
     assert (Recording(kept).num_steps, Recording(path).num_steps) == (7, 3)
+
+
+@pytest.mark.parametrize("mode", ["w", "a"])
+def test_a_recording_that_never_took_the_place_of_another_leaves_nothing(tmp_path: Path, mode: str) -> None:
+    """Its journal was in its place, and it was not."""
+    path = tmp_path / "r.mcap"
+    with _count(path, "x") as env:
+        _take(env, 7)
+
+    def die_before_the_file_is_there() -> None:
+        env = _count(path, "w")
+        FileLock.publish = lambda _: die()  # type: ignore[method-assign]
+        _take(env, 1)
+
+    in_a_process_that_dies(die_before_the_file_is_there)
+    assert journal_path(path).exists()
+    assert Recording(path).num_steps == 7
+    with _count(path, mode) as env:
+        _take(env, 3)
+    assert Recording(path).num_steps == (10 if mode == "a" else 3)
+    assert [file.name for file in tmp_path.iterdir() if not files.is_temporary(file.name)] == ["r.mcap"]

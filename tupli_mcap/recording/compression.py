@@ -31,6 +31,10 @@ def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
 
     Nothing may follow the frame: other readers would read on in it.
     """
+    if size > len(data) * MAX_RATIO.get(name, size):
+        raise FormatError(
+            f"{where}: {len(data)} compressed bytes cannot hold the {size} that they are said to"
+        )
     try:
         if name == "zstd":
             if zstandard.frame_content_size(data) not in (size, zstandard.CONTENTSIZE_UNKNOWN):

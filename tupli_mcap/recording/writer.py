@@ -26,7 +26,15 @@ from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
 from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.journal import Area, Journal, journal_aside, journal_in, journal_path, owner_among
+from tupli_mcap.recording.journal import (
+    Area,
+    Journal,
+    journal_aside,
+    journal_in,
+    journal_info,
+    journal_path,
+    owner_among,
+)
 from tupli_mcap.recording.library import library
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog
@@ -97,6 +105,7 @@ class RecordingWriter:
         self.rewritten = ""
         # the recording whose journal a writer that was killed has left in this one's place
         self.replaced = ""
+        self._replaces = ""  # the recording that this one takes the place of with its first step
         self.journal_place = self._choose_journal_place()
         self._is_cut = True  # False on append, while the file still is as it was found
         self._flush_seconds = options.flush_seconds
@@ -123,12 +132,14 @@ class RecordingWriter:
             resume(self)
             self._old_journal = self.journal_place
             self._remove_journal_of(self.replaced)
+            self._remove_journal_without_recording(self.uuid)
             return
         there = _metadata_of(self._place) if self.options.mode == "w" else {}
+        self._replaces = there.get("uuid", "")
         self._remove_journal_of(there.get("replaced", ""))  # whose file is gone
-        self.replaced = owner_among(
-            journal_path(self._place), [there[key] for key in ("uuid", "replaced") if key in there]
-        )
+        self._remove_journal_without_recording(self._replaces)
+        if any(owner_among(place, [self._replaces]) for place in self._journals_of(self._replaces)):
+            self.replaced = self._replaces
         try:
             os.ftruncate(self.lock.fd, 0)
         except OSError as err:
@@ -424,6 +435,7 @@ class RecordingWriter:
         description = {
             "uuid": self.uuid,
             **({"rewritten": self.rewritten} if self.rewritten else {}),
+            **({"replaces": self._replaces} if self._replaces else {}),
             **({} if self.journal_place.parent == self._place.parent else {"recording": str(self._place)}),
             "boot": boot_id(),
             "seals": "rows" if self._sealed else "records",
@@ -528,11 +540,22 @@ class RecordingWriter:
 
     def _remove_journal_of(self, uuid: str) -> None:
         """The journal of a recording that this one, or the one before it, took the place of."""
-        beside = journal_path(self._place)
-        for place in (beside, journal_aside(beside, uuid)):
+        for place in self._journals_of(uuid):
             with contextlib.suppress(OSError):
                 if owner_among(place, [uuid]):
                     place.unlink()
+
+    def _journals_of(self, uuid: str) -> tuple[Path, Path]:
+        """Where the journal of a recording at this path may lie, if it lies beside it."""
+        beside = journal_path(self._place)
+        return beside, journal_aside(beside, uuid)
+
+    def _remove_journal_without_recording(self, uuid: str) -> None:
+        """That of a recording that was to take the place of this one, which is still there: it never had a step."""
+        place = journal_path(self._place)
+        with contextlib.suppress(OSError, FormatError):
+            if uuid and journal_info(place).get("replaces") == uuid:
+                place.unlink()
 
     def _is_new_and_empty(self) -> bool:
         return self.options.mode != "a" and not self.options.keep_empty
