@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from environments import Scripted
 from gymnasium import spaces
-from interruptions import SCENARIOS, interrupted
+from interruptions import SCENARIOS, Counting, interrupted
 
-from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError
+from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError, verify_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 KINDS: dict[str, tuple[gym.Space[Any], Any]] = {
@@ -156,3 +156,71 @@ def test_a_step_broken_off_in_the_environment_is_followed_by_a_reset(tmp_path: P
         env.step(action)
     assert [[_number(x) for x in step] for step in transitions(path)] == [[0, 1], [0, 1]]
     assert [episode.end for episode in Recording(path).episodes] == ["interrupted"] * 2
+
+
+def counted(path: Path, **options: Any) -> tuple[RecordEpisodes, Counting]:
+    inner = Counting()
+    return RecordEpisodes(inner, path, attachments={}, **options), inner
+
+
+def test_a_callback_that_survives_a_flush_in_vain_does_not_go_on(tmp_path: Path) -> None:
+    """The rows of the half were noted as written."""
+
+    def flush(_: Any) -> dict[str, Any]:
+        if len(taken) == 10:
+            env._writer.container.add_chunk = refuse  # type: ignore[method-assign]
+            with pytest.raises(RecordingError, match="disk"):
+                env.flush()
+            del env._writer.container.add_chunk
+        return {}
+
+    def refuse(*_: Any) -> None:
+        raise RecordingError("no room on the disk")
+
+    taken: list[int] = []
+    env, _ = counted(tmp_path / "r.mcap", step_callback=flush)
+    env.reset()
+    with pytest.raises(RecordingError, match="no room on the disk"):
+        for i in range(20):
+            if env.step(0)[2]:
+                env.reset()
+            taken.append(i)
+    assert len(taken) == 10
+    env.close()
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert recording.num_steps == 11  # the one that was refused is there, too
+        assert verify_recording(tmp_path / "r.mcap").ok
+
+
+@pytest.mark.parametrize("when", ["callback", "environment", "reset"])
+def test_nothing_is_recorded_once_it_was_closed_from_within(tmp_path: Path, when: str) -> None:
+    def close(_: Any = None) -> dict[str, Any]:
+        if len(taken) == 10:
+            env.close()
+        return {}
+
+    class Closing(Counting):
+        def step(self, action: Any) -> Any:
+            if when == "environment":
+                close()
+            return super().step(action)
+
+        def reset(self, **kwargs: Any) -> Any:
+            if when == "reset" and len(taken) >= 10:
+                env.close()
+            return super().reset(**kwargs)
+
+    taken: list[int] = []
+    options = {"step_callback": close} if when == "callback" else {}
+    env: Any = RecordEpisodes(Closing(), tmp_path / "r.mcap", attachments={}, **options)
+    env.reset()
+    with pytest.raises(RecordingError, match="is closed"):
+        for i in range(20):
+            if env.step(0)[2]:
+                env.reset()
+            taken.append(i)
+    for use in (env.reset, lambda: env.step(0), env.flush):
+        with pytest.raises(RecordingError, match="is closed"):
+            use()
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert len(taken) <= recording.num_steps <= len(taken) + 1

@@ -178,6 +178,9 @@ def main() -> None:
     """The console entry point."""
     try:
         app()
+    except KeyboardInterrupt:  # before a command has begun
+        fail("interrupted")
+        sys.exit(INTERRUPTED)
     except Exception as err:  # noqa: BLE001 - a bug of ours, whose message may hold a text of a file
         print_traceback(err)
         sys.exit(FAILED)

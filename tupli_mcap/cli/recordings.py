@@ -146,7 +146,10 @@ def _record(
     if policy is not None or ":" in env_id:
         sys.path.append("")  # last: a file that happens to lie here replaces no installed module
     function = None if policy is None else load_policy(policy)
-    with _saying_what_is_safe(output, max_bytes or max_seconds), step_progress(steps) as progress:
+    with (
+        _saying_what_is_safe(output, max_bytes or max_seconds, replaces=mode is _Mode.w),
+        step_progress(steps) as progress,
+    ):
         summary = record_rollouts(
             env_id,
             output,
@@ -180,12 +183,16 @@ def _record(
 
 
 @contextlib.contextmanager
-def _saying_what_is_safe(output: Path, limit: float | None) -> Iterator[None]:
+def _saying_what_is_safe(output: Path, limit: float | None, *, replaces: bool) -> Iterator[None]:
     """Adds to Ctrl-C what the recording holds by now; with a limit, the files it went on in count too."""
+    before = output.stat().st_ino if replaces and output.exists() else None
     try:
         yield
     except KeyboardInterrupt as err:
-        raise KeyboardInterrupt(_held(output, limit)) from err
+        held = _held(output, limit)
+        if before is not None and output.exists() and output.stat().st_ino == before:
+            held = f"{held}; this is the file that was there before"
+        raise KeyboardInterrupt(held) from err
 
 
 def _held(output: Path, limit: float | None) -> str:

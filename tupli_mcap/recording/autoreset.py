@@ -7,8 +7,9 @@ DISABLED: the caller resets, all or by `reset_mask`.
 By the wrong mode, the next episode's first state is recorded as a final one, a reset as a step, or a step as a reset.
 An environment may say nothing of its mode, or something wrong, so:
 
-1. A final state in the infos of a batch that ends episodes says same-step. No end has been recorded yet: that mode is
-   gone on with. Else the batch is refused.
+1. A final state in the infos of a batch that ends episodes, other than the state that is returned, says same-step.
+   Where no mode is declared and no end has been recorded yet, that mode is gone on with; where another one is declared,
+   or ends have been recorded, the batch is refused. What the caller says counts more, and the caller is told.
 2. A flag in the batch after an end says that this was a step, and no reset; where no mode is declared, a reward says so
    too. That batch is refused. (Wrappers may give rewards to resets, so a declared mode counts more than a reward.)
 3. Where no mode is declared, an end is written with the batch after it: if that is refused, without a final state.
@@ -32,7 +33,8 @@ Array = np.ndarray[Any, Any]
 Mode = Literal["NextStep", "SameStep", "Disabled"]
 _MODES: tuple[Mode, ...] = ("NextStep", "SameStep", "Disabled")
 _OTHERWISE = (
-    'pass autoreset_mode="SameStep" if it resets in the step that ends an episode, "Disabled" if you reset it'
+    'pass autoreset_mode="SameStep" if it resets in the step that ends an episode, "NextStep" if in the next one, '
+    '"Disabled" if you reset it'
 )
 
 
@@ -87,15 +89,27 @@ class Autoreset:
         Raises:
             StepError: that contradicts what was recorded, or what the caller has said.
         """
-        if self.mode == "SameStep" or not (changed or self.is_assumed):
-            return False  # nothing contradicts what is declared
-        if self._given or self.has_ended:
+        if self.mode == "SameStep" or not changed:
+            return False  # nothing contradicts what is said
+        if self._given:
+            self._doubt(
+                f"an episode ended with a final state in infos that is not the state returned, as under same-step "
+                f"autoreset, and is recorded as under {self.mode}, as you have said"
+            )
+            return False
+        if self.has_ended or not self.is_assumed:
             raise StepError(
-                f"an episode ended with a final state in infos, as under same-step autoreset, and is recorded as under "
-                f'{self.mode}; pass autoreset_mode="SameStep"'
+                f"an episode ended with a final state in infos that is not the state returned, as under same-step "
+                f"autoreset, and is recorded as under {self.mode}; pass "
+                f'autoreset_mode="SameStep", or "{self.mode}" if that is right'
             )
         self.mode, self.is_assumed, self.is_plain = "SameStep", False, False
         return True
+
+    def _doubt(self, text: str) -> None:
+        """Tells the caller, once."""
+        if not self._has_told:
+            self._has_told, self.doubt = True, text
 
     def check_resets(self, holes: Array, done: Array, rewards: Array) -> None:
         """For a batch in which the sub-environments `holes` should have been reset.

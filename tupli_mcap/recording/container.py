@@ -141,6 +141,10 @@ class Container:
         """Of the chunks that are added."""
         return self._compression
 
+    def close(self) -> None:
+        """Nothing more is written: the number of the descriptor may be that of another file soon."""
+        self._fd = -1
+
     def write(self, *parts: Any) -> None:
         """Appends bytes, in one call of the system; on failure the file keeps only whole records."""
         start = position = self.position

@@ -169,7 +169,8 @@ class FileLock:
         if self._temporary is None:
             return
         try:
-            files.put(self._temporary, self._path, overwrite=self._old is not None)
+            is_there = self._old is not None and _is_at(self._old.fileno(), self._path)
+            files.put(self._temporary, self._path, overwrite=is_there)
         except FileExistsError as err:
             raise _exists(self._shown) from err
         except OSError as err:

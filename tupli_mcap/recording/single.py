@@ -77,7 +77,7 @@ class SingleRecorder:
         self._began_plain = False  # the running episode's reset had no seed, options and info
         self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset
-        writer.on_abandon = self._abandon
+        writer.on_close = self._stop
         writer.start_is_droppable = lambda: self._episode is not None and self.step_index == 0
 
     @property
@@ -85,9 +85,9 @@ class SingleRecorder:
         """Writes the file."""
         return self._writer
 
-    def _abandon(self) -> None:
+    def _stop(self) -> None:
         self.put = self._closed
-        self._over = None  # or `begin_next` would go on
+        self._over = self._rows = None  # or `begin_next` would go on
 
     def reset(self, state: Any, facts: ResetFacts) -> None:
         """Starts an episode at `state`; a running one ends as interrupted.
@@ -254,6 +254,7 @@ class SingleRecorder:
         self._start_earlier()
         self.reset(first, facts)
         self.put(action, state, reward, terminal, timeout)
+        writer.take_place()
 
     def _start_earlier(self) -> None:
         rows = self._writer.rows
@@ -309,8 +310,6 @@ class SingleRecorder:
         if self._writer.closed:
             return
         self.end(INTERRUPTED)
-        self.put = self._closed
-        self._rows = None
         self._writer.close()
 
     def _closed(self, *_: Any) -> None:

@@ -169,7 +169,8 @@ class VectorRecorder:
             rewards, terminals, timeouts = self._numbers_of(rewards, terminals, timeouts)
             if infos.__class__ is not dict:
                 infos = check_infos(infos, self._n)
-            if self._writer.vector is None:
+            begins = self._writer.vector is None
+            if begins:
                 self._begin(actions, states, rewards)
             done = terminals | timeouts
             flags = done.tobytes()
@@ -186,6 +187,8 @@ class VectorRecorder:
             elif resets.is_assumed or ended.tobytes() != flags:
                 self._check_resets(holes, done, rewards)
             self._store(actions, states, rewards, terminals, timeouts, active, finals, any_done)
+            if begins:
+                self._writer.take_place()
         except StepError:
             self.refuse()
             raise

@@ -30,6 +30,8 @@ BEGUN: Final = 1
 """The recorder works."""
 ASKING: Final = 2
 """Within a step or a reset, the environment or a callback works: what the recorder has in memory is whole."""
+CLOSED: Final = 3
+"""The files are finished."""
 
 
 class Recorder(Protocol):
@@ -49,7 +51,7 @@ class Work:
     """What one wrapper records: the recorders whose files are not finished, and the mark. Not thread-safe.
 
     Attributes:
-        state: DONE, BEGUN or ASKING.
+        state: DONE, BEGUN, ASKING or CLOSED.
         recorders: the last one takes the steps; those before it were left by a rotation that was interrupted.
     """
 
@@ -63,8 +65,28 @@ class Work:
         """Calls what is not the recorder's within a step: a callback, or what renders."""
         self.state = ASKING
         result = function(*args)
-        self.state = BEGUN
+        self.go_on()
         return result
+
+    def go_on(self) -> None:
+        """Goes on after what was asked, which may have closed the recording, or flushed it in vain.
+
+        Raises:
+            RecordingError: it has.
+        """
+        if self.state != ASKING:
+            self.refuse()
+        self.state = BEGUN
+
+    def finish(self) -> None:
+        """The work is done; nothing is half done any more.
+
+        Raises:
+            RecordingError: a signal handler has closed the recording within it.
+        """
+        if self.state != BEGUN:
+            self.refuse()
+        self.state = DONE
 
     def is_whole_after(self, err: BaseException) -> bool:
         """Whether nothing was left half done: what was asked raised, or a step was refused before anything changed."""
@@ -96,6 +118,7 @@ class Work:
         for recorder in self.recorders:
             writer = recorder.writer
             if self.state != DONE:
+                self.state = BEGUN  # also for what is asked just now
                 writer.break_off()
                 continue
             self.state = BEGUN
@@ -109,3 +132,4 @@ class Work:
                 writer.break_off()
                 raise
             self.state = DONE
+        self.state = CLOSED

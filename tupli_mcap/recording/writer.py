@@ -90,9 +90,9 @@ class RecordingWriter:
         self.events: EpisodeLog | None = None
         self.infos: EventLog | None = None
         self.frames: list[EventLog] = []
-        # set by the recorder: called in a forked child (its encoder knows only its buffer), and asked whether the last
-        # event is the start of an episode without a step
-        self.on_abandon: Callable[[], None] = lambda: None
+        # set by the recorder: called when nothing may be recorded any more (its encoder knows only its buffer), and
+        # asked whether the last event is the start of an episode without a step
+        self.on_close: Callable[[], None] = lambda: None
         self.start_is_droppable: Callable[[], bool] = lambda: False
         # sub-environments whose random stream does not come from their last recorded episode
         self.lost_streams: set[int] = set()
@@ -197,15 +197,15 @@ class RecordingWriter:
         self.container.define_channels()
         if self._durable:
             self._settle()
-        self._take_place()
-        if self._durable:
             sync_directory(self._place.parent)
 
-    def _take_place(self) -> None:
-        """The file that this one replaces goes when nothing more is needed to record to this one."""
+    def take_place(self) -> None:
+        """The file that this one replaces goes when this one has a step."""
         if self.lock.replaces:
             self.lock.publish()
             self._remove_journal_of(self.replaced)
+            if self._durable:
+                sync_directory(self._place.parent)
 
     def _png(self, layout: StepLayout) -> frozenset[str]:
         """The image leaves stored as PNG: as the options say, on append as they are in the file."""
@@ -387,7 +387,7 @@ class RecordingWriter:
         """Why nothing more can be recorded: it is closed, or has been broken off."""
         if self.closed and self.failed is None:
             return RecordingError(f"{self.path} is closed; wrap the environment again to record")
-        return self.failed or self._broken_off("an interruption")
+        return self.failed or self._broken_off("an interruption (or this call, from a signal handler, say)")
 
     def _broken_off(self, what: str) -> RecordingError:
         return RecordingError(
@@ -465,7 +465,7 @@ class RecordingWriter:
         data = self.index.encode(self.container.chunk_rows)
         self.container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, time.time_ns())
         self.container.finish()
-        self._take_place()
+        self.take_place()
         self._warn_if_deleted()
         if self._durable:  # before the journal goes
             sync_file(self.lock.fd, str(self.path))
@@ -484,6 +484,8 @@ class RecordingWriter:
             RecordingError: as `FileLock.release`.
         """
         _live.discard(self)
+        self.on_close()
+        self.container.close()
         try:
             self.worker.close()
             if self._stores is not None and not self.is_watched:  # who watches has yet to show the rest
@@ -581,7 +583,7 @@ class RecordingWriter:
             f"{self.path} is recorded by the process that opened it, not by a forked child; wrap the environment here"
         )
         self.lock.release()
-        self.on_abandon()
+        self.on_close()
 
 
 def finish_recording(path: Path, options: WriterOptions) -> None:

@@ -93,7 +93,8 @@ def _ns(time: datetime.datetime) -> int:
 def text_of(value: datetime.date) -> str:
     """A date or a `datetime` (local time if it has no zone) as `span_of` reads it: a day, or a microsecond."""
     if isinstance(value, datetime.datetime):
-        return value.astimezone().isoformat(timespec="microseconds")
+        # of the class itself: those of others (pandas) have other arguments
+        return datetime.datetime.astimezone(value).isoformat(timespec="microseconds")
     return value.isoformat()
 
 

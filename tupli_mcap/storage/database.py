@@ -444,6 +444,8 @@ def _translated(path: Path | None) -> Iterator[None]:
         raise kind(f"{named} cannot be used: {err.orig}") from err
     except SQLAlchemyError as err:
         raise StorageError(f"{named} cannot be used: {err}") from err
+    except sqlite3.Error as err:  # of a connection that is used as it is
+        raise CatalogUnusableError(f"{named} cannot be used: {err}") from err
 
 
 def _is_damage(err: DBAPIError) -> bool:

@@ -222,6 +222,8 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             if self._plain:
                 if terminal or timeout:
                     self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
+                if work.state != BEGUN:
+                    work.refuse()
                 work.state = DONE
                 return result
         except StepError:
@@ -232,7 +234,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             self._writer.stop(err)
             raise
         refusal = self._finish_step(action, result)
-        work.state = DONE
+        work.finish()
         if refusal is not None:
             raise refusal
         return result
@@ -280,10 +282,11 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             state, info = result
             has_facts = seed is not None or options is not None or info or unseeded
             if self._plain and not has_facts and not self.rotation.is_due(self._writer):
-                work.state = BEGUN
+                work.go_on()
                 if self._recorder.begin_next(state):
-                    work.state = DONE
+                    work.finish()
                     return result
+                work.state = ASKING
             facts = ResetFacts(
                 seed,
                 drawn_seed(self.env) if unseeded else None,
@@ -293,7 +296,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             )
             if self._watches:
                 self._state = copy.deepcopy(state)
-            work.state = BEGUN
+            work.go_on()
             if self.rotation.is_due(self._writer):
                 self._rotate(state)
             self._recorder.reset(state, facts)
@@ -310,7 +313,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             else:
                 self._writer.stop(err)
             raise
-        work.state = DONE
+        work.finish()
         return result
 
     def _start_frames(self) -> None:

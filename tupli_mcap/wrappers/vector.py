@@ -186,7 +186,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             self._writer.stop(err)
             raise
         refusal = self._finish_step(stepped, actions, result)
-        work.state = DONE
+        work.finish()
         if self._autoreset.doubt:
             doubt, self._autoreset.doubt = self._autoreset.doubt, ""
             warnings.warn(doubt, UserWarning, stacklevel=2)
@@ -272,7 +272,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             facts = self._facts(seed, unseeded, told, infos)
             if self._watches:
                 self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
-            work.state = BEGUN
+            work.go_on()
             if mask is None and self.rotation.is_due(self._writer):
                 self._rotate(states)
             self._recorder.reset(states, facts, mask)
@@ -290,7 +290,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             else:
                 self._writer.stop(err)
             raise
-        work.state = DONE
+        work.finish()
         return result
 
     def _sub_environments(self) -> list[Any]:
