@@ -247,13 +247,12 @@ def _lives(pid: int) -> bool:
 
 def _remove(path: Path) -> None:
     """Removes a temporary file, or a directory with what is in it, as far as the system allows it."""
-    with contextlib.suppress(OSError):
-        if not stat.S_ISDIR(path.lstat().st_mode):
+    with contextlib.suppress(OSError):  # without a descriptor, which may not be had any more
+        (path / _NEW).unlink()
+    try:
+        path.rmdir()
+    except NotADirectoryError:
+        with contextlib.suppress(OSError):
             path.unlink()
-            return
-        with contextlib.suppress(OSError):  # without a descriptor, which may not be had any more
-            (path / _NEW).unlink()
-        try:
-            path.rmdir()
-        except OSError:
-            shutil.rmtree(path, ignore_errors=True)
+    except OSError:
+        shutil.rmtree(path, ignore_errors=True)
