@@ -195,9 +195,7 @@ def run_storage_case(name: str, made: Lab, directory: Path, case: Case) -> Outco
     done = _DONE.setdefault(name, after)  # the first time without a fault
     assert said or told or after == done, f"silent: {faults.failed}"
     removal_failed = any(kind == "unlink" for kind, _ in faults.failed)
-    assert removal_failed or not strays(lab), (
-        f"left behind: {strays(lab)}, {[(k, p[-30:]) for k, p in faults.failed]} {case}"
-    )
+    assert removal_failed or not strays(lab), f"left behind: {strays(lab)}"
     _repeat(name, lab)
     new = state_of(lab)
     if faults.failed:

@@ -339,14 +339,14 @@ def test_a_size_that_lies_either_way(name: str, wrong: int) -> None:
     assert bytes(decompress(name, memoryview(plain[name]), len(data), "here")) == data
     with pytest.raises(
         FormatError,
-        match="here: (expected|the compressed data is damaged|[0-9]+ compressed bytes cannot hold)",
+        match=refusal,
     ):
         decompress(name, memoryview(plain[name]), len(data) + wrong, "here")
     if name == "zstd":  # the frame says what the file says, and holds something else
         unsized = zstandard.ZstdCompressor(write_content_size=False).compress(data)
         with pytest.raises(
             FormatError,
-            match="here: (expected|the compressed data is damaged|[0-9]+ compressed bytes cannot hold)",
+            match=refusal,
         ):
             decompress(name, memoryview(unsized), len(data) + wrong, "here")
         lying = bytearray(plain[name])
@@ -354,7 +354,7 @@ def test_a_size_that_lies_either_way(name: str, wrong: int) -> None:
         claimed = zstandard.frame_content_size(bytes(lying))
         with pytest.raises(
             FormatError,
-            match="here: (expected|the compressed data is damaged|[0-9]+ compressed bytes cannot hold)",
+            match=refusal,
         ):
             decompress(name, memoryview(bytes(lying)), claimed, "here")
 
