@@ -337,25 +337,17 @@ def test_a_size_that_lies_either_way(name: str, wrong: int) -> None:
         "lz4": lz4.frame.compress(data, store_size=False),
     }
     assert bytes(decompress(name, memoryview(plain[name]), len(data), "here")) == data
-    with pytest.raises(
-        FormatError,
-        match=refusal,
-    ):
+    refusal = "here: (expected|the compressed data is damaged|[0-9]+ compressed bytes cannot hold)"
+    with pytest.raises(FormatError, match=refusal):
         decompress(name, memoryview(plain[name]), len(data) + wrong, "here")
     if name == "zstd":  # the frame says what the file says, and holds something else
         unsized = zstandard.ZstdCompressor(write_content_size=False).compress(data)
-        with pytest.raises(
-            FormatError,
-            match=refusal,
-        ):
+        with pytest.raises(FormatError, match=refusal):
             decompress(name, memoryview(unsized), len(data) + wrong, "here")
         lying = bytearray(plain[name])
         lying[5:7] = struct.pack("<H", (len(data) - 256 + wrong) & 0xFFFF)
         claimed = zstandard.frame_content_size(bytes(lying))
-        with pytest.raises(
-            FormatError,
-            match=refusal,
-        ):
+        with pytest.raises(FormatError, match=refusal):
             decompress(name, memoryview(bytes(lying)), claimed, "here")
 
 
