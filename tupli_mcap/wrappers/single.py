@@ -222,8 +222,6 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             if self._plain:
                 if terminal or timeout:
                     self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
-                if work.state != BEGUN:
-                    work.refuse()
                 work.state = DONE
                 return result
         except StepError:
