@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 
 from tupli_mcap import RecordEpisodes, Recording, RecordingError, verify_recording
 from tupli_mcap.recording.lock import is_locked
@@ -94,13 +94,13 @@ def single(kind: str = "box", **options: Any) -> Callable[[Path], Any]:
     return make
 
 
-def vector(mode: AutoresetMode, kind: str = "box", **options: Any) -> Callable[[Path], Any]:
+def vector(mode: str, kind: str = "box", **options: Any) -> Callable[[Path], Any]:
     """Makes a recorder of two sub-environments."""
 
     def make(path: Path) -> Any:
         envs = SyncVectorEnv(
             [lambda i=i: Counting(kind, 10_000 * i) for i in range(2)],  # type: ignore[misc]
-            autoreset_mode=mode,
+            autoreset_mode=gym.vector.AutoresetMode[mode],  # unknown to Gymnasium 1.0
         )
         return RecordVector(envs, path, chunk_size=400, attachments={}, **options)
 
@@ -117,11 +117,11 @@ SCENARIOS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "rotating": ("x", single(max_bytes=2500, record_info=True)),
     "append": ("a", single(mode="a")),
     "replace": ("w", single(mode="w")),
-    "vector": ("x", vector(AutoresetMode.NEXT_STEP)),
-    "vector, same step": ("x", vector(AutoresetMode.SAME_STEP)),
-    "vector, infos": ("x", vector(AutoresetMode.NEXT_STEP, record_info=True)),
-    "vector, text": ("x", vector(AutoresetMode.NEXT_STEP, "text")),
-    "vector, rotating": ("x", vector(AutoresetMode.NEXT_STEP, max_bytes=2000)),
+    "vector": ("x", vector("NEXT_STEP")),
+    "vector, same step": ("x", vector("SAME_STEP")),
+    "vector, infos": ("x", vector("NEXT_STEP", record_info=True)),
+    "vector, text": ("x", vector("NEXT_STEP", "text")),
+    "vector, rotating": ("x", vector("NEXT_STEP", max_bytes=2000)),
 }
 
 
