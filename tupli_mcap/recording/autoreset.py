@@ -70,7 +70,10 @@ class Autoreset:
             StepError: it is none of the three.
         """
         # those of Gymnasium 1.0 do not declare the only mode they have
-        known = isinstance(env.unwrapped, SyncVectorEnv | AsyncVectorEnv)
+        base = env.unwrapped
+        known = isinstance(base, SyncVectorEnv | AsyncVectorEnv) or type(base).__module__.startswith(
+            "gymnasium."
+        )
         declared = (env.metadata or {}).get("autoreset_mode", "NextStep" if known else None)
         found = declared if given is None else given
         if found is None:
