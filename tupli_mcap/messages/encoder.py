@@ -365,11 +365,16 @@ def _leaf(
         plain = f"{value}.__class__ is {source.bind('array', np.ndarray)}"
         if leaf.shape == ():
             plain = f"({plain} or {value}.__class__ is {source.bind('scalar', dtype.type)})"
+        # a vector's length is told by its bytes, which spares it making a tuple
+        vector = len(leaf.shape) == 1 and not large
+        shaped = f"{value}.ndim == 1" if vector else f"{value}.shape == {shape}"
         source.lines.append(
-            f"{raw} = {fast} if {plain} and {value}.dtype is {kind} and {value}.shape == {shape} else {exact}({value})"
+            f"{raw} = {fast} if {plain} and {value}.dtype is {kind} and {shaped} else {exact}({value})"
             if not (large and is_bool)
             else f"{raw} = {exact}({value})"
         )
+        if vector:
+            source.lines.append(f"if len({raw}) != {nbytes}: {raw} = {exact}({value})")
         if is_bool and not large:  # made by a view, perhaps
             source.lines.append(f"if {raw}.translate(None, {_BOOLS!r}): {raw} = {exact}({value})")
         if large:
