@@ -206,6 +206,7 @@ def test_values_outside_the_bounds_and_nan_are_kept(tmp_path: Path) -> None:
 
 BAD_STATES = [
     (BOX, np.zeros(3, np.float32), r"state: expected shape \(2,\), found shape \(3,\)"),
+    (BOX, np.zeros((1, 2), np.float32), r"state: expected shape \(2,\), found shape \(1, 2\)"),
     (BOX, np.array([0.1, 0.2]), r"state: expected values that float32 holds exactly, found float64"),
     (BOX, "text", r"state: expected float32\[2\], found 'text'"),
     (BOX, None, r"state: expected float32\[2\], found None"),
