@@ -153,19 +153,21 @@ class StepClaims:
     finds every boundary that is not where the rows have it. Nothing changes in it; threads and stores may share it.
 
     Args:
-        episodes: EPISODE_ROWS of one sub-environment, which share no row.
+        index: EPISODE_ROWS; no two episodes share a row.
+        env: the sub-environment whose channel it is.
     """
 
-    def __init__(self, episodes: Array) -> None:
-        rows = episodes[np.argsort(episodes["first_row"].astype(np.int64), kind="stable")]
-        firsts, lengths = rows["first_row"].astype(np.int64), rows["length"].astype(np.int64)
-        self._how = np.ascontiguousarray(rows["end"])
-        # `episode` and `step` of a row, as one number of 64 bits
-        self._numbers = np.stack(
-            [rows["episode"], rows["episode"] + (rows["length"] - 1 << np.uint64(32))], 1
-        )
-        self._numbers = self._numbers.astype(np.uint64).reshape(-1)
-        self._rows = np.stack([firsts, firsts + lengths - 1], 1).reshape(-1)  # the first and the last of each
+    def __init__(self, index: Array, env: int) -> None:
+        mine = np.flatnonzero(index["env"] == env)
+        mine = mine[np.argsort(index["first_row"][mine], kind="stable")]
+        # field by field: NumPy takes far longer for rows of many fields
+        episodes, firsts, lengths = (index[name][mine] for name in ("episode", "first_row", "length"))
+        self._how = index["end"][mine]
+        self._rows = _by_turns(firsts, firsts + lengths - 1).astype(
+            np.int64
+        )  # the first and the last of each
+        # `episode` and `step` of such a row, as one number of 64 bits
+        self._numbers = _by_turns(episodes, episodes + (lengths - 1 << np.uint64(32)))
 
     def check(self, first: int, numbers: Array, flags: Array, where: str) -> None:
         """Holds consecutive rows against the index.
@@ -206,6 +208,12 @@ class StepClaims:
                     f"{where}: expected step {other >> 32} of episode {other & _U32} in row {row} as the episode index "
                     f"says, found step {one >> 32} of episode {one & _U32}; recover it into a new file"
                 )
+
+
+def _by_turns(firsts: Array, lasts: Array) -> Array:
+    both = np.empty(2 * len(firsts), np.uint64)
+    both[::2], both[1::2] = firsts, lasts
+    return both
 
 
 @functools.cache
