@@ -18,7 +18,7 @@ from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.durability import sync_file
 from tupli_mcap.recording.imagecodecs import image_codecs
 from tupli_mcap.recording.journal import journal_info, journal_path, recorded_journal
-from tupli_mcap.recording.recover import belongs, head, misplaced_journal
+from tupli_mcap.recording.recover import belongs, head, metadata_at, misplaced_journal
 from tupli_mcap.recording.signed import SIGNATURE_NAME
 from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.summary import check_magic, has_summary
@@ -106,16 +106,9 @@ def _check_journal(path: Path, metadata: Mapping[str, str]) -> None:
 
 def _is_same(path: Path, metadata: Mapping[str, str]) -> bool:
     """Whether the file at a path is a copy of the same recording."""
-    try:
-        source = PathSource(path)
-    except RecordingError:  # gone: this one was moved
-        return False
-    try:
-        return head(source).get("uuid") == metadata["uuid"]
-    except FormatError:
-        return False
-    finally:
-        source.close()
+    with contextlib.suppress(RecordingError, FormatError):  # gone: this one was moved; or damaged
+        return metadata_at(path).get("uuid") == metadata["uuid"]
+    return False
 
 
 def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: Source) -> None:

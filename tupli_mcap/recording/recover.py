@@ -39,7 +39,7 @@ from tupli_mcap.recording.salvage import (
     to_rows,
 )
 from tupli_mcap.recording.scan import Scan, is_ours, scan
-from tupli_mcap.recording.source import Source
+from tupli_mcap.recording.source import PathSource, Source
 from tupli_mcap.recording.summary import foreign, has_summary, parse_record, records
 from tupli_mcap.system import refused
 
@@ -50,6 +50,7 @@ __all__ = [
     "define",
     "find_journal",
     "head",
+    "metadata_at",
     "misplaced_journal",
     "recover_contents",
 ]
@@ -73,6 +74,12 @@ def head(source: Source) -> dict[str, str]:
             )
         raise foreign(source, f"its profile is {found.profile!r}")
     return check_metadata(source, found.metadata[RECORDING_METADATA])
+
+
+def metadata_at(path: Path) -> dict[str, str]:
+    """The same of the file at a path. Raises RecordingError too: it cannot be opened."""
+    with contextlib.closing(PathSource(path)) as source:
+        return head(source)
 
 
 def recover_contents(source: Source, journal: JournalContents | Exception | None) -> Contents:

@@ -39,9 +39,8 @@ from tupli_mcap.recording.library import library
 from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog
 from tupli_mcap.recording.options import WriterOptions, check_options
-from tupli_mcap.recording.recover import head
+from tupli_mcap.recording.recover import metadata_at
 from tupli_mcap.recording.rows import ImageRows, SingleRows
-from tupli_mcap.recording.source import PathSource
 from tupli_mcap.recording.step_log import StepLog
 from tupli_mcap.recording.stores import Stores
 from tupli_mcap.recording.vector_rows import VectorRows
@@ -603,10 +602,9 @@ def finish_recording(path: Path, options: WriterOptions) -> None:
 
 def _metadata_of(path: Path) -> dict[str, str]:
     """The metadata of a recording that is there; empty if there is none."""
-    if not path.is_file():
-        return {}
-    with contextlib.suppress(RecordingError, FormatError), contextlib.closing(PathSource(path)) as source:
-        return head(source)
+    if path.is_file():
+        with contextlib.suppress(RecordingError, FormatError):
+            return metadata_at(path)
     return {}
 
 
