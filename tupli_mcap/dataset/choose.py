@@ -11,7 +11,7 @@ from tupli_mcap.recording.choice import WORDS, Positions, named_positions
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate
-from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.sidecar import Notes
 
 __all__ = ["WORDS", "candidates", "choose_among", "choose_episodes"]
 
@@ -53,7 +53,7 @@ def choose_among(
 def candidates(recording: Recording, filter: BaseFilter | None) -> Positions:
     """The positions of the episodes that a filter is true of, without those that the storage has deleted."""
     path = recording.path
-    deleted = set() if path is None else Sidecar.read(Path(path)).deleted
+    deleted = set() if path is None else Notes.read(Path(path)).about(recording.metadata).deleted
     numbers = recording.index["episode"].astype(np.int64)
     if filter is None:
         return np.flatnonzero(~np.isin(numbers, list(deleted)))

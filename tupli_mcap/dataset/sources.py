@@ -27,7 +27,7 @@ from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.storage import FileStorage, TupliStorage
 from tupli_mcap.storage.document import restored
-from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.sidecar import Notes
 from tupli_mcap.system import refused
 
 __all__ = ["DatasetError", "FilesSource", "Source", "StorageSource", "episode_headers"]
@@ -159,11 +159,11 @@ class FilesSource:
         files: dict[str, str] = {}  # episode id -> file
         found: list[EpisodeHeader] = []
         for name in self.names:
-            # first: what was deleted may be taken out of the file, and out of the note, meanwhile
-            deleted = set() if "://" in name else Sidecar.read(Path(name)).deleted
+            notes = None if "://" in name else Notes.read(Path(name))
             with Recording(name) as recording:
                 if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                     continue
+                deleted = set() if notes is None else notes.about(recording.metadata).deleted
                 headers = list(episode_headers(recording, name, deleted))
             if seen is not None:
                 seen[name] = recording

@@ -21,7 +21,7 @@ from tupli_mcap.recording.blocks import Array
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.listing import find_recordings
-from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.sidecar import Notes
 
 __all__ = ["Examinable", "Subject", "subjects_of"]
 
@@ -89,7 +89,8 @@ def _of_file(name: str, episode_filter: BaseFilter | None) -> Subject:
         if episode_filter is not None:
             headers = TupliDataset.from_files(name).with_episode_filter(episode_filter).preview()
             return _positions(recording, headers)
-        deleted = set() if recording.path is None else Sidecar.read(recording.path).deleted
+        path = recording.path
+        deleted = set() if path is None else Notes.read(path).about(recording.metadata).deleted
         return np.flatnonzero(~np.isin(recording.index["episode"], list(deleted)))
 
     return Subject(name, lambda: Recording(name, cache_bytes=_CACHE_BYTES), choose)

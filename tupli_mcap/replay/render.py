@@ -25,7 +25,7 @@ from tupli_mcap.replay.film import Film
 from tupli_mcap.replay.movie import check_movie, write_movie
 from tupli_mcap.replay.plan import EpisodePlan
 from tupli_mcap.replay.reapply import Replayer, brief
-from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.sidecar import Notes
 
 __all__ = ["RenderReport", "RenderedEpisode", "render"]
 
@@ -185,7 +185,7 @@ def _numbers(recording: Recording, episodes: Sequence[int | Episode] | None) -> 
 
 
 def _deleted(recording: Recording) -> set[int]:
-    return set() if recording.path is None else Sidecar.read(recording.path).deleted
+    return set() if recording.path is None else Notes.read(recording.path).about(recording.metadata).deleted
 
 
 def _write(recording: Recording, goal: Path, kind: str, film: Film, order: list[int], fps: float) -> None:

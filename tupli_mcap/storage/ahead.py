@@ -27,7 +27,7 @@ from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.storage.entries import catalog_rows
 from tupli_mcap.storage.rows import RecordingStamp, store_row
 from tupli_mcap.storage.scan import stamp_of
-from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.sidecar import Notes
 
 __all__ = ["Ahead", "ReadRecording"]
 
@@ -151,12 +151,13 @@ def _asked() -> Iterator[list[str]]:
 def _read_recording(root: Path, name: str) -> tuple[Any, ...] | None:
     """The fields of a ReadRecording, as plain tuples; None if it is too long."""
     path = root / name
-    stamp, sidecar, live = stamp_of(root, name), Sidecar.read(path, root), is_locked(path)
+    stamp, notes, live = stamp_of(root, name), Notes.read(path, root), is_locked(path)
     with Recording(path) as recording:
         live |= is_locked(path)  # a writer may have come or gone meanwhile
         numbers = recording.index["episode"]
         if len(numbers) > _MOST_EPISODES:
             return None
+        sidecar = notes.about(recording.metadata)
         rows = [tuple(store_row(0, row)) for row in catalog_rows(recording, sidecar, live=live)]
         ends = [int(numbers[i]) for i in (0, -1)] if len(numbers) else []
         facts = (live, recording.uuid, recording.benchmark_id, ends)

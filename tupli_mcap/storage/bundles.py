@@ -49,7 +49,7 @@ from tupli_mcap.storage.document import (
     unpack,
 )
 from tupli_mcap.storage.recordings import episode_id
-from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.sidecar import Notes
 from tupli_mcap.storage.tuples import anew
 
 if TYPE_CHECKING:
@@ -230,8 +230,9 @@ def from_recording(
         StorageError: Something is missing and no storage given, or the file exists or cannot be written.
     """
     _refuse_existing(target)
-    deleted = Sidecar.read(path).deleted  # first: they may be deleted for good meanwhile
+    notes = Notes.read(path)
     with Recording(path) as recording:
+        deleted = notes.about(recording.metadata).deleted
         attachments: Attachments = {}
         if recording.benchmark_id:
             record = recording.benchmark.record if DOCUMENT_NAME in recording.attachments else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -10,8 +11,9 @@ from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe import spread_of, state_of
 from tupli_mcap.recording.lock import is_locked
+from tupli_mcap.recording.recover import metadata_at
 from tupli_mcap.storage.scan import scan
-from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.sidecar import Notes
 from tupli_mcap.system import refused
 
 __all__ = ["Compactable", "ListedRecording", "compactable", "find_recordings", "list_recordings"]
@@ -77,21 +79,25 @@ def compactable(root: Path) -> list[Compactable]:
     """The recordings of a storage that `FileStorage.compact` would rewrite.
 
     Raises:
-        FormatError: what is noted beside a recording is damaged.
+        FormatError: a recording with deleted episodes is damaged, or what is noted beside it.
     """
     found = []
     for item in sorted(scan(root)):
         path = root / item.relative
-        deleted = Sidecar.read(path, root).deleted
-        if deleted and not is_locked(path):
-            found.append(Compactable(item.relative, len(deleted), item.stamp.size))
+        notes = Notes.read(path, root)
+        if notes.deleted and not is_locked(path):
+            with contextlib.suppress(RecordingError):  # gone meanwhile
+                deleted = notes.about(metadata_at(path)).deleted
+                if deleted:
+                    found.append(Compactable(item.relative, len(deleted), item.stamp.size))
     return found
 
 
 def _listed(path: Path, root: Path | None) -> ListedRecording:
     try:
-        deleted = list(Sidecar.read(path, root).deleted)
+        notes = Notes.read(path, root)
         with Recording(path) as recording:
+            deleted = notes.about(recording.metadata).deleted
             rows = recording.index
             if deleted:
                 rows = rows[[int(number) not in deleted for number in rows["episode"]]]

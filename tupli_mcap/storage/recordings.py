@@ -18,6 +18,7 @@ from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, Storag
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.recording.lock import is_locked, writers_kept_out
+from tupli_mcap.recording.recover import metadata_at
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.storage.ahead import Ahead, ReadRecording
 from tupli_mcap.storage.atomic import Lock, os_errors
@@ -32,7 +33,7 @@ from tupli_mcap.storage.common import LOCAL_USER, published_in
 from tupli_mcap.storage.entries import catalog_rows
 from tupli_mcap.storage.place import cache_dir, catalog_path
 from tupli_mcap.storage.scan import scan, stamp_of
-from tupli_mcap.storage.sidecar import Deletion, Sidecar, sidecar_path
+from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles", "episode_id"]
 
@@ -145,7 +146,11 @@ class RecordingFiles:
 
     def _holds(self, header: EpisodeHeader) -> bool:
         path = self._root / header.recording
-        return path.is_file() and header.episode not in Sidecar.read(path, self._root).deleted
+        notes = Notes.read(path, self._root)
+        with contextlib.suppress(RecordingError, FormatError):  # gone, or damaged
+            metadata = metadata_at(path)
+            return metadata["uuid"] == _uuid(header) and header.episode not in notes.about(metadata).deleted
+        return False
 
     # --- files ---
 
@@ -311,7 +316,7 @@ class RecordingFiles:
 
     def _put(self, relative: str, path: Path, stamp: RecordingStamp) -> int:
         """Catalogue a recording unless it is a copy; returns how many episodes it holds."""
-        sidecar = Sidecar.read(path, self._root)
+        notes = Notes.read(path, self._root)
         live = is_locked(path)
         with Recording(path) as recording:
             live |= is_locked(path)  # a writer may have come or gone meanwhile
@@ -322,7 +327,7 @@ class RecordingFiles:
                     stamp._replace(mixed=_LIVE) if live else stamp,
                     uuid=recording.uuid,
                     benchmark_id=recording.benchmark_id,
-                    rows=catalog_rows(recording, sidecar, live=live),
+                    rows=catalog_rows(recording, notes.about(recording.metadata), live=live),
                 )
             return len(recording)
 
@@ -358,7 +363,9 @@ class RecordingFiles:
     def publish(self, header: EpisodeHeader, group: str) -> None:
         with self._lock:
             path = self.path(header.recording)
-            sidecar = Sidecar.read(path, self._root)
+            sidecar = Notes.read(path, self._root).about(metadata_at(path))
+            if sidecar.uuid != _uuid(header):
+                raise NotFoundError(f"episode {header.id} was replaced by somebody else meanwhile")
             groups = sidecar.published_in.get(header.episode, [LOCAL_USER])
             sidecar.published_in[header.episode] = published_in(groups, group)
             sidecar.write(path)  # the next query notices
@@ -369,33 +376,45 @@ class RecordingFiles:
 
         Returns how many there still were.
         """
-        by_recording: dict[str, set[int]] = {}
+        by_recording: dict[tuple[str, str], set[int]] = {}
         for header in headers:
-            by_recording.setdefault(header.recording, set()).add(header.episode)
+            by_recording.setdefault((header.recording, _uuid(header)), set()).add(header.episode)
         with self._lock:
             self._finish_deletion()
-            there: dict[str, set[int]] = {}
-            for relative, numbers in by_recording.items():
+            doomed: dict[str, Sidecar] = {}
+            for (relative, uuid), numbers in by_recording.items():
                 with contextlib.suppress(NotFoundError):  # somebody else was first
-                    there[relative] = self._left(self.path(relative)) & numbers
-            doomed = {relative: numbers for relative, numbers in there.items() if numbers}
+                    there = self._left(self.path(relative), uuid) & numbers
+                    if there:
+                        doomed[relative] = Sidecar(uuid=uuid, deleted=there)
             if len(doomed) > 1:
-                Deletion(deleted=doomed).write(self._root)
+                Deletion(
+                    deleted={relative: note.deleted for relative, note in doomed.items()},
+                    uuids={relative: note.uuid for relative, note in doomed.items()},
+                ).write(self._root)
             self._do_deletion(doomed)
-        return sum(map(len, doomed.values()))
+        return sum(len(note.deleted) for note in doomed.values())
 
     def _finish_deletion(self) -> None:
         """Do what is left of a deletion that was broken off; only recordings that are listed are touched."""
-        deleted = Deletion.read(self._root).deleted
-        if deleted:
+        deletion = Deletion.read(self._root)
+        if deletion.deleted:
             listed = {item.relative for item in scan(self._root)}
-            self._do_deletion({relative: deleted[relative] for relative in deleted.keys() & listed})
+            self._do_deletion(
+                {relative: deletion.of(relative) for relative in deletion.deleted.keys() & listed}
+            )
 
-    def _do_deletion(self, deleted: Mapping[str, set[int]]) -> None:
-        for relative, numbers in deleted.items():
+    def _do_deletion(self, deleted: Mapping[str, Sidecar]) -> None:
+        for relative, note in deleted.items():
             path = self._root / relative
-            sidecar = Sidecar.read(path, self._root)
-            sidecar.deleted |= numbers
+            try:
+                metadata = metadata_at(path)
+            except FormatError:  # no more is known of it; a repair may need its note
+                metadata = {"uuid": note.uuid}
+            if not note.is_about(metadata):  # replaced since
+                continue
+            sidecar = Notes.read(path, self._root).about(metadata)
+            sidecar.deleted |= note.deleted
             # first the note: a crash, or a writer that goes on with the file, must not bring anything back
             sidecar.write(path)  # the next query notices
             with contextlib.suppress(FormatError, RecordingError):  # damaged: its note is enough
@@ -403,10 +422,13 @@ class RecordingFiles:
                     self._remove(path)
         Deletion().write(self._root)
 
-    def _left(self, path: Path) -> set[int]:
-        """The numbers of the episodes of a recording that are not deleted."""
-        deleted = Sidecar.read(path, self._root).deleted  # first: they may be taken out of both meanwhile
+    def _left(self, path: Path, uuid: str | None = None) -> set[int]:
+        """The numbers of the episodes of a recording that are not deleted; none of another one than that of `uuid`."""
+        notes = Notes.read(path, self._root)
         with Recording(path) as recording:
+            if uuid not in (None, recording.uuid):
+                return set()
+            deleted = notes.about(recording.metadata).deleted
             return {int(number) for number in recording.index["episode"]} - deleted
 
     def _remove(self, path: Path) -> None:
@@ -458,7 +480,7 @@ class RecordingFiles:
         for item in sorted(scan(self._root)):
             path = self._root / item.relative
             with self._lock:
-                if not path.exists() or not Sidecar.read(path, self._root).deleted:
+                if not path.exists() or not Notes.read(path, self._root).deleted:
                     continue
                 try:
                     with writers_kept_out(path):  # nobody appends meanwhile
@@ -471,14 +493,17 @@ class RecordingFiles:
         return freed
 
     def _compact(self, path: Path) -> int:
-        sidecar = Sidecar.read(path, self._root)
+        notes = Notes.read(path, self._root)
         before = path.stat().st_size
         with os_errors("cannot rewrite the recording", path), Recording(path) as recording:
-            kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
-            rewrite_recording(recording, path, episodes=kept)
-            journal_path(path).unlink(missing_ok=True)
-        groups = {number: sidecar.published_in[number] for number in kept if number in sidecar.published_in}
-        Sidecar(published_in=groups).write(path)
+            sidecar = notes.about(recording.metadata)
+            if sidecar.deleted:
+                kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
+                rewrite_recording(recording, path, episodes=kept)
+                journal_path(path).unlink(missing_ok=True)
+                groups = {n: sidecar.published_in[n] for n in kept if n in sidecar.published_in}
+                sidecar = Sidecar(uuid=recording.uuid, published_in=groups)
+        sidecar.write(path)
         return before - path.stat().st_size
 
 
@@ -501,3 +526,8 @@ def _is_exhausted(err: BaseException | None) -> bool:
 def episode_id(uuid: str, episode: int) -> str:
     """The id of an episode: its recording's UUID and its number."""
     return f"{uuid}-{episode}"
+
+
+def _uuid(header: EpisodeHeader) -> str:
+    """The UUID of an episode's recording."""
+    return header.id.rpartition("-")[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,7 +30,7 @@ def scan(root: Path) -> Iterator[FoundRecording]:
         FormatError: What is noted there about a deletion is damaged.
     """
     pending = [(os.fspath(root), "")]
-    deleting: dict[str, set[int]] = {}
+    deleting = Deletion()
     while pending:
         directory, prefix = pending.pop()
         try:
@@ -39,13 +39,13 @@ def scan(root: Path) -> Iterator[FoundRecording]:
         except FileNotFoundError:
             continue  # deleted since it was listed
         if not prefix and DELETING in found:
-            deleting = Deletion.read(root).deleted
+            deleting = Deletion.read(root)
         for name, entry in found.items():
             if name.endswith(".mcap"):
                 try:
                     if entry.is_file():
                         journal = journal_name(name) in found
-                        stamp = _stamp(entry, found, deleting.get(prefix + name, set()))
+                        stamp = _stamp(entry, found, deleting.stamp(prefix + name))
                         yield FoundRecording(prefix + name, stamp, journal)
                 except OSError as err:
                     if err.errno not in (errno.ENOENT, errno.ELOOP):  # deleted since, or a link in a circle
@@ -56,7 +56,7 @@ def scan(root: Path) -> Iterator[FoundRecording]:
 
 def stamp_of(root: Path, relative: str) -> RecordingStamp:
     """The stamp of one recording below a directory; FileNotFoundError if it is gone."""
-    deleting = Deletion.read(root).deleted.get(relative, set())
+    deleting = Deletion.read(root).stamp(relative)
     path = root / relative
     status = path.stat()
     try:
@@ -65,16 +65,18 @@ def stamp_of(root: Path, relative: str) -> RecordingStamp:
         return _mix(status, None, deleting)
 
 
-def _stamp(entry: os.DirEntry[str], found: dict[str, os.DirEntry[str]], deleting: set[int]) -> RecordingStamp:
+def _stamp(
+    entry: os.DirEntry[str], found: dict[str, os.DirEntry[str]], deleting: Sequence[int]
+) -> RecordingStamp:
     beside = found.get(f"{entry.name}.json")
     # Not `beside.stat()`: what scandir knows of a file may be older than its name.
     return _mix(os.stat(entry.path), None if beside is None else os.stat(beside.path), deleting)  # noqa: PTH116
 
 
-def _mix(status: os.stat_result, beside: os.stat_result | None, deleting: set[int]) -> RecordingStamp:
+def _mix(status: os.stat_result, beside: os.stat_result | None, deleting: Sequence[int]) -> RecordingStamp:
     # A clock ticks every few ms only, and archives set the times of their files: neither inodes nor times of change
     # repeat where a file is replaced.
     facts = [
         (found.st_ino, found.st_ctime_ns, found.st_size) for found in (status, beside) if found is not None
     ]
-    return RecordingStamp(status.st_size, status.st_mtime_ns, hash((*facts, *sorted(deleting))) & (2**63 - 1))
+    return RecordingStamp(status.st_size, status.st_mtime_ns, hash((*facts, *deleting)) & (2**63 - 1))

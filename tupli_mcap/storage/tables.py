@@ -9,7 +9,7 @@ from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.types import UserDefinedType
 
 APPLICATION_ID: Final = 0x7475_706C  # "tupl": how SQLite tells whose file this is
-VERSION: Final = 2
+VERSION: Final = 3
 
 EPISODE_BITS: Final = 32
 """An episode's row id is its recording's id shifted left by this, plus its number: rows lie in file order."""

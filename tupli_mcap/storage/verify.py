@@ -24,7 +24,7 @@ from tupli_mcap.storage.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.common import is_hash
 from tupli_mcap.storage.files import FileStorage
 from tupli_mcap.storage.scan import scan
-from tupli_mcap.storage.sidecar import DELETING, Sidecar, sidecar_path
+from tupli_mcap.storage.sidecar import DELETING, Notes, sidecar_path
 
 __all__ = ["StorageReport", "verify_paths", "verify_storage"]
 
@@ -112,18 +112,24 @@ def _recording(path: Path) -> VerifyReport:
 
 
 def _sidecar(path: Path, findings: Findings) -> None:
-    """What is noted beside a recording is about episodes it has."""
+    """What is noted beside a recording is about it, and about episodes it has."""
     try:
-        sidecar = Sidecar.read(path)
+        notes = Notes.read(path)
     except TupliError as err:
         findings.error(
             "sidecar", str(err), advice=f"delete {sidecar_path(path).name}: deletions are then undone"
         )
         return
-    if not (sidecar.deleted or sidecar.published_in):
+    if all(said.is_empty() for said in notes):
         return
     with Recording(path) as recording:
         numbers = {int(number) for number in recording.index["episode"]}
+        sidecar, is_left = notes.about(recording.metadata), not notes.beside.is_about(recording.metadata)
+    if is_left and not notes.beside.is_empty():
+        what = f"{sidecar_path(path).name} is about another recording, whose place this one has taken"
+        findings.note(
+            "leftover", what, "nothing to be done: it does not count; the next note takes its place"
+        )
     strange = sorted((sidecar.deleted | sidecar.published_in.keys()) - numbers)
     if strange:
         what = f"{sidecar_path(path).name} notes episodes that are not in the recording: {strange[:10]}"
