@@ -365,6 +365,21 @@ def test_episodes_are_chosen_by_positions_or_a_mask(path: Path) -> None:
     assert np.array_equal(recording.read(fields="states").states, recording.read().states)
 
 
+def test_starts_of_several_episodes(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(Sampler(gym.spaces.Discrete(3), gym.spaces.Discrete(3), 4), path) as env:
+        for seed in range(5):
+            env.reset(seed=seed)
+            env.step(0)
+    with Recording(path) as recording:
+        assert [start.seed for start in recording.episode_starts([3, 0, 1])] == ["3", "0", "1"]
+        assert recording.episode_starts([4]) == [recording.episode_start(4)]
+        assert recording.episode_starts(np.array([True, False, False, True, False]))[1].episode == 3
+        assert recording.episode_starts([]) == []
+        with pytest.raises(RecordingError, match="expected episodes from 0 to 4"):
+            recording.episode_starts([5])
+
+
 @pytest.mark.parametrize(
     "space",
     [

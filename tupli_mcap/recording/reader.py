@@ -321,6 +321,22 @@ class Recording:
             )
         return start
 
+    def episode_starts(self, episodes: Sequence[int] | np.ndarray[Any, Any]) -> list[EpisodeStart]:
+        """The `/episode_start` messages of some episodes (positions or a mask), read together."""
+        rows = self.index[self._positions(episodes)]
+        if not len(rows):
+            return []
+        at = rows["start_row"].astype(np.int64)
+        first = int(at.min())
+        bodies = list(self._store.bodies(self._channel("/episode_start"), first, int(at.max()) + 1 - first))
+        starts = [EpisodeStart.decode(bodies[i]) for i in (at - first).tolist()]
+        for start, episode in zip(starts, rows["episode"].tolist(), strict=True):
+            if start.episode != episode:
+                raise FormatError(
+                    f"{self.name}: expected the start of episode {episode}, found {start.episode}"
+                )
+        return starts
+
     def resets_before(self, i: int) -> list[EpisodeStart]:
         """The resets just before that of episode `i` that no step followed, the earliest first.
 
