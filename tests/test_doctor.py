@@ -30,7 +30,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli import app
 from tupli_mcap.doctor import CHECKS, Diagnosis, Finding, Place, Severity, examine
-from tupli_mcap.doctor.gather.bounded import Extremes, Sample
+from tupli_mcap.doctor.steps import Largest, Sample
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
@@ -108,22 +108,22 @@ def places(finding: Finding) -> list[tuple[int, int | None]]:
 @pytest.mark.parametrize(
     ("env_id", "steps", "expected"),
     [
-        ("CartPole-v1", 3000, {"constant-reward"}),
+        ("CartPole-v1", 3000, set()),
         ("Pendulum-v1", 1000, {"missing-terminals"}),
-        ("MountainCar-v0", 1000, {"missing-terminals", "constant-reward"}),
+        ("MountainCar-v0", 1000, {"missing-terminals"}),
         ("MountainCarContinuous-v0", 1998, {"missing-terminals"}),
-        ("Acrobot-v1", 1200, {"missing-terminals", "constant-reward"}),
-        ("FrozenLake-v1", 3000, {"duplicate-episodes"}),
+        ("Acrobot-v1", 1200, {"missing-terminals"}),
+        ("FrozenLake-v1", 3000, set()),
         ("CliffWalking-v1", 2000, set()),
         ("Taxi-v4", 2000, {"missing-terminals"}),
-        ("Blackjack-v1", 1000, {"duplicate-episodes", "one-step-episodes"}),
+        ("Blackjack-v1", 1000, set()),
     ],
 )
 def test_healthy_environments(tmp_path: Path, env_id: str, steps: int, expected: set[str]) -> None:
     record_rollouts(env_id, tmp_path / "a.mcap", steps=steps, seed=1)
     diagnosis = examine(tmp_path / "a.mcap")
     assert diagnosis.at_least(WARNING) == ()
-    usual = {"interrupted", "clock-jump"}  # where the rollout happens to end, and how busy the machine is
+    usual = {"clock-jump"}  # how busy the machine is
     assert {finding.check for finding in diagnosis.findings} - usual == expected
     assert (diagnosis.files, diagnosis.steps) == (1, steps)
     assert diagnosis.healthy
@@ -214,6 +214,7 @@ def test_not_finite_in_values_of_variable_size(tmp_path: Path) -> None:
         (spaces.Box(0, 9, (2,), np.int32), np.int32([3, -1]), np.int32([0, 9]), WARNING),
         (spaces.Box(0, 99, (2, 2, 3), np.uint8), FRAME + 1, FRAME, WARNING),
         (spaces.Discrete(4, start=-1), np.int64(3), np.int64(2), ERROR),
+        (spaces.Discrete(5, start=2**62), np.int64(2**62 + 5), np.int64(2**62 + 4), ERROR),
         (spaces.MultiDiscrete([2, 3]), np.array([1, 3]), np.array([1, 2]), ERROR),
         (spaces.MultiBinary(2), np.int8([2, 0]), np.int8([1, 0]), ERROR),
         (spaces.Text(3, charset="ab"), "abc", "ab", ERROR),
@@ -243,10 +244,9 @@ def test_choices_beyond_all_integers(tmp_path: Path) -> None:
     assert {finding.check for finding in examine(path).findings} == {"duplicate-episodes"}
 
 
-def test_rounding_errors_at_a_bound_are_no_warning(tmp_path: Path) -> None:
+def test_rounding_errors_at_a_bound_are_no_finding(tmp_path: Path) -> None:
     almost = np.nextafter(np.float32([1, 1, 1]), np.float32(2))
-    finding = found(examine(scripted(tmp_path / "a.mcap", lambda n: almost)), "outside-space")
-    assert (finding.severity, finding.count) == (INFO, 99)
+    assert examine(scripted(tmp_path / "a.mcap", lambda n: almost)).of("outside-space") == ()
     over = np.float32([1, 1, 1.0001])
     finding = found(examine(scripted(tmp_path / "b.mcap", lambda n: over)), "outside-space")
     assert (finding.severity, finding.count, finding.dimensions) == (WARNING, 33, ((2,),))
@@ -261,15 +261,6 @@ def test_actions_outside_of_their_box(tmp_path: Path) -> None:
     finding = found(examine(path), "outside-space")
     assert (finding.severity, finding.leaf, finding.count) == (WARNING, "action", 3)
     assert "clip" in finding.suggestion and "reach from -1 to 1.25" in finding.message
-
-
-def test_wider_dtypes_than_declared(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match="recorded as float64"):
-        path = scripted(tmp_path / "a.mcap", lambda n: np.array([0.1, 0.2, 0.3]) * np.cos(n))
-    finding = found(examine(path), "stored-dtype")
-    assert (finding.severity, finding.leaf) == (INFO, "state")
-    assert finding.message == "the environment returned float64, its space declares float32"
-    assert examine(scripted(tmp_path / "b.mcap")).of("stored-dtype") == ()
 
 
 # --- what varies ---
@@ -290,13 +281,13 @@ def test_constant_dimensions(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("space", "value", "message"),
     [
-        (spaces.Discrete(4), 2, "it is always 2 in 110 values"),
+        (spaces.Discrete(4), 2, "all 110 values are the same"),
         (
             spaces.Box(0, 255, (4, 4, 3), np.uint8),
             np.ones((4, 4, 3), np.uint8),
             "all 110 frames are the same",
         ),
-        (spaces.Box(-1, 1, (2,)), np.float32([0, 1]), "it never changes in 110 values"),
+        (spaces.Box(-1, 1, (2,)), np.float32([0, 1]), "all 110 values are the same"),
         (spaces.Text(3), "abc", "all 110 values are the same"),
     ],
 )
@@ -348,14 +339,6 @@ def test_frozen_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_by
     assert examine(path, thresholds={"frozen-frames": {"frames": 31}}).of("frozen-frames") == ()
 
 
-def test_states_of_very_different_scale(tmp_path: Path) -> None:
-    space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
-    path = scripted(tmp_path / "a.mcap", lambda n: np.array([n, 1e6 * n, 0.01 * n]), space)
-    finding = found(examine(path), "state-scale")
-    assert (finding.severity, finding.dimensions) == (INFO, ((1,), (2,)))
-    assert "varies 1e+08 times as much" in finding.message
-
-
 # --- episodes ---
 
 
@@ -365,101 +348,25 @@ def test_one_step_episodes_stand_out(tmp_path: Path) -> None:
     assert (finding.severity, finding.count, finding.total) == (WARNING, 2, 20)
     assert places(finding) == [(2, None), (5, None)]
     short = by_hand(tmp_path / "b.mcap", [{"length": 1 + i % 3} for i in range(20)])
-    assert found(examine(short), "one-step-episodes").severity is INFO
+    assert examine(short).of("one-step-episodes") == ()
 
 
 def test_one_step_at_the_end_of_a_recording_is_no_episode_of_one_step(tmp_path: Path) -> None:
     path = by_hand(tmp_path / "a.mcap", [{"length": 12}, {"length": 1, "terminals": [False]}])
     assert examine(path).of("one-step-episodes") == ()
-    assert found(examine(path), "interrupted").severity is INFO
 
 
 def test_episodes_without_any_end(tmp_path: Path) -> None:
     never = {"terminals": [False] * 4}
-    diagnosis = examine(by_hand(tmp_path / "a.mcap", [never] * 5))
-    finding = found(diagnosis, "missing-terminals")
+    finding = found(examine(by_hand(tmp_path / "a.mcap", [never] * 5)), "missing-terminals")
     assert (finding.severity, finding.count) == (WARNING, 5)
     assert finding.message == "none of 5 episodes ends in a terminal state: all are interrupted"
-    cut = found(diagnosis, "interrupted")
-    assert (cut.severity, cut.count, places(cut)) == (
-        WARNING,
-        5,
-        [(0, None), (1, None), (2, None), (3, None)],
-    )
+    assert places(finding) == [(0, None), (1, None), (2, None), (3, None), (4, None)]
     timeouts = {**never, "timeouts": [False, False, False, True]}
     finding = found(examine(by_hand(tmp_path / "b.mcap", [timeouts] * 5)), "missing-terminals")
     assert (finding.severity, finding.message[-12:]) == (INFO, "5 by timeout")
     assert examine(by_hand(tmp_path / "c.mcap", [{}, timeouts])).of("missing-terminals") == ()
-
-
-def test_some_interrupted_episodes(tmp_path: Path) -> None:
-    cut = {"terminals": [False] * 4}
-    finding = found(examine(by_hand(tmp_path / "a.mcap", [{}, cut, cut, {}, {}, {}])), "interrupted")
-    assert (finding.severity, finding.count, places(finding)) == (WARNING, 2, [(1, None), (2, None)])
-    few = found(examine(by_hand(tmp_path / "b.mcap", [cut] + [{}] * 9)), "interrupted")
-    assert (few.severity, few.message) == (INFO, "1 of 10 episodes is interrupted")
-
-
-class Limited(gym.Wrapper[Any, Any, Any, Any]):
-    """Tells a time limit as a terminal state, as environments of the old API did."""
-
-    def step(self, action: Any) -> Any:
-        state, reward, terminal, timeout, info = self.env.step(action)
-        return state, reward, terminal or timeout, False, info
-
-
-def test_a_time_limit_recorded_as_terminal(tmp_path: Path) -> None:
-    gym.register("DoctorLimited-v0", "gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=30)
-    try:
-        with RecordEpisodes(gym.make("DoctorLimited-v0"), tmp_path / "good.mcap") as env:
-            roll(env, 150)
-        good = examine(tmp_path / "good.mcap")
-        # What the spec says, with steps that end otherwise.
-        attachments = {}
-        with Recording(tmp_path / "good.mcap") as recording:
-            attachments["benchmark.json"] = ("application/json", recording.read_attachment("benchmark.json"))
-    finally:
-        del gym.registry["DoctorLimited-v0"]
-    assert good.of("time-limit-as-terminal") == ()
-    with Recording(tmp_path / "good.mcap") as recording:
-        episodes = [
-            EpisodeData(e.states, e.actions, e.rewards, e.timeouts, e.terminals, final_state=e.final_state)
-            for e in recording.episodes
-        ]
-        write_recording(
-            tmp_path / "bad.mcap",
-            episodes,
-            observation_space=recording.observation_space,
-            action_space=recording.action_space,
-            attachments=attachments,
-        )
-    finding = found(examine(tmp_path / "bad.mcap"), "time-limit-as-terminal")
-    assert (finding.severity, finding.count, finding.total) == (WARNING, 5, 5)
-    assert "exactly 30 steps, the environment's time limit" in finding.message
-
-
-def test_a_fixed_length_without_a_known_limit_is_worth_knowing(tmp_path: Path) -> None:
-    path = record(tmp_path / "a.mcap", Limited(Sampler(UNIT, spaces.Discrete(3), 60)), 360)
-    assert found(examine(path), "time-limit-as-terminal").severity is INFO
-    path = record(tmp_path / "b.mcap", Limited(Sampler(UNIT, spaces.Discrete(3), 10)), 60)
-    assert examine(path).of("time-limit-as-terminal") == ()
-
-
-def test_flags_before_the_last_step(tmp_path: Path) -> None:
-    flags = [False, True, False, True]
-    path = by_hand(tmp_path / "a.mcap", [{}, {"terminals": flags}, {"timeouts": [True, False, False, False]}])
-    finding = found(examine(path), "flags-inside")
-    assert (finding.severity, finding.count, places(finding)) == (ERROR, 2, [(1, 1), (2, 0)])
-    assert examine(by_hand(tmp_path / "b.mcap", [{}, {}])).of("flags-inside") == ()
-
-
-def test_missing_final_states(tmp_path: Path) -> None:
-    timeout = {"terminals": [False] * 4, "timeouts": [False, False, False, True]}
-    path = by_hand(tmp_path / "a.mcap", [{}, {"final_state": None}, {**timeout, "final_state": None}])
-    finding = found(examine(path), "missing-final-state")
-    assert (finding.severity, finding.count, places(finding)) == (WARNING, 2, [(2, None)])
-    path = by_hand(tmp_path / "b.mcap", [{"final_state": None}, timeout])
-    assert found(examine(path), "missing-final-state").severity is INFO
+    assert examine(by_hand(tmp_path / "d.mcap", [never])).of("missing-terminals") == ()
 
 
 class EarlyReset(gym.Wrapper[Any, Any, Any, Any]):
@@ -492,6 +399,11 @@ def test_final_states_of_the_next_episode(
     assert examine(good).of("final-state-is-reset") == ()
 
 
+def test_final_states_of_episodes_that_all_start_alike_may_be_chance(tmp_path: Path) -> None:
+    path = scripted(tmp_path / "a.mcap", lambda n: still(n % 10), episodes=5)
+    assert examine(path).of("final-state-is-reset") == ()
+
+
 def test_stepping_on_without_a_reset(tmp_path: Path) -> None:
     with RecordEpisodes(Scripted(still, UNIT, length=4), tmp_path / "a.mcap") as env:
         for _ in range(3):
@@ -502,13 +414,6 @@ def test_stepping_on_without_a_reset(tmp_path: Path) -> None:
     assert (finding.severity, finding.count, finding.total) == (WARNING, 3, 6)
     assert places(finding) == [(1, None), (3, None), (5, None)]
     assert examine(scripted(tmp_path / "b.mcap")).of("missing-reset") == ()
-
-
-def test_episodes_of_unusual_length(tmp_path: Path) -> None:
-    path = by_hand(tmp_path / "a.mcap", [{"length": 1500 if i == 4 else 12} for i in range(20)])
-    finding = found(examine(path), "episode-length")
-    assert (finding.severity, finding.count, places(finding)) == (INFO, 1, [(4, None)])
-    assert finding.message.endswith("longer than 100 times the median of 12 steps; the longest has 1,500")
 
 
 # --- copies ---
@@ -532,24 +437,31 @@ def test_duplicate_episodes_across_recordings(tmp_path: Path) -> None:
     ("space", "observe", "by_chance"),
     [
         (spaces.Discrete(4), lambda n: n % 4, True),
-        (spaces.Text(1), lambda n: "abcd"[n % 4], True),
         (spaces.Box(0, 9, (2,), np.int64), lambda n: np.array([n % 4, 0]), True),
-        (spaces.Sequence(spaces.Discrete(4)), lambda n: (n % 4,), True),
         (UNIT, still, False),
         (spaces.Tuple((spaces.Discrete(4), UNIT)), lambda n: (n % 4, still(n)), False),
+        (spaces.Text(1), lambda n: "abcd"[n % 4], False),
         (spaces.Sequence(UNIT), lambda n: (still(n),), False),
-        (spaces.OneOf((spaces.Discrete(4), UNIT)), lambda n: (0, n % 4), False),
     ],
-    ids=["discrete", "text", "integers", "sequence", "floats", "tuple", "sequence of floats", "oneof"],
+    ids=["discrete", "integers", "floats", "tuple", "text", "sequence of floats"],
 )
-def test_duplicates_by_chance_are_no_warning(
+def test_duplicates_by_chance_are_no_finding(
     tmp_path: Path, space: gym.Space[Any], observe: Observe, by_chance: bool
 ) -> None:
-    for length, severity in ((5, INFO if by_chance else WARNING), (60, WARNING)):
+    for length in (5, 60):
         path = scripted(tmp_path / f"{length}.mcap", observe, space, length=length)
+        if length == 5 and by_chance:
+            assert examine(path).of("duplicate-episodes") == ()
+            continue
         finding = found(examine(path), "duplicate-episodes")
-        assert (finding.severity, finding.count, finding.total) == (severity, 2, 3)
+        assert (finding.severity, finding.count, finding.total) == (WARNING, 2, 3)
         assert places(finding) == [(0, None), (1, None), (2, None)]
+
+
+def test_episodes_that_differ_in_a_text_are_no_duplicates(tmp_path: Path) -> None:
+    texts = iter(range(1000))
+    path = scripted(tmp_path / "a.mcap", lambda n: str(next(texts)), spaces.Text(4))
+    assert examine(path).of("duplicate-episodes") == ()
 
 
 @pytest.mark.parametrize("block_bytes", [1, 500, 20_000])
@@ -604,14 +516,6 @@ def test_repeated_seeds(tmp_path: Path) -> None:
 # --- rewards ---
 
 
-def test_constant_rewards(tmp_path: Path) -> None:
-    path = scripted(tmp_path / "a.mcap", reward=lambda n: 0.0, episodes=10)
-    finding = found(examine(path), "constant-reward")
-    assert (finding.severity, finding.message) == (INFO, "all 100 rewards are 0")
-    strict = examine(path, thresholds={"constant-reward": {"zero_steps": 100}})
-    assert found(strict, "constant-reward").severity is WARNING
-
-
 def test_reward_outliers(tmp_path: Path) -> None:
     rewards = [[1.0] * 10 for _ in range(10)]
     rewards[3][4], rewards[7][0] = 1e6, -1e5
@@ -627,13 +531,6 @@ def test_a_bonus_at_the_end_is_no_outlier(tmp_path: Path, bonus: float) -> None:
     rng = np.random.default_rng(0)
     episodes = [{"length": 10, "rewards": [*rng.normal(size=9), bonus if i % 7 else 0.0]} for i in range(30)]
     assert examine(by_hand(tmp_path / "a.mcap", episodes)).of("reward-outliers") == ()
-
-
-def test_return_outliers(tmp_path: Path) -> None:
-    totals = [*range(30), 10_000]
-    path = by_hand(tmp_path / "a.mcap", [{"rewards": [0.0, 0.0, 0.0, float(r)]} for r in totals])
-    finding = found(examine(path), "return-outliers")
-    assert (finding.severity, finding.count, places(finding)) == (INFO, 1, [(30, None)])
 
 
 # --- actions ---
@@ -659,46 +556,24 @@ def test_actions_that_never_occur(
     assert examine(few).of("unused-action") == ()
 
 
-def test_one_action_nearly_always(tmp_path: Path) -> None:
-    act = [1] * 999 + [0]
-    path = scripted(tmp_path / "a.mcap", act=lambda n: act[n], actions=spaces.Discrete(2), length=1000)
-    finding = found(examine(path), "action-imbalance")
-    assert (finding.severity, finding.count, finding.total) == (INFO, 2997, 3000)
-    assert finding.message == "the action is 1 in 99.9% of 3,000 steps"
-
-
-def test_continuous_actions_at_bounds_and_in_a_corner(tmp_path: Path) -> None:
-    def act(n: int) -> Any:
-        return np.float32([1 if n else 0, 1 if n % 2 else -1, 0.01 * np.sin(n), np.sin(n)])
-
-    space = spaces.Box(-1, 1, (4,), np.float32)
-    diagnosis = examine(scripted(tmp_path / "a.mcap", act=act, actions=space, length=100))
-    finding = found(diagnosis, "saturated-action")
-    assert (finding.severity, finding.dimensions) == (WARNING, ((0,), (1,)))
-    assert finding.count == 3 * 99 + 3 * 100
-    finding = found(diagnosis, "action-range")
-    assert (finding.severity, finding.dimensions) == (INFO, ((2,),))
-    assert "use 1% of their range" in finding.message
-
-
 @pytest.mark.parametrize("pieces", [1, 7, 100, 5000])
-def test_samples_are_every_nth_value(pieces: int) -> None:
-    sample = Sample(capacity=50)
-    values = np.arange(5000)
+@pytest.mark.parametrize("total", [100, 200_000])
+def test_samples_are_every_nth_value(pieces: int, total: int) -> None:
+    sample = Sample(total)
+    values = np.arange(total)
     for piece in np.array_split(values, pieces):
         sample.put(piece)
-    stride = int(np.diff(sample.values)[0])
-    assert sample.seen == 5000 and 25 <= len(sample.values) <= 51
-    assert np.array_equal(sample.values, values[::stride])
+    assert sample.seen == total
+    assert np.array_equal(sample.values, values[:: 4 if total > 100 else 1])
 
 
-def test_extremes_are_the_largest_with_their_places() -> None:
+def test_the_largest_values_with_their_places() -> None:
     values = np.random.default_rng(0).integers(0, 300, 5000).astype(float)
-    extremes = Extremes(k=10)
+    largest = Largest(k=10)
     for start in range(0, 5000, 123):
-        extremes.put(values[start : start + 123], lambda i, start=start: (0, start + i))
+        largest.put(values[start : start + 123], lambda i, start=start: (0, start + i))
     order = np.lexsort((np.arange(5000), -values))[:10]
-    assert extremes.largest == [(values[i], (0, int(i))) for i in order]
+    assert largest.values == [(values[i], (0, int(i))) for i in order]
 
 
 # --- clocks ---
@@ -743,30 +618,6 @@ def test_clocks_of_sub_environments(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (finding.count, finding.total, places(finding)) == (3, 21, [(0, 5), (1, 5), (2, 5)])
 
 
-def test_a_clock_that_was_set_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = Clock(monkeypatch)
-    calls = iter(range(1000))
-
-    def observe(n: int) -> Any:
-        clock.now += 10**6 - (12 * 10**6 if next(calls) == 25 else 0)
-        return still(n)
-
-    diagnosis = examine(scripted(tmp_path / "a.mcap", observe, length=60))
-    finding = found(diagnosis, "clock-held")
-    assert (finding.severity, finding.count, places(finding)) == (WARNING, 12, [(0, 24)])
-    assert finding.message.startswith("13 steps in a row have the same time")
-    assert diagnosis.of("clock-jump") == ()
-
-
-def test_times_that_were_never_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = Clock(monkeypatch)
-    clock.now = 10**9
-    diagnosis = examine(scripted(tmp_path / "a.mcap", length=12))
-    assert found(diagnosis, "clock-held").severity is INFO
-    finding = found(diagnosis, "clock-unset")
-    assert (finding.severity, finding.count) == (WARNING, 3)
-
-
 # --- files ---
 
 
@@ -782,7 +633,6 @@ def test_empty_unfinished_and_unreadable_files(tmp_path: Path) -> None:
     (tmp_path / "zdamaged.mcap").write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
     diagnosis = examine(tmp_path)
     assert diagnosis.files == 4
-    assert found(diagnosis, "no-episodes").path == str(tmp_path / "empty.mcap")
     bad = diagnosis.of("unreadable")
     assert [Path(finding.path).name for finding in bad] == ["text.mcap", "zdamaged.mcap"]
     assert all(finding.severity is ERROR for finding in bad)
@@ -792,12 +642,6 @@ def test_empty_unfinished_and_unreadable_files(tmp_path: Path) -> None:
         env.step(0)
         assert found(examine(tmp_path / "live.mcap"), "unfinished").message == "a writer is at work on it"
     assert examine(tmp_path / "live.mcap").of("unfinished") == ()
-
-
-def test_nan_in_metadata(tmp_path: Path) -> None:
-    path = by_hand(tmp_path / "a.mcap", [{}, {"metadata": {"score": np.nan}}, {"metadata": {"score": 1.0}}])
-    finding = found(examine(path), "metadata-nan")
-    assert (finding.severity, finding.count, places(finding)) == (WARNING, 1, [(1, None)])
 
 
 # --- what can be examined ---
@@ -864,7 +708,7 @@ def test_what_cannot_be_examined(tmp_path: Path) -> None:
     assert "holds no recording" in found(examine(tmp_path), "unreadable").message
     with pytest.raises(RecordingError, match="expected a path, Recording, TupliDataset or storage, found 3"):
         examine(3)  # type: ignore[arg-type]
-    with pytest.raises(RecordingError, match="there is no check 'nam'; there are no-episodes, "):
+    with pytest.raises(RecordingError, match="there is no check 'nam'; there are unfinished, nan, "):
         examine(tmp_path, checks=["nam"])
     with pytest.raises(RecordingError, match="'nan' has no threshold 'least'; it has none"):
         examine(tmp_path, thresholds={"nan": {"least": 3}})

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
-from functools import partial
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from tupli_mcap.dataset.subjects import Examinable, Subject, subjects_of
-from tupli_mcap.doctor.chart import Chart
 from tupli_mcap.doctor.checks import CHECKS, Check
-from tupli_mcap.doctor.checks.repeats import Contents
 from tupli_mcap.doctor.findings import Diagnosis, Finding, Severity
+from tupli_mcap.doctor.measurements import Measurements, Statistic
 from tupli_mcap.errors import FilterError, RecordingError, TupliError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys
 
@@ -46,10 +44,13 @@ def examine(
         RecordingError: the source is nothing that can be examined, or there is no such check or threshold.
         FilterError: the filter names an unknown field.
     """
-    chosen = _chosen(checks, skip, thresholds or {})
+    _check_names([*_list(checks or ()), *_list(skip)], thresholds or {})
     if episode_filter is not None:
         check_keys(episode_filter, EpisodeHeader)
-    examination = _Examination(chosen)
+    chosen = [
+        check for name, check in CHECKS.items() if (checks is None or name in checks) and name not in skip
+    ]
+    examination = _Examination(chosen, thresholds or {})
     for subject in subjects_of(source, episode_filter):
         if progress is not None:
             progress(subject.name)
@@ -57,35 +58,32 @@ def examine(
     return examination.diagnosis()
 
 
-Bound = tuple[Check, Callable[..., Iterable[Finding]]]
+def _list(checks: Collection[str]) -> Collection[str]:
+    if isinstance(checks, str):
+        raise RecordingError(f"expected a list of the ids of checks, found the text {checks!r:.80}")
+    return checks
 
 
-def _chosen(
-    checks: Collection[str] | None, skip: Collection[str], thresholds: Mapping[str, Mapping[str, Any]]
-) -> list[Bound]:
-    """The checks to run, with their thresholds."""
-    if isinstance(checks, str) or isinstance(skip, str):
-        raise RecordingError("expected a list of the ids of checks, found a text")
-    for name in [*(checks or ()), *skip, *thresholds]:
+def _check_names(checks: Iterable[str], thresholds: Mapping[str, Mapping[str, Any]]) -> None:
+    for name in [*checks, *thresholds]:
         if name not in CHECKS:
             raise RecordingError(f"there is no check {name!r}; there are {', '.join(CHECKS)}")
     for name, values in thresholds.items():
         for key in values:
             if key not in CHECKS[name].thresholds:
-                known = ", ".join(CHECKS[name].thresholds) or "none"
-                raise RecordingError(f"the check {name!r} has no threshold {key!r}; it has {known}")
-    names = [name for name in CHECKS if (checks is None or name in checks) and name not in skip]
-    return [(CHECKS[name], partial(CHECKS[name].run, **thresholds.get(name, {}))) for name in names]
+                names = ", ".join(CHECKS[name].thresholds) or "none"
+                raise RecordingError(f"the check {name!r} has no threshold {key!r}; it has {names}")
 
 
 class _Examination:
-    """The findings so far, and what is kept to compare recordings."""
+    """The findings so far, and the statistics that are kept to compare recordings."""
 
-    def __init__(self, checks: list[Bound]) -> None:
+    def __init__(self, checks: Sequence[Check], thresholds: Mapping[str, Mapping[str, Any]]) -> None:
         self._checks = checks
-        self._needs = frozenset().union(*(check.needs for check, _ in checks))
-        self._findings: list[tuple[int, int, Finding]] = []
-        self._contents: list[Contents] = []
+        self._thresholds = thresholds
+        self._needs = dict.fromkeys(check.needs for check in checks if check.needs is not None)
+        self._findings: list[tuple[int, int, Finding]] = []  # number of the recording, number of the check
+        self._kept: list[Statistic] = []
         self._files = self._episodes = self._steps = 0
 
     def add(self, subject: Subject) -> None:
@@ -96,34 +94,35 @@ class _Examination:
             if subject.error is not None:
                 raise subject.error
             with subject.open() as recording:
-                chart = Chart(recording, subject.choose(recording))
-                chart.measure(self._needs)
-                found = [
-                    (number, i, finding)
-                    for i, (check, run) in enumerate(self._checks)
-                    if not check.across
-                    for finding in run(chart)
-                ]
+                measured = Measurements(recording, subject.choose(recording))
+                measured.measure(self._needs)
+                findings = self._run(number, measured, across=False)
         except FilterError:
             raise
         except (TupliError, OSError) as err:
             self._findings.append((number, -1, _unreadable(subject.name, err)))
             return
-        self._findings += found
-        self._episodes += len(chart.rows)
-        self._steps += chart.steps
-        contents = Contents.of(chart)
-        if contents is not None:
-            self._contents.append(contents)
+        self._findings += findings
+        self._episodes += len(measured.rows)
+        self._steps += measured.steps
+        for check in self._checks:
+            if check.across and check.needs is not None:
+                self._kept += measured.statistics(check.needs)
 
     def diagnosis(self) -> Diagnosis:
-        for i, (check, run) in enumerate(self._checks):
-            if check.across:
-                self._findings += [(-1, i, finding) for finding in run(self._contents)]
+        self._findings += self._run(-1, self._kept, across=True)
         # Sorting is stable: of one check and recording, findings stay in the order of the leaves.
         ordered = sorted(self._findings, key=lambda item: (-item[2].severity, item[0], item[1]))
         findings = tuple(finding for _, _, finding in ordered)
         return Diagnosis(findings, self._files, self._episodes, self._steps)
+
+    def _run(self, number: int, data: Any, *, across: bool) -> list[tuple[int, int, Finding]]:
+        return [
+            (number, i, finding)
+            for i, check in enumerate(self._checks)
+            if check.across == across
+            for finding in check.run(data, **self._thresholds.get(check.id, {}))
+        ]
 
 
 def _unreadable(name: str, err: TupliError | OSError) -> Finding:

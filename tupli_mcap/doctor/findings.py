@@ -1,9 +1,9 @@
-"""What an examination finds: typed findings, and the diagnosis they make together."""
+"""What `examine` returns: a diagnosis, and the findings in it."""
 
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 __all__ = ["MAX_PLACES", "Diagnosis", "Finding", "Place", "Severity"]
@@ -17,7 +17,7 @@ class Severity(enum.IntEnum):
 
     ERROR: the data is wrong, a learner would break on it or learn nonsense (NaN, values outside a Discrete space).
     WARNING: something is probably wrong, or surprises a learner (a dimension that never changes).
-    INFO: worth knowing, and usual in healthy data too (all rewards are equal).
+    INFO: worth knowing, and usual in healthy data too (episodes that all end by timeout).
     """
 
     INFO = 1
@@ -44,7 +44,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is worth a look.
+    """Something that is worth a look.
 
     check: the id of the check, one of `CHECKS`.
     path: the recording it is about; where several are, the first one.
@@ -69,17 +69,11 @@ class Finding:
     places: tuple[Place, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """The finding as JSON-able object; its keys are the fields, `severity` is its name in lower case."""
+        """The finding as a JSON-able object: its fields, with the name of the severity in lower case."""
         return {
-            "check": self.check,
+            **{field.name: getattr(self, field.name) for field in fields(self)},
             "severity": str(self.severity),
-            "path": self.path,
-            "message": self.message,
-            "suggestion": self.suggestion,
-            "leaf": self.leaf,
             "dimensions": [list(index) for index in self.dimensions],
-            "count": self.count,
-            "total": self.total,
             "places": [place._asdict() for place in self.places],
         }
 
@@ -115,7 +109,7 @@ class Diagnosis:
         return tuple(finding for finding in self.findings if finding.check == check)
 
     def to_dict(self) -> dict[str, Any]:
-        """The diagnosis as JSON-able object. Keys are added only; a change of meaning changes `version`.
+        """The diagnosis as a JSON-able object. Keys are only added; a change of meaning changes `version`.
 
         `version` (1), `healthy`, `worst` ("info", "warning", "error" or null), `files`, `episodes`, `steps`, and
         `findings`, a list of objects with the keys of `Finding`; a place has `path`, `episode` and `step` (or null).

@@ -1,4 +1,4 @@
-"""Numbers and dimensions as words of a message."""
+"""Numbers, times and dimensions as a message says them."""
 
 from __future__ import annotations
 
@@ -38,28 +38,27 @@ def duration(ns: float) -> str:
     return f"{ns:.0f} ns"
 
 
-def unravel(leaf: Leaf, chosen: Array) -> tuple[tuple[int, ...], ...]:
-    """The indexes of the chosen elements (bool, C order) of a leaf, at most 100; none for a scalar, or for all."""
-    if leaf.shape == () or chosen.all():
+def unravel(leaf: Leaf, mask: Array) -> tuple[tuple[int, ...], ...]:
+    """The indexes of the elements of a leaf in a mask (C order), at most 100; none for a scalar, or for all."""
+    if leaf.shape == () or mask.all():
         return ()
-    indexes = np.argwhere(chosen.reshape(leaf.shape))[:_LISTED]
+    indexes = np.argwhere(mask.reshape(leaf.shape))[:_LISTED]
     return tuple(tuple(index) for index in indexes.tolist())
 
 
-def dimension_text(leaf: Leaf, chosen: Array) -> str:
-    """` in dimension 3`, ` in 3 of 17 dimensions (0, 4, 5)`; empty where it is all, or a scalar."""
-    text = dimensions(leaf, chosen)
-    return f" in {text}" if text else ""
-
-
-def dimensions(leaf: Leaf, chosen: Array) -> str:
-    """`dimension 3`, `3 of 17 dimensions (0, 4, 5)`; empty where it is all, or a scalar."""
-    indexes = unravel(leaf, chosen)
-    count = int(chosen.sum())
+def dimensions(leaf: Leaf, mask: Array) -> str:
+    """`dimension 3`, `3 of 17 dimensions (0, 4, 5)`; empty for a scalar, or for all."""
+    indexes, count = unravel(leaf, mask), int(mask.sum())
     if not indexes:
         return ""
-    texts = [",".join(map(str, index)) if len(index) == 1 else str(index) for index in indexes[:_NAMED]]
+    names = [str(index[0]) if len(index) == 1 else str(index) for index in indexes[:_NAMED]]
     if count == 1:
-        return f"dimension {texts[0]}"
+        return f"dimension {names[0]}"
     more = ", ..." if count > _NAMED else ""
-    return f"{count:,} of {leaf.size:,} dimensions ({', '.join(texts)}{more})"
+    return f"{count:,} of {leaf.size:,} dimensions ({', '.join(names)}{more})"
+
+
+def dimension_text(leaf: Leaf, mask: Array) -> str:
+    """The same with ` in ` before it; empty for a scalar, or for all."""
+    text = dimensions(leaf, mask)
+    return f" in {text}" if text else ""

@@ -1,1 +1,0 @@
-"""What is measured while a recording streams past: one pass, memory that does not grow with the steps."""

@@ -1,0 +1,108 @@
+"""`Measurements`: what is known of one recording once its steps were read, for the checks to judge."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Place, Severity
+from tupli_mcap.doctor.message_text import unravel
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.blocks import Array, Block, blocks
+
+__all__ = ["Measurements", "Statistic", "StepPlace", "value_bytes"]
+
+StepPlace = tuple[int, int]
+"""The number of an episode, and a step in it; its length stands for its final state."""
+
+
+class Statistic:
+    """What is measured while the steps of a recording pass by once, in memory that does not grow with them."""
+
+    @classmethod
+    def start(cls, measured: Measurements) -> Sequence[Statistic]:
+        """The statistics of this kind for a recording, before its first step: one, or one for each leaf."""
+        raise NotImplementedError
+
+    def put(self, block: Block) -> None:
+        """Take the next steps."""
+        raise NotImplementedError
+
+
+_S = TypeVar("_S", bound=Statistic)
+
+
+class Measurements:
+    """The chosen episodes of a recording, and what was measured of their steps.
+
+    path: the recording's name. positions: the episodes, as positions in its index. rows, lengths: their index rows
+    and numbers of steps.
+    """
+
+    def __init__(self, recording: Recording, positions: Array) -> None:
+        self.recording = recording
+        self.path = recording.name
+        self.positions = positions
+        self.rows: Array = recording.index[positions]
+        self.lengths: Array = self.rows["length"].astype(np.int64)
+        self.steps = int(self.lengths.sum())
+        self._statistics: list[Statistic] = []
+
+    @property
+    def layout(self) -> StepLayout:
+        return self.recording.layout
+
+    def measure(self, kinds: Iterable[type[Statistic]]) -> None:
+        """Read the steps once; without a kind of statistic, or without a step, nothing is read.
+
+        Raises:
+            FormatError: the recording is damaged.
+        """
+        if self.steps:
+            self._statistics = [statistic for kind in kinds for statistic in kind.start(self)]
+        if self._statistics:
+            for block in blocks(self.recording, self.positions):
+                for statistic in self._statistics:
+                    statistic.put(block)
+
+    def statistics(self, kind: type[_S]) -> list[_S]:
+        """The statistics of a kind."""
+        return [statistic for statistic in self._statistics if isinstance(statistic, kind)]
+
+    def places(self, steps: Iterable[StepPlace]) -> tuple[Place, ...]:
+        """The first different ones of some steps."""
+        return tuple(Place(self.path, *step) for step in dict.fromkeys(steps))[:MAX_PLACES]
+
+    def episodes(self, mask: Array) -> tuple[Place, ...]:
+        """The first episodes of a mask over `rows`."""
+        return tuple(Place(self.path, int(number)) for number in self.rows["episode"][mask][:MAX_PLACES])
+
+    def finding(
+        self,
+        check: str,
+        severity: Severity,
+        message: str,
+        advice: str,
+        count: int = 0,
+        total: int = 0,
+        places: tuple[Place, ...] = (),
+        leaf: Leaf | None = None,
+        mask: Array | None = None,
+    ) -> Finding:
+        """A finding about this recording, or about the elements of a leaf that are in a mask."""
+        path = None if leaf is None else leaf.path
+        indexes = () if leaf is None or mask is None else unravel(leaf, mask)
+        return Finding(check, severity, self.path, message, advice, path, indexes, count, total, places)
+
+
+def value_bytes(layout: StepLayout, leaf: Leaf, value: Any) -> bytes:
+    """A value of a leaf as bytes: the same for equal values only."""
+    if leaf.kind != "variable":
+        return bytes(value.tobytes())
+    out = bytearray()
+    layout.variable[leaf.name].encode(value, out, 0)
+    return bytes(out)

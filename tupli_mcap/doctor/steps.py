@@ -1,0 +1,249 @@
+"""Checks of what shows from one step to the next: frozen cameras, reward outliers, clock jumps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from tupli_mcap.doctor.findings import Finding, Severity
+from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace
+from tupli_mcap.doctor.message_text import duration, plural, share
+from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.recording.blocks import Array, Block
+
+__all__ = [
+    "Clock",
+    "Frames",
+    "Largest",
+    "Rewards",
+    "Sample",
+    "clock_jump",
+    "frozen_frames",
+    "reward_outliers",
+]
+
+_SECOND = 10**9
+_SAMPLE_SIZE = 1 << 16
+_FEWEST_REWARDS = 20
+# The standard deviation of a normal distribution is 1.4826 times its median absolute deviation. Source: B. Iglewicz and
+# D. C. Hoaglin, How to Detect and Handle Outliers, ASQC 1993, chapter 3.
+_MAD_TO_STD = 1.4826
+
+
+class Sample:
+    """Every n-th of about `total` values, so that 65,536 are kept at most. seen: how many there were."""
+
+    def __init__(self, total: int) -> None:
+        self._stride = max(1, -(-total // _SAMPLE_SIZE))
+        self._parts: list[Array] = []
+        self.seen = 0
+
+    def put(self, values: Array) -> None:
+        self._parts.append(values[-self.seen % self._stride :: self._stride].copy())
+        self.seen += len(values)
+
+    @property
+    def values(self) -> Array:
+        return np.concatenate(self._parts) if self._parts else np.empty(0)
+
+
+class Largest:
+    """The `k` largest of some values: (value, place), the largest first; of equal ones, those that came first."""
+
+    def __init__(self, k: int = 64) -> None:
+        self._k = k
+        self.values: list[tuple[float, StepPlace]] = []
+
+    def put(self, values: Array, locate: Callable[[int], StepPlace]) -> None:
+        least = self.values[-1][0] if len(self.values) == self._k else -np.inf
+        candidates = np.flatnonzero(values > least)
+        candidates = candidates[np.argsort(-values[candidates], kind="stable")[: self._k]]
+        self.values += [(float(values[i]), locate(int(i))) for i in candidates]
+        self.values.sort(key=lambda item: (-item[0], item[1]))
+        del self.values[self._k :]
+
+
+class Frames(Statistic):
+    """The images of a leaf. repeated: how many equal the one before in their episode, in every pixel.
+
+    longest: how many such there are in a row at most; place: the first of these.
+    """
+
+    def __init__(self, leaf: Leaf) -> None:
+        self.leaf = leaf
+        self.repeated = self.longest = 0
+        self.place: StepPlace = (0, 0)
+        self._last: Array = np.empty(0)  # the last image of the block before
+        self._run = 0  # how many images in a row, up to that one, equal the one before
+
+    @classmethod
+    def start(cls, measured: Measurements) -> Sequence[Frames]:
+        return [cls(leaf) for leaf in measured.layout.images]
+
+    def put(self, block: Block) -> None:
+        repeats = self._repeats(block)
+        steps = np.arange(len(repeats))
+        last_new = np.maximum.accumulate(np.where(repeats, -1, steps))
+        runs = np.where(last_new < 0, self._run + steps + 1, steps - last_new)
+        end = int(np.argmax(runs))
+        if runs[end] > self.longest:
+            self.longest = int(runs[end])
+            episode, step = block.place(end)
+            self.place = (episode, step - self.longest + 1)
+        self.repeated += int(repeats.sum())
+        self._run = int(runs[-1])
+
+    def _repeats(self, block: Block) -> Array:
+        """Which images equal the one before in their episode (bool)."""
+        frames = block.leaves[self.leaf.name]
+        flat = frames.reshape(len(frames), -1)
+        repeats = np.zeros(len(flat), np.bool_)
+        repeats[1:] = (flat[1:] == flat[:-1]).all(axis=1)
+        repeats[block.starts] = False
+        if block.first_step:
+            repeats[0] = np.array_equal(flat[0], self._last)
+        self._last = flat[-1].copy()
+        return repeats
+
+
+def frozen_frames(measured: Measurements, *, frames: int = 30) -> Iterator[Finding]:
+    """A camera that stands still: `frames` or more consecutive frames of an episode equal in every pixel.
+
+    Shorter runs are usual: an action without effect, a game that waits.
+    """
+    for images in measured.statistics(Frames):
+        if images.longest + 1 < frames:
+            continue
+        count, total, places = images.repeated, measured.steps, measured.places([images.place])
+        length = images.longest + 1
+        message = (
+            f"{length:,} frames in a row are equal; {share(count, total)} of all frames repeat the one before"
+        )
+        advice = "look whether the camera or the renderer hung, and cut these steps out"
+        yield measured.finding(
+            "frozen-frames", Severity.WARNING, message, advice, count, total, places, images.leaf
+        )
+
+
+class Rewards(Statistic):
+    """One scalar reward, either in the last steps of episodes or in the others: a sample, and the extremes."""
+
+    def __init__(self, leaf: Leaf, total: int, *, last: bool) -> None:
+        self.leaf = leaf
+        self.last = last
+        self.sample = Sample(total)
+        self.highest, self.lowest = Largest(), Largest()
+
+    @classmethod
+    def start(cls, measured: Measurements) -> Sequence[Rewards]:
+        leaves = [leaf for leaf in measured.layout.reward if leaf.kind != "variable" and leaf.size == 1]
+        totals = {False: measured.steps, True: len(measured.rows)}
+        return [cls(leaf, total, last=last) for leaf in leaves for last, total in totals.items()]
+
+    def put(self, block: Block) -> None:
+        rewards = block.leaves[self.leaf.name].astype(np.float64).reshape(-1)
+        is_last = np.zeros(len(rewards), np.bool_)
+        is_last[block.ends if block.whole else block.ends[:-1]] = True
+        steps = np.flatnonzero((is_last == self.last) & np.isfinite(rewards))
+        self.sample.put(rewards[steps])
+        self.highest.put(rewards[steps], lambda i: block.place(int(steps[i])))
+        self.lowest.put(-rewards[steps], lambda i: block.place(int(steps[i])))
+
+
+def reward_outliers(measured: Measurements, *, factor: float = 300) -> Iterator[Finding]:
+    """Rewards further than `factor` scales from the median, among the last steps of episodes and the others apart.
+
+    A bonus at the end is usual, one reward of a million is not. The scale is 1.4826 times the median absolute
+    deviation; where most rewards are equal, the larger of the median's magnitude and the median of the deviations that
+    are not 0 (if there are three). No judgement where that is 0 too, or below 20 rewards. Median and scale are those of
+    a sample where there are more than 65,536 rewards.
+    """
+    for rewards in measured.statistics(Rewards):
+        if rewards.sample.seen < _FEWEST_REWARDS:
+            continue
+        median, scale = _scale(rewards.sample.values)
+        limit = factor * scale
+        outliers = [(value, place) for value, place in rewards.highest.values if value - median > limit]
+        outliers += [(-value, place) for value, place in rewards.lowest.values if median + value > limit]
+        if scale == 0 or not outliers:
+            continue
+        outliers.sort(key=lambda item: (-abs(item[0] - median), item[1]))
+        count, total, places = (
+            len(outliers),
+            rewards.sample.seen,
+            measured.places(place for _, place in outliers),
+        )
+        message = (
+            f"{plural(count, 'reward')} {'is' if count == 1 else 'are'} further than {factor:g} times the usual "
+            f"deviation ({scale:.3g}) from the median ({median:.3g}), {'among' if rewards.last else 'before'} the last "
+            f"steps of episodes; the furthest is {outliers[0][0]:g}"
+        )
+        advice = "look at these steps; clip or scale rewards if they are right"
+        yield measured.finding(
+            "reward-outliers", Severity.WARNING, message, advice, count, total, places, rewards.leaf
+        )
+
+
+def _scale(values: Array) -> tuple[float, float]:
+    """Median, and how far values usually are from it."""
+    median = float(np.median(values))
+    deviations = np.abs(values - median)
+    spread = _MAD_TO_STD * float(np.median(deviations))
+    if spread > 0:
+        return median, spread
+    others = deviations[deviations > 0]
+    return median, max(abs(median), float(np.median(others)) if len(others) >= 3 else 0.0)
+
+
+class Clock(Statistic):
+    """Times (ns) from one step to the next inside episodes: a sample, and the longest."""
+
+    def __init__(self, total: int) -> None:
+        self.gaps = Sample(total)
+        self.longest = Largest()
+        self._last = 0  # the time of the last step of the block before
+
+    @classmethod
+    def start(cls, measured: Measurements) -> Sequence[Clock]:
+        return [cls(measured.steps)]
+
+    def put(self, block: Block) -> None:
+        times = block.columns.times
+        gaps = np.diff(times, prepend=self._last)
+        inside = np.ones(len(times), np.bool_)
+        inside[block.starts] = False
+        inside[0] = block.first_step > 0
+        self._last = int(times[-1])
+        steps = np.flatnonzero(inside)
+        self.gaps.put(gaps[steps])
+        self.longest.put(gaps[steps], lambda i: block.place(int(steps[i])))
+
+
+def clock_jump(
+    measured: Measurements, *, factor: float = 1000, least_s: float = 1.0, warn_s: float = 600.0
+) -> Iterator[Finding]:
+    """Steps that came `factor` times the median and `least_s` seconds or more after the one before, in one episode.
+
+    A policy that is trained between steps pauses too: information. A warning from `warn_s` seconds on: a suspended
+    machine, or a clock that was set.
+    """
+    for clock in measured.statistics(Clock):
+        if not clock.gaps.seen:
+            continue
+        median = float(np.median(clock.gaps.values))
+        limit = max(factor * median, least_s * _SECOND)
+        pauses = [(gap, place) for gap, place in clock.longest.values if gap >= limit]
+        if not pauses:
+            continue
+        (longest, _), count, total = pauses[0], len(pauses), clock.gaps.seen
+        # Only the longest gaps are known: where all of these are pauses there may be more.
+        more = "at least " if count == len(clock.longest.values) < total else ""
+        message = (
+            f"{more}{plural(count, 'step')} came after a pause inside an episode, the longest of {duration(longest)}; "
+            f"the median is {duration(median)}"
+        )
+        advice = "leave these episodes out where timing matters, as on a robot"
+        severity = Severity.WARNING if longest >= warn_s * _SECOND else Severity.INFO
+        places = measured.places(place for _, place in pauses)
+        yield measured.finding("clock-jump", severity, message, advice, count, total, places)

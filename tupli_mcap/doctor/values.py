@@ -1,0 +1,312 @@
+"""Checks of values: NaN, infinities, values outside of their space, dimensions that never change, unused actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Severity
+from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace, value_bytes
+from tupli_mcap.doctor.message_text import dimension_text, dimensions, plural
+from tupli_mcap.messages.leaves import DType, Leaf
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.blocks import Array, Block
+
+__all__ = ["LeafValues", "bounds", "constant_dimension", "infinity", "nan", "outside_space", "unused_action"]
+
+Locate = Callable[[int], StepPlace]
+Role = Literal["state", "action", "reward"]
+_KINDS = ("nan", "infinite", "outside")
+_ROUNDING = 8  # units in the last place that a value may be outside of its space
+_NARROW = 64  # elements a step up to which a transposed copy makes reductions quicker
+_MOST_CHOICES = 1 << 12
+_NAMED = 8  # choices that a message names
+_INT64_MAX = 2**63 - 1
+
+
+class LeafValues(Statistic):
+    """The values of a leaf, in steps and final states.
+
+    seen: how many. counts: how many of each element (int64, C order) are of each of `_KINDS`; a value of variable size
+    is one element. places: the first of each kind. choices: of each element of an action, how often each choice occurs;
+    empty where the action is not discrete, or has more than 4,096. Of each element of a leaf of constant size, low and
+    high are the bounds of the space, least and most the range of the finite values.
+    """
+
+    low: Array
+    high: Array
+    least: Array
+    most: Array
+    dtype: DType = np.dtype(object)
+
+    def __init__(self, leaf: Leaf, role: Role) -> None:
+        self.leaf = leaf
+        self.role = role
+        self.seen = 0
+        self.counts = {kind: np.zeros(leaf.size, np.int64) for kind in _KINDS}
+        self.places: dict[str, list[StepPlace]] = {kind: [] for kind in _KINDS}
+        self.choices: list[Array] = []
+
+    @classmethod
+    def start(cls, measured: Measurements) -> Sequence[LeafValues]:
+        roles: tuple[Role, ...] = ("state", "action", "reward")
+        return [
+            (_VariableValues if leaf.kind == "variable" else _ArrayValues)(leaf, role, measured.layout)
+            for role in roles
+            for leaf in getattr(measured.layout, role)
+        ]
+
+    def put(self, block: Block) -> None:
+        name = self.leaf.name
+        self._add(block.leaves[name], block.place)
+        if name in block.finals:
+            self._add(block.finals[name], partial(_final_place, block))
+
+    @property
+    def constant(self) -> Array:
+        """Which elements had one finite value only (bool), although the space allows others."""
+        raise NotImplementedError
+
+    def _add(self, values: Any, locate: Locate) -> None:
+        """Take some values; `locate` gives the place of one of them."""
+        raise NotImplementedError
+
+    def _note(self, kind: str, bad: Array, locate: Locate) -> None:
+        """`bad[element, i]`: that element of value `i` is of this kind."""
+        self.counts[kind] += bad.sum(axis=1)
+        missing = MAX_PLACES - len(self.places[kind])
+        if missing:
+            self.places[kind] += [locate(int(i)) for i in np.flatnonzero(bad.any(axis=0))[:missing]]
+
+
+def _final_place(block: Block, i: int) -> StepPlace:
+    row = block.rows[block.finals_of[i]]
+    return int(row["episode"]), int(row["length"])
+
+
+class _ArrayValues(LeafValues):
+    """A leaf of constant size."""
+
+    def __init__(self, leaf: Leaf, role: Role, layout: StepLayout) -> None:
+        super().__init__(leaf, role)
+        recorded = layout.dtypes[leaf.name]
+        # Bools have no range, and NumPy is slow with float16.
+        wider: dict[str, DType] = {"bool": np.dtype(np.uint8), "float16": np.dtype(np.float32)}
+        self.dtype = wider.get(recorded.name, recorded)
+        self.low, self.high = self._lowest, self._highest = bounds(leaf)
+        if leaf.dtype is not None and leaf.dtype.kind == "f":
+            sizes = [np.where(np.isfinite(b), np.abs(b.astype(np.float64)), 0) for b in (self.low, self.high)]
+            slack = _ROUNDING * float(np.finfo(leaf.dtype).eps) * np.maximum(*sizes)
+            self._lowest, self._highest = self.low - slack, self.high + slack
+        info: Any = np.finfo(self.dtype) if self.dtype.kind == "f" else np.iinfo(self.dtype)
+        self.least = np.full(leaf.size, info.max, self.dtype)
+        self.most = np.full(leaf.size, info.min, self.dtype)
+        if role == "action" and not isinstance(leaf.space, spaces.Box):
+            counts = [int(high) - int(low) + 1 for low, high in zip(self.low, self.high, strict=True)]
+            self.choices = [np.zeros(n, np.int64) for n in counts] if sum(counts) <= _MOST_CHOICES else []
+
+    @property
+    def constant(self) -> Array:
+        finite = self.counts["nan"] + self.counts["infinite"] == 0
+        constant: Array = finite & (self.least == self.most) & (self.low < self.high)
+        return constant
+
+    def _add(self, values: Any, locate: Locate) -> None:
+        self.seen += len(values)
+        if not self.leaf.size:
+            return
+        flat = values.reshape(len(values), -1).astype(self.dtype, copy=False)
+        columns = np.ascontiguousarray(flat.T) if flat.shape[1] <= _NARROW else flat.T
+        least, most = self._finite_range(columns, locate)
+        self.least, self.most = np.minimum(self.least, least), np.maximum(self.most, most)
+        if (least < self.low).any() or (most > self.high).any():
+            with np.errstate(invalid="ignore"):  # signalling NaN
+                outside = (columns < self._lowest[:, None]) | (columns > self._highest[:, None])
+            self._note("outside", outside & np.isfinite(columns), locate)
+        for counts, column, low in zip(self.choices, columns, self.low, strict=False):
+            inside = column[(column >= low) & (column - low < len(counts))]
+            counts += np.bincount((inside - low).astype(np.int64), minlength=len(counts))
+
+    def _finite_range(self, columns: Array, locate: Locate) -> tuple[Array, Array]:
+        if columns.dtype.kind != "f" or (finite := np.isfinite(columns)).all():
+            return columns.min(axis=1), columns.max(axis=1)
+        nan = np.isnan(columns)
+        self._note("nan", nan, locate)
+        self._note("infinite", ~finite & ~nan, locate)
+        least = np.where(finite, columns, np.inf).min(axis=1)
+        return least, np.where(finite, columns, -np.inf).max(axis=1)
+
+
+def bounds(leaf: Leaf) -> tuple[Array, Array]:
+    """The smallest and largest value the space allows, of each element of a leaf of constant size (C order)."""
+    space = leaf.space
+    if isinstance(space, spaces.Box):
+        return space.low.reshape(-1), space.high.reshape(-1)
+    starts, counts = [0] * leaf.size, [2] * leaf.size
+    if isinstance(space, spaces.Discrete):
+        starts, counts = [int(space.start)], [int(space.n)]
+    elif isinstance(space, spaces.MultiDiscrete):
+        starts, counts = np.asarray(space.start).reshape(-1).tolist(), space.nvec.reshape(-1).tolist()
+    # As Python's integers: a file may claim choices beyond what int64 holds.
+    ends = [min(start + n - 1, _INT64_MAX) for start, n in zip(starts, counts, strict=True)]
+    return np.array([min(start, _INT64_MAX) for start in starts], np.int64), np.array(ends, np.int64)
+
+
+class _VariableValues(LeafValues):
+    """A leaf of variable size."""
+
+    def __init__(self, leaf: Leaf, role: Role, layout: StepLayout) -> None:
+        super().__init__(leaf, role)
+        self._layout = layout
+        # Where dtypes are recorded wider than the space declares, no value is in the space.
+        self._in_space = leaf.name not in layout.inner_dtypes
+        self._first: bytes | None = None
+        self._changes = False
+
+    @property
+    def constant(self) -> Array:
+        return np.array([not self._changes])
+
+    def _add(self, values: Any, locate: Locate) -> None:
+        self.seen += len(values)
+        bad = {kind: np.zeros((1, len(values)), np.bool_) for kind in _KINDS}
+        for i, value in enumerate(values):
+            bad["outside"][0, i] = self._in_space and not self.leaf.space.contains(value)
+            for array in _floats(value):
+                bad["nan"][0, i] |= np.isnan(array).any()
+                bad["infinite"][0, i] |= np.isinf(array).any()
+            if not self._changes:
+                encoded = value_bytes(self._layout, self.leaf, value)
+                self._first = encoded if self._first is None else self._first
+                self._changes = encoded != self._first
+        for kind, flags in bad.items():
+            self._note(kind, flags, locate)
+
+
+def _floats(value: Any) -> Iterator[Array]:
+    """The arrays of floats inside a value."""
+    if isinstance(value, dict | tuple | list):  # a GraphInstance is a tuple, too
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _floats(part)
+    elif isinstance(value, np.ndarray | np.generic | float) and np.asarray(value).dtype.kind == "f":
+        yield np.asarray(value)
+
+
+def nan(measured: Measurements) -> Iterator[Finding]:
+    """NaN in a state, a final state, an action or a reward. One is enough: it spreads through every network."""
+    advice = "drop these episodes, or find the division or sensor that made it"
+    yield from _not_finite(measured, "nan", "nan", "NaN", advice)
+
+
+def infinity(measured: Measurements) -> Iterator[Finding]:
+    """An infinite state, final state, action or reward."""
+    advice = "clip the values, or drop these episodes; means and normalisation become infinite"
+    yield from _not_finite(measured, "infinity", "infinite", "infinite", advice)
+
+
+def _not_finite(measured: Measurements, check: str, kind: str, word: str, advice: str) -> Iterator[Finding]:
+    for values in measured.statistics(LeafValues):
+        mask = values.counts[kind] > 0
+        part = " in part" if values.leaf.kind == "variable" else dimension_text(values.leaf, mask)
+        if mask.any():
+            yield _bad_values(measured, values, check, kind, Severity.ERROR, word + part, advice)
+
+
+def outside_space(measured: Measurements) -> Iterator[Finding]:
+    """Values outside of their space: bounds of a Box, choices of a Discrete, letters of a Text, ...
+
+    An error where the space names choices (an index out of range crashes an embedding), a warning for a Box: learners
+    that scale by its bounds go astray. Within 8 units in the last place of the larger bound it is a rounding error, and
+    no finding. Infinite values and NaN are left to their own checks.
+    """
+    for values in measured.statistics(LeafValues):
+        leaf, mask = values.leaf, values.counts["outside"] > 0
+        if not mask.any():
+            continue
+        what = f"outside of {leaf.space!r:.80}"
+        if leaf.kind != "variable":
+            what = (
+                f"outside the space{dimension_text(leaf, mask)}: they reach from {values.least[mask].min():g} to "
+                f"{values.most[mask].max():g}, the space from {values.low[mask].min():g} to {values.high[mask].max():g}"
+            )
+        severity = Severity.WARNING
+        if not isinstance(leaf.space, spaces.Box):
+            severity = Severity.ERROR
+            advice = "correct the space, or what the environment returns; an index out of range crashes an embedding"
+        elif values.role == "action":
+            advice = "clip actions before the environment does, or what was recorded is not what was done"
+        else:
+            advice = "widen the space's bounds, or clip what the environment returns"
+        yield _bad_values(measured, values, "outside-space", "outside", severity, what, advice)
+
+
+def _bad_values(
+    measured: Measurements,
+    values: LeafValues,
+    check: str,
+    kind: str,
+    severity: Severity,
+    what: str,
+    advice: str,
+) -> Finding:
+    """The finding that the values of a kind are `what`."""
+    counts = values.counts[kind]
+    count, total = int(counts.sum()), values.seen * len(counts)
+    message = f"{count:,} of {total:,} values are {what}"
+    places = measured.places(values.places[kind])
+    return measured.finding(check, severity, message, advice, count, total, places, values.leaf, counts > 0)
+
+
+def constant_dimension(measured: Measurements, *, min_steps: int = 100) -> Iterator[Finding]:
+    """Dimensions of states and of continuous actions that had one value only in at least `min_steps` steps.
+
+    A warning where a whole leaf never changes, or a dimension of floats (its standard deviation is 0: normalising
+    divides by it); information where some of many integers do not. Dimensions whose Box allows one value only are left
+    out, as are single pixels, and discrete actions: those are "unused-action"'s.
+    """
+    if measured.steps < min_steps:
+        return
+    for values in measured.statistics(LeafValues):
+        leaf, mask = values.leaf, values.constant
+        count, whole = int(mask.sum()), bool(mask.all())
+        if values.role == "reward" or values.choices or not count or (leaf.apart and not whole):
+            continue
+        if whole:
+            message = f"all {values.seen:,} {'frames' if leaf.apart else 'values'} are the same"
+            advice = "look whether this sensor, camera or actuator works; leave it out when training"
+        else:
+            what = f"is always {values.least[mask][0]:g}" if count == 1 else "never change"
+            message = f"{dimensions(leaf, mask)} {what} in {values.seen:,} values"
+            advice = "guard against a standard deviation of 0 when normalising, or leave it out"
+        severity = Severity.WARNING if whole or values.dtype.kind == "f" else Severity.INFO
+        yield measured.finding(
+            "constant-dimension", severity, message, advice, count, leaf.size, (), leaf, mask
+        )
+
+
+def unused_action(measured: Measurements, *, steps_each: int = 20) -> Iterator[Finding]:
+    """Choices of a Discrete, MultiDiscrete or MultiBinary action that never occur.
+
+    Judged from `steps_each` steps a choice on: a uniform policy then misses one with a probability below e^-20.
+    """
+    for values in measured.statistics(LeafValues):
+        for i, counts in enumerate(values.choices):
+            unused = np.flatnonzero(counts == 0)
+            if not len(unused) or values.seen < steps_each * len(counts):
+                continue
+            leaf, element = values.leaf, np.arange(values.leaf.size) == i
+            names = ", ".join(str(int(values.low[i]) + int(choice)) for choice in unused[:_NAMED])
+            count, total = len(unused), len(counts)
+            message = (
+                f"{count:,} of {total:,} choices{dimension_text(leaf, element)} never "
+                f"{'occurs' if count == 1 else 'occur'} in {plural(values.seen, 'step')}: {names}"
+                f"{', ...' if count > _NAMED else ''}"
+            )
+            advice = "nothing can be learnt about these: record with more exploration, or mask them"
+            yield measured.finding(
+                "unused-action", Severity.WARNING, message, advice, count, total, (), leaf, element
+            )
