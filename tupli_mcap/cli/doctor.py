@@ -1,4 +1,4 @@
-"""The command doctor: recorded data as someone sees it who is about to train on it."""
+"""The command doctor: looks at recorded data as someone who is about to train on it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tupli_mcap.cli.options import FilterText, Json, filter_of
-from tupli_mcap.cli.output import Column, number, print_json, print_table, print_wrapped, short_ids
+from tupli_mcap.cli.output import Column, counted, number, print_json, print_table, print_wrapped, short_ids
 from tupli_mcap.cli.terminal import say, say_styled, status
 
 if TYPE_CHECKING:
@@ -64,26 +64,24 @@ def _doctor(
 ) -> None:
     """Look at recorded data before training on it.
 
-    Finds NaN and infinities, values outside their space, dimensions that never change, odd episodes and
-    endings, duplicates, reward outliers, clock jumps, actions that never occur.
+    Finds NaN and infinities, values outside their space, dimensions that never change, actions that never occur,
+    missing terminals, episodes of one step, wrong resets, duplicates, frozen cameras, reward outliers, clock jumps.
 
     An error is wrong data, a warning is probably wrong, info is worth knowing. Exit code 1 if there is an
     error (see --fail-on) or a file that cannot be read; the others are examined all the same.
     """
-    from tupli_mcap.doctor import CHECKS, Severity, examine
+    from tupli_mcap.doctor import Severity, examine
 
     if list_checks:
         _print_checks(as_json)
         return
-    for name in [*(check or ()), *(skip or ())]:
-        if name not in CHECKS:
-            raise typer.BadParameter(f"there is no check {name!r}; see tupli-mcap doctor --list")
+    checks, skipped, thresholds = _checked(check), _checked(skip), _thresholds(settings or ())
     with status("examining") as progress:
         diagnosis = examine(
             paths or ["."],
-            checks=check,
-            skip=skip or (),
-            thresholds=_thresholds(settings or ()),
+            checks=checks,
+            skip=skipped or (),
+            thresholds=thresholds,
             episode_filter=filter_of(filter_text),
             progress=progress,
         )
@@ -91,28 +89,36 @@ def _doctor(
         print_json(diagnosis.to_dict())
     else:
         _print(diagnosis, Severity[level.name.upper()])
-    failing = diagnosis.of("unreadable")
-    if fail_on is not _FailOn.never:
-        failing += diagnosis.at_least(Severity[fail_on.name.upper()])
-    if failing:
+    failing = () if fail_on is _FailOn.never else diagnosis.at_least(Severity[fail_on.name.upper()])
+    if failing or diagnosis.of("unreadable"):
         raise typer.Exit(1)
+
+
+def _checked(names: list[str] | None) -> list[str] | None:
+    """Ids of checks, all of which there are."""
+    from tupli_mcap.doctor import CHECKS
+
+    for name in names or ():
+        if name not in CHECKS:
+            raise typer.BadParameter(f"there is no check {name!r}; see tupli-mcap doctor --list")
+    return names
 
 
 def _thresholds(settings: Sequence[str]) -> dict[str, dict[str, float]]:
     """Thresholds by check, from texts such as `frozen-frames.frames=50`."""
     from tupli_mcap.doctor import CHECKS
 
-    found: dict[str, dict[str, float]] = {}
+    thresholds: dict[str, dict[str, float]] = {}
     for setting in settings:
         name, _, text = setting.partition("=")
         check, _, threshold = name.partition(".")
         if check not in CHECKS or threshold not in CHECKS[check].thresholds:
             raise typer.BadParameter(f"there is no threshold {name!r}; see tupli-mcap doctor --list --json")
         try:
-            found.setdefault(check, {})[threshold] = float(text)
+            thresholds.setdefault(check, {})[threshold] = float(text)
         except ValueError as err:
             raise typer.BadParameter(f"expected a number for {name}, found {text!r}") from err
-    return found
+    return thresholds
 
 
 def _print_checks(as_json: bool) -> None:
@@ -127,36 +133,33 @@ def _print_checks(as_json: bool) -> None:
 
 
 def _print(diagnosis: Diagnosis, level: Severity) -> None:
-    several = diagnosis.files > 1
     groups: dict[tuple[object, ...], list[Finding]] = {}
     for finding in diagnosis.at_least(level):
-        # What recordings have in common is told once; why a file cannot be read, of each.
-        own = finding.path if finding.check == "unreadable" else ""
-        groups.setdefault((finding.severity, finding.check, finding.leaf, own), []).append(finding)
+        # What recordings have in common is said once; why a file cannot be read, of each.
+        path = finding.path if finding.check == "unreadable" else ""
+        groups.setdefault((finding.severity, finding.check, finding.leaf, path), []).append(finding)
     for group in groups.values():
-        _print_group(group, several)
+        _print_group(group, several=diagnosis.files > 1)
         say("")
-    counts = [
-        f"{number(count)} {name}{'s' if count != 1 and name != 'info' else ''}"
-        for name in ("error", "warning", "info")
-        if (count := sum(str(finding.severity) == name for finding in diagnosis.findings))
+    verdict = ["healthy"] if diagnosis.healthy else []
+    severities = [str(finding.severity) for finding in diagnosis.findings]
+    verdict += [
+        f"{number(count)} info" if name is _Level.info else counted(count, name)
+        for name in _Level
+        if (count := severities.count(name))
     ]
-    files, episodes, steps = (
-        f"{number(count)} {noun}{'' if count == 1 else 's'}"
-        for count, noun in (
-            (diagnosis.files, "recording"),
-            (diagnosis.episodes, "episode"),
-            (diagnosis.steps, "step"),
-        )
+    examined = (
+        counted(diagnosis.files, "recording"),
+        counted(diagnosis.episodes, "episode"),
+        counted(diagnosis.steps, "step"),
     )
-    verdict = "healthy" if diagnosis.healthy else ""
-    say(f"{', '.join([*([verdict] if verdict else []), *counts])}: {files}, {episodes}, {steps}")
+    say(f"{', '.join(verdict)}: {', '.join(examined)}")
 
 
-def _print_group(group: Sequence[Finding], several: bool) -> None:
+def _print_group(group: Sequence[Finding], *, several: bool) -> None:
     first = group[0]
     severity = str(first.severity)
-    title = " · ".join([first.check, *([] if first.leaf is None else [first.leaf])])
+    title = first.check if first.leaf is None else f"{first.check} · {first.leaf}"
     say_styled((f"{severity:<{_INDENT}}", _STYLES[severity]), (title, "bold"))
     if several and first.check != "unreadable":  # which names the file itself
         _print_wrapped(f"{short_ids(first.path)}:")
@@ -172,7 +175,7 @@ def _print_group(group: Sequence[Finding], several: bool) -> None:
 
 
 def _at(finding: Finding) -> str:
-    """The places in short: `at episode:step 3:5, 4:0, ...`, `in episode 3, 4`; foreign recordings are named."""
+    """The places in short: `at episode:step 3:5, 4:0, ...`, `episode 3, 4`; another recording is named."""
     steps = finding.places[0].step is not None
     texts = []
     for place in finding.places:
