@@ -113,6 +113,17 @@ def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [goal]
 
 
+def test_a_directory_takes_its_place_as_a_whole(tmp_path: Path) -> None:
+    goal = tmp_path / "directory"
+    for text in ("first", "second"):
+        with contextlib.suppress(FileExistsError), files.replacing(goal, overwrite=False) as new:
+            new.mkdir()
+            (new / "file").write_text(text)
+            assert text == "second" or not goal.exists()
+    assert (goal / "file").read_text() == "first"
+    assert list(tmp_path.iterdir()) == [goal]
+
+
 def test_nobody_else_can_look_into_what_is_being_written(tmp_path: Path) -> None:
     with files.replacing(tmp_path / "file") as new:
         assert stat.S_IMODE(new.parent.stat().st_mode) == 0o700

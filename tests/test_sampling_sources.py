@@ -23,13 +23,12 @@ from test_recovery import abandon, cart_pole
 from test_sampling import naive
 
 from tupli_mcap import F, FileStorage, RecordEpisodes, Recording, TupliDataset
-from tupli_mcap.dataset.loading import Selected
-from tupli_mcap.dataset.materialize import Wanted, materialized
+from tupli_mcap.dataset import open_columns
+from tupli_mcap.dataset.saved import save_columns
 from tupli_mcap.dataset.sources import FilesSource
 from tupli_mcap.errors import FormatError, NotFoundError, SpaceError
 from tupli_mcap.recording import EpisodeData, write_recording
 from tupli_mcap.sampling import FIELDS, ListedEpisodes, RecordedSteps, SamplingError, Windows, steps_of
-from tupli_mcap.sampling.mapped import MappedSteps
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 IMAGE = spaces.Dict({"eye": spaces.Box(0, 255, (3, 4, 3), np.uint8), "x": spaces.Box(0, 1, (2,))})
@@ -108,12 +107,12 @@ def test_episodes_that_went_on_since_they_were_listed(tmp_path: Path, space: spa
             [ListedEpisodes.of(str(path), headers[4 * i : 4 * i + 4]) for i, path in enumerate(paths)],
             source.open,
         )
-        wanted = Wanted(
-            source, headers, None, None, None, lambda: Selected(np.array(lengths)), lambda: steps.identity
-        )
-        mapped = MappedSteps(materialized(wanted, tmp_path / "columns"))
+        kinds = [steps, pickle.loads(pickle.dumps(steps))]
+        if space is IMAGE:
+            save_columns(tmp_path / "columns", steps, headers, None)
+            kinds.append(open_columns(tmp_path / "columns").steps)
         expected = [step for n, episode in zip(lengths, naive(paths), strict=True) for step in episode[:n]]
-        for kind in (steps, mapped, pickle.loads(pickle.dumps(steps))):
+        for kind in kinds:
             assert len(kind) == len(expected) == 60
             assert len(kind.open_ends) == 0
             columns = kind.read(["states", "next_states"], np.arange(60)[::-1])

@@ -28,6 +28,7 @@ from test_readme import run_python
 from test_sampling import SPACES, record
 
 from tupli_mcap import F, FormatError, Recording, TupliDataset
+from tupli_mcap.dataset import open_columns
 from tupli_mcap.sampling import DeltaWindows, Order, Sampler, SamplingError
 
 torch = pytest.importorskip("torch")
@@ -464,10 +465,9 @@ def test_state_dicts_of_other_options_are_refused(dataset: TupliDataset, tmp_pat
         StreamDataset(windows, 32, seed=0, rank=0, ranks=2, worker_cache_bytes=SMALL).load_state_dict(state)
     with pytest.raises(SamplingError, match="expected the state dict of such a dataset, with items"):
         stream_of(dataset, 0).load_state_dict({"step": 3})
-    columns = TupliDataset.from_files(sorted({header.recording for header in dataset.preview()}))
-    columns.materialize(tmp_path / "columns")
+    dataset.save_columns(tmp_path / "columns")
     with pytest.raises(SamplingError, match="expected a state dict with (mix|chunks)="):
-        stream_of(columns, 0).load_state_dict(state)
+        stream_of(open_columns(tmp_path / "columns"), 0).load_state_dict(state)
     with pytest.raises(SamplingError, match="expected workers, key and batches in a state dict"):
         stream_of(dataset, 0).load_state_dict({name: part for name, part in state.items() if name != "key"})
     for key in ("x", {}, []):

@@ -73,6 +73,8 @@ def hold(fd: int) -> None:
 def replacing(goal: Path, *, overwrite: bool = True) -> Iterator[Path]:
     """The path of a file to make, which becomes `goal` when the block ends without an error.
 
+    A directory may be made instead, whose files the block syncs; it replaces nothing: not with `overwrite`.
+
     Raises:
         FileExistsError: `goal` exists by then, and not `overwrite`.
         OSError: the system refuses; `goal` is as it was.

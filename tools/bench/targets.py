@@ -10,7 +10,7 @@ from typing import Any
 from tools.bench.contenders import OURS
 from tools.bench.measure import ratio
 
-MATERIALIZED = "tupli-mcap, materialized"
+SAVED = "tupli-mcap, saved columns"
 NPY, HDF5 = ".npy, mapped", "HDF5 by hand"
 _SIZES = {
     "bytes": "lengths of the files",
@@ -105,7 +105,7 @@ def from_matrix(found: dict[str, Any]) -> Iterator[Target]:
         yield at_least(f"read all, {work}, over HDF5 by hand (gzip)", 1, figure, unit="x")
     for operation in ("epoch0", "epoch2"):
         workers = f"{operation[-1]} workers"
-        for name in (OURS, MATERIALIZED):
+        for name in (OURS, SAVED):
             figure = m.ratio("floats", operation, name, NPY)
             yield at_least(
                 f"shuffled epoch of 32-step windows, {workers}, {name}, over mapped .npy",

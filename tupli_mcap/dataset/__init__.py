@@ -8,6 +8,7 @@ from tupli_mcap.dataset.parsers import (
     TensorflowTupleParser,
     TorchTupleParser,
 )
+from tupli_mcap.dataset.saved import SavedColumns, open_columns
 from tupli_mcap.dataset.sources import DatasetError
 
 __all__ = [
@@ -15,8 +16,10 @@ __all__ = [
     "DatasetError",
     "FilterReport",
     "NumpyTupleParser",
+    "SavedColumns",
     "TensorflowTupleParser",
     "TorchTupleParser",
     "TupliDataset",
     "filter_recording",
+    "open_columns",
 ]

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.weights import episode_values
 from tupli_mcap.sampling import DeltaWindows, Pad, Steps, Transitions, Unit, Windows
-from tupli_mcap.sampling.items import checked_count
 from tupli_mcap.sampling.transitions import TRANSITION_FIELDS
-from tupli_mcap.schema import BaseFilter, F
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 
 __all__ = ["RandomAccess"]
 
@@ -21,32 +19,21 @@ FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 
 
 class RandomAccess:
-    """What a dataset gives by number. Only what is asked for is read; see `with_cache` for what is kept."""
-
-    _query: Query
-
-    def _with(self, **filters: Any) -> Self:
-        raise NotImplementedError
+    """What a dataset, or the columns saved of one, gives by number. Only what is asked for is read."""
 
     @property
     def steps(self) -> Steps:
         """The wanted steps by number, from 0, in the episodes' order: what windows and samplers read from."""
-        return self._query.steps()
+        raise NotImplementedError
 
-    def with_cache(self, cache_bytes: int, threads: int | None = None) -> Self:
-        """The dataset with another budget (bytes, 512 MiB by default) for what random access keeps in memory.
+    @property
+    def _headers(self) -> Sequence[EpisodeHeader]:
+        """The episodes that the steps are of."""
+        raise NotImplementedError
 
-        Args:
-            threads: how many read chunks; by default as many as there are cores, at most 4.
-
-        Raises:
-            SamplingError: a number is no integer, or too small.
-        """
-        made = self._with()
-        made._query.cache_bytes = checked_count(cache_bytes, 0, "a budget in bytes")
-        if threads is not None:
-            made._query.threads = checked_count(threads, 1, "a number of threads")
-        return made
+    def _step_seconds(self) -> float | None:
+        """How long a step takes, where all recordings say the same."""
+        raise NotImplementedError
 
     def windows(
         self,
@@ -87,11 +74,11 @@ class RandomAccess:
             SamplingError: an episode has no number there.
             FilterError: the expression names an unknown field.
         """
-        return episode_values(self._query.headers, expression)
+        return episode_values(self._headers, expression)
 
     def _values_now(self) -> Callable[[F | BaseFilter], np.ndarray[Any, np.dtype[np.float64]]]:
         """`episode_values` of the episodes as they are listed now, whatever is listed later."""
-        return partial(episode_values, self._query.headers)
+        return partial(episode_values, self._headers)
 
     def delta_windows(
         self,
@@ -111,11 +98,3 @@ class RandomAccess:
             step_seconds = self._step_seconds()
         made = DeltaWindows(self.steps, deltas, unit, step_seconds=step_seconds)
         return made.of_episodes(self._values_now())
-
-    def _step_seconds(self) -> float | None:
-        """How long a step takes, where all recordings say the same."""
-        known = set()
-        for name in dict.fromkeys(header.recording for header in self._query.headers):
-            with self._query.source.open(name) as recording:
-                known.add(recording.labels.step_seconds)
-        return known.pop() if len(known) == 1 else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -15,9 +14,12 @@ from tupli_mcap.dataset.episodes import EpisodeItems, items_of
 from tupli_mcap.dataset.loading import read_columns
 from tupli_mcap.dataset.parsers import BaseTupleParser, NumpyTupleParser
 from tupli_mcap.dataset.query import Query
+from tupli_mcap.dataset.saved import save_columns
 from tupli_mcap.dataset.selection import TupleFilter
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
 from tupli_mcap.dataset.tuples import Tuples
+from tupli_mcap.sampling import Steps
+from tupli_mcap.sampling.items import checked_count
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.tuples import anew
@@ -131,6 +133,21 @@ class TupliDataset(RandomAccess):
         made.set_seed(self._seed)
         return made
 
+    def with_cache(self, cache_bytes: int, threads: int | None = None) -> Self:
+        """The dataset with another budget (bytes, 512 MiB by default) for what random access keeps in memory.
+
+        Args:
+            threads: how many read chunks; by default as many as there are cores, at most 4.
+
+        Raises:
+            SamplingError: a number is no integer, or too small.
+        """
+        made = self._with()
+        made._query.cache_bytes = checked_count(cache_bytes, 0, "a budget in bytes")
+        if threads is not None:
+            made._query.threads = checked_count(threads, 1, "a number of threads")
+        return made
+
     # --- looking and loading ---
 
     def preview(self) -> list[EpisodeHeader]:
@@ -155,38 +172,39 @@ class TupliDataset(RandomAccess):
 
         anew(attempt)  # episodes that are deleted while they are read are listed no more the next time
 
-    def materialize(self, directory: str | os.PathLike[str], *, verify: bool = False) -> Self:
-        """List the episodes anew and write their columns to a directory, as plain arrays that everything is read from
-        then, mapped into memory; where they are there and fresh, they are used as they are.
+    def save_columns(self, directory: str | os.PathLike[str]) -> None:
+        """Write the steps to a new directory as plain `.npy` files, which `open_columns` reads mapped into memory.
 
-        The directory has a `.npy` file a leaf (`np.load(file, mmap_mode="r")` reads it), and `manifest.json`; see
-        docs/columns.md.
-        Columns are fresh if the query gives the same episodes, of the same lengths, in the same order, with an
-        equal tuple filter, and no recording's size or time of change differs; a change that keeps both is not
-        noticed. Anything else is written anew: no half of it is ever used, and a killed process leaves the old
-        columns or none. Of two processes at once, one waits for the other. Infos stay in the recordings.
-
-        Nobody can compare functions: with a function as the tuple filter, only the dataset that wrote the columns uses
-        them, and another one writes them anew.
+        The directory also holds `manifest.json`; see docs/columns.md. It is there as a whole or not at all: a process
+        that is killed leaves none. It keeps the steps as they are listed now, whatever becomes of their recordings, and
+        no infos. Steps are read a few at a time, within the budget of `with_cache`.
 
         Args:
-            directory: an empty one, one of columns, or none yet.
-            verify: also compare all columns with their digests; damaged ones are written anew, with a warning.
+            directory: where nothing is yet.
 
         Raises:
-            DatasetError: there is no episode, or the directory is no path.
+            DatasetError: there is no step, values differ in size (texts, graphs), or the directory is no path.
             SpaceError: the steps of two recordings do not fit into one array; the message says which.
-            StorageError: the directory holds something else, the disk is full, ...
-
-        Returns:
-            the dataset itself.
+            StorageError: there is something at that path, the disk is full, ...
         """
-        if not isinstance(directory, str | os.PathLike):
-            raise DatasetError(f"expected the path of a directory for the columns, found {directory!r:.80}")
-        anew(lambda: self._query.materialize(Path(directory), verify=verify))
-        return self
+        save_columns(directory, self.steps, self._headers, self._step_seconds())
 
     # --- what is in it ---
+
+    @property
+    def steps(self) -> Steps:
+        return self._query.steps()
+
+    @property
+    def _headers(self) -> Sequence[EpisodeHeader]:
+        return self._query.headers
+
+    def _step_seconds(self) -> float | None:
+        known = set()
+        for name in dict.fromkeys(header.recording for header in self._headers):
+            with self._query.source.open(name) as recording:
+                known.add(recording.labels.step_seconds)
+        return known.pop() if len(known) == 1 else None
 
     @property
     def benchmarks(self) -> list[BenchmarkHeader]:

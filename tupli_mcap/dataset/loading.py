@@ -17,10 +17,11 @@ from tupli_mcap.messages.common import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
-from tupli_mcap.sampling import ListedEpisodes, index
+from tupli_mcap.sampling import ListedEpisodes
+from tupli_mcap.sampling.index import positions_of
 from tupli_mcap.schema import EpisodeHeader
 
-__all__ = ["Selected", "empty_column", "positions_of", "read_columns"]
+__all__ = ["Selected", "read_columns"]
 
 _BLOCK_BYTES = 64 << 20
 _VARIABLE_STEP_BYTES = 4096  # a guess, for steps of variable size
@@ -103,7 +104,8 @@ class _Reader:
             self._builders = {field: FieldBuilder(field, self._capacity, layout) for field in self._fields}
         else:
             check_layouts(self._layout, self._first_name, layout, recording.name)
-        positions, lengths = positions_of(recording, headers)
+        listed = ListedEpisodes.of(recording.name, headers)
+        positions, lengths = positions_of(recording, listed), listed.lengths
         for block in _blocks(lengths, _step_bytes(layout)):
             columns = _read_block(recording, positions[block], lengths[block], self._needed)
             steps = int(lengths[block].sum())
@@ -133,26 +135,16 @@ class _Reader:
             selected = Selected(lengths, self._mask)
         columns = {field: builder.finish() for field, builder in self._builders.items()}
         if self._layout is None:
-            columns = {field: empty_column(field) for field in self._fields}
+            columns = {field: _empty_column(field) for field in self._fields}
         return columns, selected, self._layout
 
 
-def empty_column(field: str) -> Any:
+def _empty_column(field: str) -> Any:
     """The column of no episodes at all, whose spaces nobody knows."""
     if field == "infos":
         return []
     dtypes: dict[str, Any] = {"terminals": np.bool_, "timeouts": np.bool_, "steps": np.int64}
     return np.empty(0, dtypes.get(field, np.float64))
-
-
-def positions_of(recording: Recording, headers: Sequence[EpisodeHeader]) -> tuple[Array, Array]:
-    """Where the episodes are in the recording, and how many steps of each are listed (int64).
-
-    Raises:
-        NotFoundError: one of them is not there any more, or is shorter.
-    """
-    listed = ListedEpisodes.of(recording.name, headers)
-    return index.positions_of(recording, listed), listed.lengths
 
 
 def _blocks(lengths: Array, step_bytes: int) -> Iterator[slice]:

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from tupli_mcap.dataset.columns import pick
 from tupli_mcap.dataset.loading import Selected, read_columns
-from tupli_mcap.dataset.materialize import Wanted, is_current, materialized, unchanged
 from tupli_mcap.dataset.parsers import map_columns
 from tupli_mcap.dataset.selection import TupleFilter, selector_of
 from tupli_mcap.dataset.sources import Source
-from tupli_mcap.errors import TupliError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.sampling import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
-from tupli_mcap.sampling.mapped import MAPPED_FIELDS, MappedSteps
 from tupli_mcap.sampling.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_keys
 
@@ -54,23 +49,13 @@ class Query:
         self._benchmarks: list[BenchmarkHeader] | None = None
         self._headers: list[EpisodeHeader] | None = None
         self._selected: Selected | None = None
-        self._mapped: MappedSteps | None = None  # the steps, where they are materialized
         self._columns: dict[str, Any] = {}
         self._recorded: RecordedSteps | None = None
         self.cache_bytes, self.threads = CACHE_BYTES, THREADS
 
     def __getstate__(self) -> dict[str, Any]:
         # Another process reads the same episodes for itself; a layout cannot be pickled.
-        mapped = None if self._mapped is None else self._mapped.__reduce__()
-        return {**self.__dict__, "layout": None, "_columns": {}, "_recorded": None, "_mapped": mapped}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update({**state, "_mapped": None})
-        if state["_mapped"] is not None:
-            open_again, arguments = state["_mapped"]
-            with contextlib.suppress(TupliError):  # else from the recordings, as without columns
-                self._mapped = open_again(*arguments)
-                self.layout = self._mapped.layout
+        return {**self.__dict__, "layout": None, "_columns": {}, "_recorded": None}
 
     def with_filters(self, **filters: Any) -> Self:
         """A query that has read nothing, with some filters replaced; named as the constructor's arguments."""
@@ -103,8 +88,6 @@ class Query:
     @property
     def selected(self) -> Selected:
         """The steps the tuple filter is true of."""
-        if self._selected is None and self._mapped is not None:
-            self._selected = _selected(self._mapped, self.tuple_filter is not None)
         if self._selected is None:
             self.read(["terminals"])
         if self._selected is None:
@@ -115,18 +98,13 @@ class Query:
         """Lists the episodes anew; columns stay if the episodes are the same. `seen` as in `Source.episodes`."""
         headers = self.source.episodes(self.benchmark_filter, self.episode_filter, seen)
         if self._headers is None or _identity(headers) != _identity(self._headers):
-            self._selected, self.layout, self._columns = None, None, {}
-            self._recorded, self._mapped = None, None
-        elif self._mapped is not None and not unchanged(self._mapped.opened, self.source, headers):
-            self._columns, self._mapped = {}, None
+            self._selected, self.layout, self._columns, self._recorded = None, None, {}, None
         self._headers, self._benchmarks = headers, None
         return headers
 
     def steps(self) -> Steps:
-        """The wanted steps by number: from materialized columns, or those that have been read, else from the recordings
-        as they are asked for."""
-        if self._mapped is not None:
-            return self._mapped
+        """The wanted steps by number: from columns that have been read, else from the recordings as they are asked
+        for."""
         if self._recorded is None:
             seen: dict[str, Recording] = {}
             headers = self.refresh(seen) if self._headers is None else self._headers
@@ -141,24 +119,6 @@ class Query:
         loaded = {field: column for field, column in self._columns.items() if field in FIELDS}
         return MemorySteps(loaded, self._recorded) if loaded else self._recorded
 
-    def materialize(self, directory: Path, *, verify: bool) -> None:
-        """Lists the episodes anew, writes their columns to a directory unless it has them, and reads them from there.
-
-        What is there is not looked at again before the next `refresh`.
-        """
-        headers = self.refresh()
-        mapped = self._mapped
-        if mapped is None or not is_current(mapped.opened, directory) or verify:
-            wanted = Wanted(
-                self.source, headers, self.benchmark_filter, self.episode_filter, self.tuple_filter,
-                lambda: self.selected, lambda: self.steps().identity,
-            )  # fmt: skip
-            mapped = MappedSteps(materialized(wanted, directory, verify=verify))
-        self._columns = {
-            field: column for field, column in self._columns.items() if field not in MAPPED_FIELDS
-        }
-        self._mapped, self._recorded, self.layout = mapped, None, mapped.layout
-
     def read(self, fields: Sequence[str]) -> dict[str, Any]:
         """Columns by field, which are kept and cannot be written to."""
         found = self._missing(fields)
@@ -168,8 +128,6 @@ class Query:
     def own(self, fields: Sequence[str]) -> dict[str, Any]:
         """Columns by field that are the caller's own; what has to be read for them is not kept."""
         found = self._missing(fields)
-        if self._mapped is not None:
-            found = {field: _own(column) for field, column in found.items()}
         copies = {field: pick(self._columns[field], slice(None)) for field in fields if field not in found}
         return {field: found[field] if field in found else copies[field] for field in fields}
 
@@ -185,16 +143,13 @@ class Query:
 
     def _missing(self, fields: Sequence[str]) -> dict[str, Any]:
         missing = [field for field in fields if field not in self._columns]
-        found = {}
-        if self._mapped is not None:
-            found = {field: self._mapped.whole(field) for field in missing if field in MAPPED_FIELDS}
-            missing = [field for field in missing if field not in found]
         if not missing:
-            return found
-        known = self._selected if self._mapped is None else self.selected
-        read, self._selected, layout = read_columns(self.source, self.headers, missing, self._selector, known)
+            return {}
+        found, self._selected, layout = read_columns(
+            self.source, self.headers, missing, self._selector, self._selected
+        )
         self.layout = layout or self.layout
-        return {**found, **read}
+        return found
 
 
 def _check(filter: BaseFilter | None, model: type[BenchmarkHeader] | type[EpisodeHeader]) -> None:
@@ -210,22 +165,6 @@ def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
 def _listed(headers: Sequence[EpisodeHeader]) -> Iterator[ListedEpisodes]:
     for name, group in itertools.groupby(headers, key=lambda header: header.recording):
         yield ListedEpisodes.of(name, group)
-
-
-def _own(column: Any) -> Any:
-    """A column whose arrays may be written to: mapped ones cannot, and are copied."""
-    return map_columns(lambda array: array if array.flags.writeable else array.copy(), column)
-
-
-def _selected(mapped: MappedSteps, filtered: bool) -> Selected:
-    """Which steps of the listed episodes the columns hold."""
-    opened = mapped.opened
-    if not filtered:
-        return Selected(opened.episode_lengths)
-    recorded = opened.recorded_lengths
-    mask = np.zeros(int(recorded.sum()), np.bool_)
-    mask[np.repeat(np.cumsum(recorded) - recorded, opened.episode_lengths) + opened.step] = True
-    return Selected(opened.episode_lengths, mask)
 
 
 def _frozen(array: Array) -> Array:

@@ -25,10 +25,9 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.times import iso_utc
-from tupli_mcap.storage import FileStorage, TupliStorage
+from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.document import restored
 from tupli_mcap.storage.sidecar import Notes
-from tupli_mcap.system import refused
 
 __all__ = ["DatasetError", "FilesSource", "Source", "StorageSource", "episode_headers"]
 
@@ -61,10 +60,6 @@ class Source(Protocol):
 
     def open(self, recording: str) -> Recording:
         """The recording that a header names; the caller closes it."""
-        ...
-
-    def stamp(self, recording: str) -> tuple[int, int]:
-        """Size and time of change (ns; 0 where nobody knows it) of the recording that a header names."""
         ...
 
 
@@ -103,12 +98,6 @@ class StorageSource:
 
     def open(self, recording: str) -> Recording:
         return self.storage.open_recording(recording)
-
-    def stamp(self, recording: str) -> tuple[int, int]:
-        if isinstance(self.storage, FileStorage):
-            return _stamp(self.storage.root / recording)
-        with self.open(recording) as opened:
-            return _stamp_of(opened)
 
     def __repr__(self) -> str:
         return repr(self.storage)
@@ -185,26 +174,8 @@ class FilesSource:
     def open(self, recording: str) -> Recording:
         return Recording(recording, cache_bytes=_CACHE_BYTES)
 
-    def stamp(self, recording: str) -> tuple[int, int]:
-        if "://" not in recording:
-            return _stamp(Path(recording))
-        with self.open(recording) as opened:
-            return _stamp_of(opened)
-
     def __repr__(self) -> str:
         return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} files"
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    try:
-        status = path.stat()
-    except OSError as err:
-        raise RecordingError(f"{path} cannot be looked at: {refused(err)}") from err
-    return status.st_size, status.st_mtime_ns
-
-
-def _stamp_of(recording: Recording) -> tuple[int, int]:
-    return (recording.size, 0) if recording.path is None else _stamp(recording.path)
 
 
 def _expand(item: str | os.PathLike[str]) -> Sequence[str]:

@@ -1,4 +1,4 @@
-"""Random access to steps: windows, transitions and samplers over recordings, materialised columns or memory."""
+"""Random access to steps: windows, transitions and samplers over recordings, saved columns or memory."""
 
 from tupli_mcap.sampling.batches import Batches
 from tupli_mcap.sampling.deltas import DeltaWindow, DeltaWindows, Unit

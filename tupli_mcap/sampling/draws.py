@@ -365,7 +365,7 @@ def _check_state(state: Mapping[str, Any], own: Mapping[str, Any]) -> None:
     if state.get("blocks") != own.get("blocks") and state["kind"] == own["kind"]:
         raise SamplingError(
             "expected the state of a shuffle of these blocks, found that of others: the recordings have been written "
-            "anew, loaded or materialized since; read them as before, or take shuffle='exact'"
+            "anew, loaded or saved as columns since; read them as before, or take shuffle='exact'"
         )
     for key in ("kind", "batch_size", "buffer"):
         if state.get(key) != own.get(key):

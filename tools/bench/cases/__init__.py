@@ -26,7 +26,7 @@ CASES: dict[str, Callable[[Run], Iterator[Target]]] = {
     "over mcap": reading.over_mcap,
     "cold": reading.cold_windows,
     "windows": columns.windows,
-    "materialized": columns.materialized,
+    "saved": columns.saved,
     "listing": reading.listing,
     "noise": reading.incompressible,
     "vector": vector.record_vector,

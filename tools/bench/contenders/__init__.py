@@ -23,7 +23,7 @@ class Entry(NamedTuple):
 
 ENTRIES: dict[str, Entry] = {
     OURS: Entry("ours", "Ours", "", ("tupli-mcap", "mcap", "zstandard")),
-    "tupli-mcap, materialized": Entry("ours", "Materialized", "", ("tupli-mcap",)),
+    "tupli-mcap, saved columns": Entry("ours", "SavedColumns", "", ("tupli-mcap",)),
     "Minari HDF5": Entry("minari", "MinariHdf5", ".venv-peers", ("minari", "h5py")),
     "Minari Arrow": Entry("minari", "MinariArrow", ".venv-peers", ("minari", "pyarrow")),
     "Minari Parquet": Entry("minari", "MinariParquet", ".venv-peers", ("minari", "pyarrow")),

@@ -1,4 +1,4 @@
-"""tupli-mcap: recordings as they are, and their columns materialized."""
+"""tupli-mcap: recordings as they are, and their columns saved."""
 
 from __future__ import annotations
 
@@ -113,10 +113,10 @@ def _flat_states(dataset: Any) -> dict[str, Any]:
 
 
 class _Mapped(Session):
-    """Episodes are runs of steps of the dataset."""
+    """Episodes are runs of steps of the columns."""
 
-    def __init__(self, dataset: Any) -> None:
-        self._steps = dataset.steps
+    def __init__(self, columns: Any) -> None:
+        self._steps = columns.steps
         super().__init__(self._steps.episode_lengths)
         self._starts = np.cumsum(self.lengths) - self.lengths
 
@@ -129,40 +129,43 @@ class _Mapped(Session):
         return flat(found.pop("states")) | found
 
 
-class Materialized(Ours):
+class SavedColumns(Ours):
     """The same recording, whose columns were written once as files that are mapped into memory."""
 
-    note = "recorded as above, then `dataset.materialize(...)`; that is not counted as recording"
+    note = "recorded as above, then `dataset.save_columns(...)`; that is not counted as recording"
 
     def record(self, work: Workload, path: Path, episodes: int) -> tuple[float, int]:
         path.mkdir()
         found = super().record(work, path / "run.mcap", episodes)
         if work.table == "mission":
-            raise CannotError("texts are not materialized")
-        self._at(path)
+            raise CannotError("texts are in no array")
+        super().dataset(path / "run.mcap").save_columns(path / "columns")
         return found
 
-    def _at(self, path: Path) -> Any:
-        return super().dataset(path / "run.mcap").materialize(path / "columns")
-
     def append(self, work: Workload, path: Path, episodes: int) -> tuple[float, int]:
-        raise CannotError("columns are written anew")
+        raise CannotError("columns are written once")
 
     def dataset(self, path: Path) -> Any:
-        return self._at(path)
+        """The columns."""
+        from tupli_mcap.dataset import open_columns
+
+        return open_columns(path / "columns")
 
     def read(self, path: Path) -> tuple[dict[str, Any], Array | None]:
-        steps = self._at(path).steps
+        steps = self.dataset(path).steps
         found = steps.read(("states", *STEPS), np.arange(len(steps)))
         return flat(found.pop("states")) | found, steps.episode_lengths
 
     def field(self, path: Path) -> Array:
-        steps = self._at(path).steps
+        steps = self.dataset(path).steps
         actions: Array = steps.read(("actions",), np.arange(len(steps)))["actions"]
         return actions
 
     def listing(self, path: Path) -> Array:
         raise CannotError("as above")
 
+    def select(self, path: Path, least: float) -> dict[str, Any]:
+        raise CannotError("are filtered before they are saved")
+
     def open(self, path: Path) -> Session:
-        return _Mapped(self._at(path))
+        return _Mapped(self.dataset(path))
