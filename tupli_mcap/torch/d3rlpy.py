@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.dataset import TupliDataset
+from tupli_mcap.dataset import SavedColumns, TupliDataset
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.sampling import SamplingError, Steps
 
@@ -36,7 +36,7 @@ Array = np.ndarray[Any, Any]
 _FIELDS = ("states", "actions", "rewards")
 
 
-def mdp_dataset(dataset: TupliDataset, **options: Any) -> MDPDataset:
+def mdp_dataset(dataset: TupliDataset | SavedColumns, **options: Any) -> MDPDataset:
     """The whole dataset in memory, as d3rlpy's MDPDataset; `options` are its other arguments.
 
     Raises:
@@ -58,7 +58,7 @@ def mdp_dataset(dataset: TupliDataset, **options: Any) -> MDPDataset:
     )
 
 
-def replay_buffer(dataset: TupliDataset, **options: Any) -> RecordedReplayBuffer:
+def replay_buffer(dataset: TupliDataset | SavedColumns, **options: Any) -> RecordedReplayBuffer:
     """A replay buffer that reads what is sampled, within the dataset's cache; it keeps the rewards (4 bytes a step).
 
     The same random numbers give the same batches as `mdp_dataset`. A batch of transitions is read at once;
