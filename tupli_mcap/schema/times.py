@@ -2,7 +2,8 @@
 
 A text means all of the time that it names: `2026-11-23` is a day, `2026-11-23 03:31` a minute, `2026-11-23 03:31:07`
 a second. So `==` is true within it, `>` after its end, `>=` from its beginning, `<` before it and `<=` up to its end:
-what a table shows is found by `==`. A text without a zone is about local time.
+what a table shows is found by `==`. A text without a zone is about local time. The calendar ends with the years 1 and
+9999 in UTC: what lies beyond, in another zone, is its first or last microsecond.
 """
 
 from __future__ import annotations
@@ -76,14 +77,25 @@ def _span_of_text(text: str, now: datetime.datetime) -> TimeSpan:
 
 def _day(day: datetime.date) -> TimeSpan:
     """A day in the local zone, of 23 hours or 25 where the clocks are changed."""
-    following = day + datetime.timedelta(days=1)
-    midnights = (datetime.datetime.combine(date, datetime.time()) for date in (day, following))
-    return TimeSpan(*(_ns(midnight.astimezone()) for midnight in midnights))
+    # the last microsecond, after the clocks are set back: the calendar's last day has no following midnight
+    ends = (datetime.time.min, datetime.time.max.replace(fold=1))
+    first, last = (_ns(_utc(datetime.datetime.combine(day, end))) for end in ends)
+    return TimeSpan(first, last + 1000)
 
 
 def _span(start: datetime.datetime, length: datetime.timedelta) -> TimeSpan:
-    first = _ns(start.astimezone())
+    first = _ns(_utc(start))
     return TimeSpan(first, first + length // _MICROSECOND * 1000)
+
+
+def _utc(time: datetime.datetime) -> datetime.datetime:
+    """A time (local if it has no zone) in UTC; the first or last one there is if it lies beyond."""
+    try:
+        # of the class itself: those of others (pandas) have other arguments
+        return datetime.datetime.astimezone(time, datetime.UTC)
+    except (OverflowError, ValueError):
+        nearest = datetime.datetime.min if time.year == datetime.MINYEAR else datetime.datetime.max
+        return nearest.replace(tzinfo=datetime.UTC)
 
 
 def _ns(time: datetime.datetime) -> int:
@@ -91,10 +103,9 @@ def _ns(time: datetime.datetime) -> int:
 
 
 def text_of(value: datetime.date) -> str:
-    """A date or a `datetime` (local time if it has no zone) as `span_of` reads it: a day, or a microsecond."""
+    """A date or a `datetime` (local time if it has no zone) as `span_of` reads it: a day, or a microsecond in UTC."""
     if isinstance(value, datetime.datetime):
-        # of the class itself: those of others (pandas) have other arguments
-        return datetime.datetime.astimezone(value).isoformat(timespec="microseconds")
+        return _utc(value).isoformat(timespec="microseconds")
     return value.isoformat()
 
 
