@@ -156,10 +156,12 @@ times = st.sampled_from(
     ]
 )
 real = compared.filter(lambda number: number == number)
+whole = real.filter(lambda number: number % 1 == 0)
 ends = st.sampled_from(["terminal", "timeout", "interrupted", ""])
 FACTS: dict[str, st.SearchStrategy[Any]] = {
-    **dict.fromkeys(("n_tuples", "env", "episode"), real),
-    **dict.fromkeys(("seed", "episode_return"), real | st.none()),
+    **dict.fromkeys(("n_tuples", "env", "episode"), whole),
+    "seed": whole | st.none(),
+    "episode_return": real | st.none(),
     **dict.fromkeys(("terminated", "timeout"), st.booleans()),
     **dict.fromkeys(("id", "created_by", "benchmark_id", "recording"), texts | own_texts),
     **dict.fromkeys(("created_at", "ended"), times),
@@ -177,8 +179,10 @@ def leaves(draw: st.DrawFn) -> BaseFilter:
     if kind is FilterIN:
         return FilterIN(key=key, value=draw(st.lists(given, max_size=20)))
     if kind not in (FilterEQ, FilterNE):
-        if key in ("terminated", "timeout"):
+        if key in ("terminated", "timeout", "end"):
             kind = FilterNE
+        elif key in ("n_tuples", "env", "episode", "seed"):
+            given = real
         else:
             given = given.filter(lambda value: not (value is None or isinstance(value, bool)))
     return kind(key=key, value=draw(given))
@@ -347,7 +351,9 @@ class TestOneMeaning:
         with Catalog(None) as catalog:
             fill(catalog, [header_of(i, base_row({"x": number}, number)) for i, number in enumerate(NUMBERS)])
             for operation in (FilterEQ, FilterNE, FilterGT, FilterGEQ, FilterLT, FilterLEQ):
-                for key in ("metadata.x", *(("episode_return", "seed") if value == value else ())):
+                real = ("metadata.x", "episode_return") if value == value else ("metadata.x",)
+                may_be_seed = value % 1 == 0 or (value == value and operation not in (FilterEQ, FilterNE))
+                for key in (*real, *(("seed",) if may_be_seed else ())):
                     asked = operation(key=key, value=value)
                     expected = [h.episode for h in catalog.episodes() if compile_predicate(asked)(h)]
                     assert [h.episode for h in catalog.episodes(asked)] == expected, asked
@@ -468,9 +474,15 @@ class TestTimes:
                 )
                 for value in (None, True, math.nan, "999999999w ago")
             ),
-            (F("n_tuples") < "20", "'n_tuples' is a number: expected such a value, found '20'"),
-            (F("n_tuples").isin([1, None]), "'n_tuples' is a number: expected such a value, found None"),
-            (F("seed") == True, "'seed' is a number or null: expected such a value, found True"),  # noqa: E712
+            (F("n_tuples") < "20", "'n_tuples' is a whole number: expected such a value, found '20'"),
+            (
+                F("n_tuples").isin([1, None]),
+                "'n_tuples' is a whole number: expected such a value, found None",
+            ),
+            (F("n_tuples") == 1.5, "'n_tuples' is a whole number: expected such a value, found 1.5"),
+            (F("env") != math.inf, "'env' is a whole number: expected such a value, found inf"),
+            (F("seed").isin([1.0, 0.1]), "'seed' is a whole number or null: .*, found 0.1"),
+            (F("seed") == True, "'seed' is a whole number or null: expected such a value, found True"),  # noqa: E712
             (
                 F("episode_return") != math.nan,
                 "nan is equal to nothing; 'episode_return' <= inf is true of all",
@@ -478,6 +490,10 @@ class TestTimes:
             (F("terminated") == 1, "'terminated' is true or false: expected such a value, found 1"),
             (F("end") > 1, "'end' is a text: expected such a value, found 1"),
             (F("end") == "terminated", "'end' is terminal, timeout or interrupted, found 'terminated'"),
+            (
+                F("end") > "terminal",
+                r"'end' has no order: expected ==, != or in, found F\(.end.\) > 'terminal'",
+            ),
             (F("end.x") == 1, "filter key 'end.x': end is a text and has no parts"),
             (F("published_in") == "lab", "'published_in' holds several values and is equal to none"),
             (F("metadata") != 1, "'metadata' holds several values .* name one, such as metadata.score"),

@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.filters import (
     COMBINING,
+    ORDERING,
     BaseFilter,
     FilterAND,
     FilterGEQ,
@@ -25,7 +26,7 @@ from tupli_mcap.schema.filters import (
 )
 from tupli_mcap.schema.models import EpisodeHeader
 from tupli_mcap.schema.times import EXPECTED, TimeSpan, span_of
-from tupli_mcap.schema.values import classify
+from tupli_mcap.schema.values import Scalar, classify
 
 __all__ = ["TIME_KEY", "bound", "check_key", "check_keys", "comparisons", "filter_keys"]
 
@@ -35,11 +36,17 @@ _ENDS: Final = ("terminal", "timeout", "interrupted", "")
 _KINDS: Final[Mapping[Any, str]] = {
     str: "text",
     bool: "bool",
-    int: "number",
+    int: "whole",
     float: "number",
     type(None): "null",
 }
-_WORDS: Final = {"text": "a text", "bool": "true or false", "number": "a number", "null": "null"}
+_WORDS: Final = {
+    "text": "a text",
+    "bool": "true or false",
+    "whole": "a whole number",
+    "number": "a number",
+    "null": "null",
+}
 
 
 def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
@@ -108,18 +115,24 @@ def _check_values(filter: BaseFilter, name: str, kinds: frozenset[str]) -> None:
         raise FilterError(
             f"{key} holds several values and is equal to none; name one, such as metadata.score"
         )
+    ordered = filter.type in ORDERING
     for value in filter.value if filter.type is FilterType.IN else (filter.value,):
-        kind = classify(value).kind
-        if kind == "nan" and "number" in kinds:
+        scalar = classify(value)
+        if scalar.kind == "nan" and kinds & {"whole", "number"}:
             raise FilterError(f"nan is equal to nothing; {key} <= inf is true of all numbers")
-        if kind not in kinds:
+        if not _may_be(kinds, scalar, ordered):
             raise FilterError(f"{key} is {_one_of(kinds)}: expected such a value, found {value!r:.60}")
-        if (
-            name == "end"
-            and filter.type in (FilterType.EQ, FilterType.NE, FilterType.IN)
-            and value not in _ENDS
-        ):
+        if name == "end" and not ordered and value not in _ENDS:
             raise FilterError(f"{key} is terminal, timeout or interrupted, found {value!r:.60}")
+    if name == "end" and ordered:
+        raise FilterError(f"{key} has no order: expected ==, != or in, found {filter!r:.80}")
+
+
+def _may_be(kinds: frozenset[str], scalar: Scalar, ordered: bool) -> bool:
+    """Whether a field of these kinds may be a scalar; in order, whole numbers lie among all numbers."""
+    if scalar.kind == "number" and "whole" in kinds:
+        return ordered or scalar.value % 1 == 0
+    return scalar.kind in kinds
 
 
 def _in_time(filter: BaseFilter, now: datetime.datetime) -> BaseFilter:
