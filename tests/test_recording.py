@@ -439,3 +439,14 @@ def test_an_end_by_hand_is_what_the_flags_say(end: str, flags: tuple[bool, bool]
         )
     with Recording(tmp_path / "a.mcap") as recording:
         assert len(recording) == 1
+
+
+@pytest.mark.parametrize("flag", ["terminal", "timeout"])
+def test_flags_by_hand_are_set_at_the_last_step_only(flag: str, tmp_path: Path) -> None:
+    space = gym.spaces.Discrete(2)
+    flags = {name: [False, name == flag, False] for name in ("terminal", "timeout")}
+    steps = EpisodeData([0] * 3, [0] * 3, [0.0, 0.0, "x"], flags["terminal"], flags["timeout"])
+    with pytest.raises(StepError, match=f"false before the last step, 2, found {flag} at step 1; make an ep"):
+        write_recording(tmp_path / "a.mcap", [steps], observation_space=space, action_space=space)
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert len(recording) == 0

@@ -13,6 +13,7 @@ import gymnasium as gym
 import jsonschema
 import numpy as np
 import pytest
+from crafted import set_flags
 from cryptography.hazmat.primitives import serialization as ser
 from cryptography.hazmat.primitives.asymmetric import ed25519
 from environments import Sampler
@@ -178,13 +179,7 @@ def test_a_state_is_compared_bit_for_bit(tmp_path: Path) -> None:
 
 def test_a_different_end_is_named(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 60)
-
-    def change(i: int, episode: EpisodeData) -> EpisodeData:
-        if i == 0:
-            episode.terminals[4] = True
-        return episode
-
-    first = certify(forge(path, tmp_path / "b.mcap", change)).first
+    first = certify(set_flags(path, 0, 4, terminal=True)).first
     assert first is not None
     assert (first.kind, first.step, first.leaf, first.expected, first.found) == (
         "end", 4, "terminal", "True", "False"

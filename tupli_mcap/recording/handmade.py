@@ -30,9 +30,9 @@ __all__ = ["EpisodeData", "write_recording"]
 class EpisodeData:
     """An episode as sequences of one value a step.
 
-    `final_state` None: not known, and then the last step has no next state. `end` None: from the last step's flags,
-    "interrupted" if neither is set; another one is refused. `frames` are (step, frame), in order; they get the times of
-    the new recording.
+    `final_state` None: not known, and then the last step has no next state. A flag may be set at the last step only.
+    `end` None: from its flags, "interrupted" if neither is set; another one is refused. `frames` are (step, frame), in
+    order; they get the times of the new recording.
     """
 
     states: Sequence[Any]
@@ -67,8 +67,8 @@ def write_recording(
     `frames` says that some of them have frames.
 
     Raises:
-        StepError: an episode without steps, of unequal columns, with values that cannot be stored exactly, or with an
-            `end` that its last step's flags do not say.
+        StepError: an episode without steps, of unequal columns, with values that cannot be stored exactly, with a flag
+            before its last step, or with an `end` that its last step's flags do not say.
     """
     spaces = StepLayout(observation_space, action_space, reward_space)
     cameras = (CAMERA,) if frames else ()
@@ -120,9 +120,15 @@ def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeDa
 
 
 def _end(episode: EpisodeData, last: int) -> int:
-    terminal = exact_flag(episode.terminals[last], "terminal")
-    timeout = exact_flag(episode.timeouts[last], "timeout")
-    end = TERMINAL if terminal else TIMEOUT if timeout else INTERRUPTED
+    end = INTERRUPTED
+    for step, flags in enumerate(zip(episode.terminals, episode.timeouts, strict=True)):
+        terminal, timeout = exact_flag(flags[0], "terminal"), exact_flag(flags[1], "timeout")
+        end = TERMINAL if terminal else TIMEOUT if timeout else INTERRUPTED
+        if end != INTERRUPTED and step < last:
+            raise StepError(
+                f"expected terminal and timeout to be false before the last step, {last}, found {END_NAMES[end]} "
+                f"at step {step}; make an episode of the steps up to it, and another one of those after it"
+            )
     if episode.end is not None and episode.end != END_NAMES[end]:
         raise StepError(
             f"expected the end {END_NAMES[end]!r}, as the flags of the last step say, or None, "
