@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from crafted import find_step
 from environments import Sampler, roll
 from gymnasium import spaces
 from mcap.opcode import Opcode
@@ -574,6 +575,21 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.mcap")
     with pytest.raises(RecordingError, match="a device, a pipe or a socket"):
         recover_recording(tmp_path / "pipe.mcap")
+
+
+@pytest.mark.parametrize("kept", [0, 31], ids=["messages", "bodies"])
+def test_rows_that_change_places_inside_an_episode_are_found(kept: int, tmp_path: Path) -> None:
+    """Whole messages, or what they say: then sequence numbers and times are right, too."""
+    path = record(tmp_path / "a.mcap", steps=60, length=20)
+    model = Model.of(path.read_bytes())
+    (part, i), (other, j) = find_step(model, 1, 5), find_step(model, 1, 12)
+    one, two = part.inner[i], other.inner[j]
+    part.inner[i], other.inner[j] = one[:kept] + two[kept:], two[:kept] + one[kept:]
+    path.write_bytes(model.encode())
+    wrong = [
+        item for item in verify_recording(path).problems if "does not count from the one" in item.message
+    ]
+    assert [(item.channel, item.episode, item.step) for item in wrong] == [("/step", 1, 5), ("/step", 1, 12)]
 
 
 def test_bools_other_than_0_and_1_are_found(tmp_path: Path) -> None:
