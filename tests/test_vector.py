@@ -19,6 +19,7 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 from mcap.reader import make_reader
 
+from tupli_mcap import RecordEpisodes as RecordSingle
 from tupli_mcap import Recording, RecordingError, SpaceError, StepError, verify_recording
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
@@ -482,3 +483,16 @@ def test_many_large_metadata_end_at_one_step(tmp_path: Path) -> None:
         with (tmp_path / "r.mcap").open("rb") as file:
             chunks = make_reader(file).get_summary().chunk_indexes  # type: ignore[union-attr]
         assert max(chunk.uncompressed_size for chunk in chunks) <= 512 * 1024
+
+
+def test_an_environment_of_the_other_kind_is_told_its_class(tmp_path: Path) -> None:
+    one, many = Sampler(spaces.Discrete(2), spaces.Discrete(2)), make(SPACES["box"], MODES[0])
+    with pytest.raises(
+        RecordingError, match=r"found the single environment Sampler; use tupli_mcap\.RecordE"
+    ):
+        RecordEpisodes(one, tmp_path / "a.mcap")  # type: ignore[arg-type]
+    with pytest.raises(
+        RecordingError, match=r"the vector environment SyncVectorEnv; use tupli_mcap\.vector\.RecordE"
+    ):
+        RecordSingle(many, tmp_path / "a.mcap")  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())

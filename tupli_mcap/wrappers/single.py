@@ -36,7 +36,7 @@ from tupli_mcap.wrappers.stacks import format_version, with_stacks
 if TYPE_CHECKING:
     from tupli_mcap.live import LiveSession
 
-__all__ = ["RecordEpisodes", "close_recordings", "live_session", "metadata_of"]
+__all__ = ["RecordEpisodes", "check_kind", "close_recordings", "live_session", "metadata_of"]
 
 StepCallback = Callable[[Step], Mapping[str, Any] | None]
 
@@ -90,7 +90,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
         MissingExtraError: the extra that `live` needs is not installed.
-        RecordingError: the file exists, is being written, or cannot be written.
+        RecordingError: the file exists, is being written, or cannot be written; a vector environment.
 
     Not thread-safe. A forked child cannot go on recording; the parent can.
     """
@@ -122,6 +122,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         max_bytes: int | None = None,
         max_seconds: float | None = None,
     ) -> None:
+        check_kind(env, vector=False)
         super().__init__(env)
         self._base = env.unwrapped
         image_format = check_image_format(image_format)
@@ -412,6 +413,16 @@ def metadata_of(callback: EpisodeMetadataCallback, step: RLTuple) -> str:
         return jsonvalue.dumps_plain(dict(metadata))
     except (TypeError, ValueError) as err:
         raise RecordingError(f"metadata_callback: {err}") from err
+
+
+def check_kind(env: object, *, vector: bool) -> None:
+    """Raises RecordingError if an environment is single where a vector one is expected, or the other way round."""
+    if isinstance(env, gym.Env if vector else gym.vector.VectorEnv):
+        expected, found = ("vector", "single") if vector else ("single", "vector")
+        raise RecordingError(
+            f"expected a {expected} environment, found the {found} environment {type(env).__name__}; "
+            f"use tupli_mcap.{'' if vector else 'vector.'}RecordEpisodes"
+        )
 
 
 def close_recordings(work: Work, live: LiveSession | None) -> None:

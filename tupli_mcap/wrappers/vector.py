@@ -34,7 +34,7 @@ from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import Captured, CaptureEnv
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
-from tupli_mcap.wrappers.single import close_recordings, live_session, metadata_of
+from tupli_mcap.wrappers.single import check_kind, close_recordings, live_session, metadata_of
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
 __all__ = ["RecordEpisodes"]
@@ -82,6 +82,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         max_bytes: int | None = None,
         max_seconds: float | None = None,
     ) -> None:
+        check_kind(env, vector=True)
         super().__init__(env)
         image_format = check_image_format(image_format)
         every = check_every(frames)
