@@ -771,6 +771,28 @@ class TestParser:
         with pytest.raises(FilterError, match=message):
             parse_filter(text)
 
+    @pytest.mark.parametrize(
+        ("text", "found", "right"),
+        [
+            ("end == terminal", "terminal", 'end == "terminal"'),
+            ("ended > 2024-05-01", "2024-05-01", 'ended > "2024-05-01"'),
+            ("(ended <= 2024-05-01 12:30 )", "2024-05-01 12:30", '(ended <= "2024-05-01 12:30" )'),
+            ("not ended > 7d ago AND env=1", "7d ago", 'not ended > "7d ago" AND env=1'),
+            ("id = x@y.z or env = 1", "x@y.z", 'id = "x@y.z" or env = 1'),
+            ("recording != /lab/a.mcap", "/lab/a.mcap", 'recording != "/lab/a.mcap"'),
+            ("metadata.v in [1, 1.2.3]", "1.2.3", 'metadata.v in [1, "1.2.3"]'),
+            ("metadata.s = truely", "truely", 'metadata.s = "truely"'),
+        ],
+    )
+    def test_a_text_without_quotes_is_shown_with_them(self, text: str, found: str, right: str) -> None:
+        said = re.escape(f"found {found!r}; put a text or a time in quotes, as in {right}")
+        with pytest.raises(FilterError, match=f"needs a value .*, {said}$"):
+            parse_filter(text)
+        parse_filter(right)
+
+    def test_words_may_follow_numbers_at_once(self) -> None:
+        assert parse_filter("a = 1and b = 2or c = 3") == (F("a") == 1) & (F("b") == 2) | (F("c") == 3)
+
     @settings(max_examples=500, deadline=None)
     @given(st.text(alphabet="ab.\"'()[]<>=!,12e-+ nortu\\", max_size=25))
     def test_any_text_is_a_filter_or_an_error(self, text: str) -> None:

@@ -48,6 +48,8 @@ _TOKEN: Final = re.compile(
     )""",
     re.VERBOSE | re.IGNORECASE | re.DOTALL,
 )
+_UNQUOTED: Final = re.compile(r"""[^\s()\[\],"'=<>!][^()\[\],"']*""")
+_AFTER_UNQUOTED: Final = re.compile(r"\s(?:and|or)\b", re.IGNORECASE)
 _COMPARISON: Final[Mapping[str, type[BaseFilter]]] = {
     "=": FilterEQ,
     "==": FilterEQ,
@@ -182,9 +184,24 @@ class _Parser:
         elif token.kind == "word" and token.text.lower() in _CONSTANTS:
             value = _CONSTANTS[token.text.lower()]
         else:
-            raise self._error('a value (a number, "text", true, false or null)')
+            raise self._no_value(token)
         self._take()
+        touches = self._next.position == token.position + len(token.text)
+        if touches and self._next.kind in ("number", "word", "unknown") and not self._next.says("and", "or"):
+            raise self._no_value(token)  # 2024-05-01, 7d ago, 1.2.3
         return value
+
+    def _no_value(self, token: _Token) -> FilterError:
+        """What to say of a token that begins no value, perhaps a text or a time without quotes."""
+        expected = 'a value (a number, "text", true, false or null)'
+        match = _UNQUOTED.match(self._text, token.position)
+        if match is None or token.says("and", "or", "not", "in"):
+            return self._error(expected, token)
+        unquoted = _AFTER_UNQUOTED.split(match[0], maxsplit=1)[0].rstrip()
+        before, after = self._text[: token.position], self._text[token.position + len(unquoted) :]
+        right = f"{before}{json.dumps(unquoted, ensure_ascii=False)}{after}"
+        error = self._error(expected, token._replace(text=unquoted))
+        return FilterError(f"{error}; put a text or a time in quotes, as in {right:.200}")
 
     def _number(self, text: str) -> float:
         try:
@@ -219,8 +236,8 @@ class _Parser:
         kind = match.lastgroup
         return _Token(kind, match[kind], match.start(kind))
 
-    def _error(self, expected: str) -> FilterError:
-        token = self._next
+    def _error(self, expected: str, token: _Token | None = None) -> FilterError:
+        token = token or self._next
         found = "the end" if token.kind == "end" else repr(token.text[:40])
         return FilterError(
             f"filter {self._text!r:.200} needs {expected} at character {token.position}, found {found}"
