@@ -518,12 +518,15 @@ class TestPlace:
         mounts.write_text(f"x / {other} rw 0 0\ny {point} {kind} rw 0 0\nz {point}x {other} rw 0 0\n")
         monkeypatch.setattr(place, "_MOUNTS", mounts)
         assert (catalog_path(tmp_path) is not None) == is_local
+        (tmp_path / "lab").mkdir()
         with FileStorage(tmp_path / "lab") as storage:
             assert storage.count_episodes() == 0
         assert (list(cache.rglob("*.sqlite")) != []) == is_local
 
     def test_what_nobody_opens_is_forgotten(self, tmp_path: Path) -> None:
         old, used, new = tmp_path / "old", tmp_path / "used", tmp_path / "new"
+        for root in (old, used, new):
+            root.mkdir()
         for root in (old, used):
             FileStorage(root).count_episodes()
             path = catalog_path(root)

@@ -915,7 +915,7 @@ class TestSharing:
         assert line.startswith("cannot write the bundle 'file/b.mcap': ")
         ok("bundle", lab[1], "-o", "b.mcap", "--storage", "lab")
         line = fails("import", "b.mcap", "--storage", "file/storage")
-        assert line.startswith(f"cannot make the storage '{Path('file/storage').absolute()}': ")
+        assert line.startswith(f"cannot use the storage '{Path('file/storage').absolute()}': ")
 
     def test_a_plain_recording_is_no_bundle(self, here: Path, cartpole: Path) -> None:
         line = fails("import", cartpole, "--storage", "lab")

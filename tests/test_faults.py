@@ -225,7 +225,7 @@ def test_too_many_open_files_are_no_missing_recordings(tmp_path: Path) -> None:
     ("use", "message"),
     [
         (lambda d: FileStorage(d).open_recording(None), "expected the recording of an episode header"),
-        (lambda d: FileStorage(d / "a\0b"), "cannot make the storage .*choose another path"),
+        (lambda d: FileStorage(d / "a\0b"), "cannot use the storage .*choose another path"),
         (lambda d: TupliEnvWrapper(sampler(), "lab"), "storage: expected a TupliStorage"),
         (lambda d: TupliDataset.from_files(None), "expected paths of recordings"),
         (

@@ -17,7 +17,6 @@ import pytest
 from typer.testing import CliRunner
 
 from tupli_mcap import (
-    FileStorage,
     RecordEpisodes,
     Recording,
     files,
@@ -195,10 +194,8 @@ def test_names_of_earlier_versions_and_of_others(tmp_path: Path) -> None:
 
 def test_commands_name_and_remove_what_is_left(recording: Path, tmp_path: Path) -> None:
     storage = tmp_path / "lab"
-    with FileStorage(storage):
-        pass
     places = [tmp_path, storage, storage / "recordings"]
-    places[2].mkdir(exist_ok=True)
+    places[2].mkdir(parents=True)
     with writer(tmp_path / "a"), writer(storage / "a"), writer(places[2] / "a"):
         in_use = {path for place in places for path in place.glob(".*.tmp")}
         assert len(in_use) == 3

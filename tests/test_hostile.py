@@ -399,6 +399,7 @@ def test_times_at_the_limits(time_ns: int, tmp_path: Path, capsys: pytest.Captur
         with pytest.raises(SystemExit) as stopped:
             app([*words, str(path)])
         assert not stopped.value.code, capsys.readouterr().err
+    (tmp_path / "storage").mkdir()
     with FileStorage(tmp_path / "storage") as storage:
         path.rename(tmp_path / "storage" / "hostile.mcap")
         assert len(storage.list_episodes()) == 3

@@ -235,6 +235,7 @@ def test_threads_read_the_same(library: list[Path]) -> None:
 
 
 def test_the_same_from_a_storage_and_after_load(library: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "lab").mkdir()
     storage = FileStorage(tmp_path / "lab")
     for path in library:
         shutil.copy(path, storage.root / path.name)

@@ -469,8 +469,23 @@ class TestFileStorage(StorageContract):
 
     def test_an_unusable_directory_is_one_error(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
-        with pytest.raises(StorageError, match="cannot make the storage"):
+        with pytest.raises(StorageError, match="cannot use the storage"):
             FileStorage(tmp_path / "file" / "lab")
+
+    def test_the_first_write_makes_the_directory(self, tmp_path: Path) -> None:
+        with FileStorage(tmp_path / "a" / "lab") as storage, warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert storage.list_benchmarks() == storage.list_artifacts() == storage.list_episodes() == []
+            assert storage.count_episodes(FilterEQ(key="env", value=0)) == 0
+            assert len(TupliDataset(storage)) == 0
+            with pytest.raises(NotFoundError, match="no benchmark"):
+                storage.load_benchmark("x")
+            storage.reindex()
+            assert list(tmp_path.iterdir()) == []
+            header = storage.store_benchmark(query())
+            made = storage.record_episodes([episode(header.id)])
+            assert storage.list_episodes() == made
+            assert storage.count_episodes(FilterEQ(key="env", value=0)) == 1
 
     def test_compact_rewrites_what_holds_deleted_episodes(self, storage: FileStorage) -> None:
         header = storage.store_benchmark(query())
@@ -575,6 +590,7 @@ class TestFileStorage(StorageContract):
             storage.list_episodes()
 
     def test_a_plain_recording_can_be_dropped_in(self, storage: FileStorage) -> None:
+        storage.root.mkdir()
         with RecordEpisodes(gym.make("CartPole-v1"), storage.root / "plain.mcap") as env:
             env.reset(seed=1)
             while not any(env.step(env.action_space.sample())[2:4]):

@@ -119,21 +119,16 @@ def _import(
     from tupli_mcap.signing import find_key
     from tupli_mcap.storage import bundles
 
-    create = not dry_run
     required = require_signature or bool(signers)
     keys = [find_key(text).public_key for text in signers or ()]
     signed_by: str | None = None
-    if required:  # before a storage is made
+    if required:
         with Recording(file) as recording:
             signature = bundles.checked_signature(recording, required, keys)
             signed_by = None if signature is None else signature.fingerprint
-    with (
-        open_storage(storage_path, create=create)
-        if create or storage_path.is_dir()
-        else nullcontext() as storage
-    ):
+    with open_storage(storage_path, create=True) as storage:
         preview = bundles.preview(storage, file)
-        if storage is not None and not dry_run:
+        if not dry_run:
             storage.import_bundle(file, trust=trust, require_signature=required, signers=keys)
     if as_json:
         print_json({"dry_run": dry_run, **preview._asdict(), "signed_by": signed_by})

@@ -12,6 +12,7 @@ filtering and reading write nothing into the directory.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
@@ -58,13 +59,13 @@ class _Settings(BaseModel):
 
 @refusals_told
 class FileStorage(TupliStorage):
-    """A storage in the directory `root`, made if it is missing (`storage_base_dir` is PyTupli's name for it).
+    """A storage in the directory `root` (`storage_base_dir` is PyTupli's name for it), which the first write makes.
 
     Any number of threads and processes may use one directory at once. The recordings are the truth: files put
     into the directory by other means are found, and what is removed from it is gone.
 
     Raises:
-        StorageError: The directory cannot be made.
+        StorageError: `root` is no directory, and none can be made there, or it may not be looked at.
     """
 
     def __init__(
@@ -76,11 +77,11 @@ class FileStorage(TupliStorage):
         # Absolute: the working directory may change while something is recorded.
         self.root = Path(root if storage_base_dir is None else storage_base_dir).absolute()
         try:
-            with os_errors("cannot make the storage", self.root):
-                self.root.mkdir(parents=True, exist_ok=True)
+            with os_errors("cannot use the storage", self.root), contextlib.suppress(FileNotFoundError):
+                os.scandir(self.root).close()
         except ValueError as err:  # a NUL in it
             raise StorageError(
-                f"cannot make the storage {str(self.root)!r}: {err}; choose another path"
+                f"cannot use the storage {str(self.root)!r}: {err}; choose another path"
             ) from err
         self._lock = Lock(self.root / ".lock")
         self.import_lock = Lock(self.root / ".import.lock")  # two imports of one file would copy it twice

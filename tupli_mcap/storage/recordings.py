@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import errno
+import functools
 import re
 import secrets
 import stat
@@ -184,6 +185,8 @@ class RecordingFiles:
     @property
     def _catalog(self) -> Catalog:
         if self._opened is None:
+            if not self._root.is_dir():
+                return self._empty
             try:
                 with os_errors("no catalog can be kept in", cache_dir()):
                     path = catalog_path(self._root)
@@ -191,6 +194,11 @@ class RecordingFiles:
             except StorageError as err:
                 return self._use_memory(err)
         return self._opened
+
+    @functools.cached_property
+    def _empty(self) -> Catalog:
+        """What is listed before the first write makes the directory: nothing."""
+        return Catalog(None)
 
     def _use_memory(self, err: StorageError) -> Catalog:
         """Go on with a catalog in memory: what is recorded can be listed even where nothing can be written."""
