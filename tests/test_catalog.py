@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tupli_mcap.errors import FilterError, FormatError, StorageError
-from tupli_mcap.messages.jsonvalue import dumps_plain
+from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR
 from tupli_mcap.storage import FileStorage, place
 from tupli_mcap.storage.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp

@@ -17,7 +17,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tupli_mcap.errors import FilterError
-from tupli_mcap.messages.jsonvalue import dumps_plain
+from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.schema import (
     BaseFilter,
     EpisodeHeader,

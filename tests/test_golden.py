@@ -21,8 +21,8 @@ import zstandard
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.container import PROFILE
 from tupli_mcap.recording.contents import read_contents

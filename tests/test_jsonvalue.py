@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages import jsonvalue
-from tupli_mcap.messages.jsonvalue import MAX_DEPTH, dumps, dumps_any, dumps_plain, loads
+from tupli_mcap.jsonvalue import MAX_DEPTH, dumps, dumps_any, dumps_plain, loads
 
 
 def same(one: Any, other: Any) -> bool:

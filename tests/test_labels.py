@@ -16,7 +16,7 @@ from jsonschema import Draft202012Validator
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, SpaceError
 from tupli_mcap.environment import documented_labels
-from tupli_mcap.messages.labels import LABELS_NAME, Labels
+from tupli_mcap.spaces.labels import LABELS_NAME, Labels
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 SCHEMA = json.loads((Path(__file__).parent.parent / "schemas" / "labels.schema.json").read_text())

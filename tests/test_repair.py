@@ -29,11 +29,11 @@ from tupli_mcap import (
     Recording,
     RecordingError,
     journal_path,
+    jsonvalue,
     recover_recording,
     verify_recording,
 )
 from tupli_mcap.cli.app import app
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import RecoveryReport
 from tupli_mcap.recording.attach import add_attachments
 from tupli_mcap.recording.container import MAGIC

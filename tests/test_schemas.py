@@ -22,8 +22,6 @@ from sample_spaces import SPACES, space_id
 
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
-from tupli_mcap.messages.leaves import ROS_TYPES
-from tupli_mcap.messages.spaces import space_to_json
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.cameras import FRAME_LAYOUT, encode_pair
@@ -34,6 +32,8 @@ from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_MEDIA_TYPE, INDEX_NAM
 from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.journal import PAGE, Journal, LogArea, RowArea, journal_path
 from tupli_mcap.schema import ArtifactMetadata
+from tupli_mcap.spaces.leaves import ROS_TYPES
+from tupli_mcap.spaces.space_json import space_to_json
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.wrappers import RecordEpisodes
 

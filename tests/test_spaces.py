@@ -16,9 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_spaces import COMPOSITE_SPACES, FUNDAMENTAL_SPACES, SPACES, space_id
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, SpaceError
-from tupli_mcap.messages import jsonvalue
-from tupli_mcap.messages.spaces import MAX_DEPTH, space_from_json, space_to_json
+from tupli_mcap.spaces.space_json import MAX_DEPTH, space_from_json, space_to_json
 
 # Those of Gymnasium 1.0 sample in the order in which a set happens to be.
 TEXTS_ARE_ORDERED = list(spaces.Text(1).character_list) == sorted(spaces.Text(1).character_set)
@@ -52,7 +52,7 @@ def test_round_trip(space):
 def test_a_space_is_described_alike_in_every_process(text):
     code = f"""if True:
         from gymnasium.spaces import Text
-        from tupli_mcap.messages.spaces import space_to_json
+        from tupli_mcap.spaces.space_json import space_to_json
         print(space_to_json({text}))"""
     command = [sys.executable, "-c", code]
     seen = [

@@ -18,9 +18,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
 
-from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset
+from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset, jsonvalue
 from tupli_mcap.dataset import open_columns
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.merge import merge_recordings

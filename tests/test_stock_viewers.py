@@ -24,8 +24,8 @@ from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
 from test_golden import NAMES, finished
 
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
+from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.companions import write_companions
 
 DECODERS = Path(__file__).parent / "foxglove"

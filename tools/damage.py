@@ -22,8 +22,7 @@ from pathlib import Path
 
 import zstandard
 
-from tupli_mcap import Recording, TupliError, recover_recording, verify_recording
-from tupli_mcap.messages import jsonvalue
+from tupli_mcap import Recording, TupliError, jsonvalue, recover_recording, verify_recording
 
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
 Steps = dict[tuple[int, int], str]

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns import FIELDS
 from tupli_mcap.recording.describe import describe

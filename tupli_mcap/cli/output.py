@@ -95,7 +95,7 @@ def print_json(value: Any) -> None:
     """Print a value as one JSON document: NumPy values as numbers and lists, NaN as `{"$float": "nan"}`."""
     import json
 
-    from tupli_mcap.messages.jsonvalue import MAX_DEPTH, dumps_plain
+    from tupli_mcap.jsonvalue import MAX_DEPTH, dumps_plain
 
     most = 2 * MAX_DEPTH  # of what was read, and of the lists and objects it is printed in
     try:
@@ -107,7 +107,7 @@ def print_json(value: Any) -> None:
 
 def _printable(value: Any, levels: int) -> Any:
     """A value with text in place of what has no JSON, or is nested deeper: it must not hide all the others."""
-    from tupli_mcap.messages.jsonvalue import dumps_plain, shown
+    from tupli_mcap.jsonvalue import dumps_plain, shown
 
     if levels and isinstance(value, dict):
         return {_printable(key, 0): _printable(item, levels - 1) for key, item in value.items()}

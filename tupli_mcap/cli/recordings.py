@@ -371,7 +371,7 @@ def _short(value: object) -> str:
         return f"{value:.4g}"
     if isinstance(value, str):
         return value
-    from tupli_mcap.messages.jsonvalue import shown
+    from tupli_mcap.jsonvalue import shown
 
     return shown(value)
 

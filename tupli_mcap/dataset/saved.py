@@ -17,11 +17,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from tupli_mcap import files
+from tupli_mcap import files, jsonvalue
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import FormatError, StorageError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.common import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import progress

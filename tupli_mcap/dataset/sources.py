@@ -12,8 +12,8 @@ from typing import Any, Protocol, cast
 
 from pydantic import ValidationError
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError, TupliError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import (
     BaseFilter,

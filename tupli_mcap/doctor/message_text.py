@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording.blocks import Array
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["dimension_text", "dimensions", "duration", "plural", "share", "unravel"]
 

@@ -11,7 +11,7 @@ import gymnasium as gym
 from gymnasium import spaces
 from gymnasium.envs.registration import load_env_creator
 
-from tupli_mcap.messages.labels import Labels
+from tupli_mcap.spaces.labels import Labels
 
 __all__ = ["documented_labels"]
 

@@ -1,1 +1,12 @@
-"""Gymnasium spaces and values as ROS 2 messages, NumPy dtypes and CDR bytes."""
+"""The messages of a recording, a kind a module: schema, encoding and decoding side by side.
+
+layout                 CDR offsets, ros2msg definitions and NumPy dtypes of a message of constant size
+step                   the layout of `/step`: where each leaf of state, action and reward lies
+encode_rows            the generated function that writes a step into a row
+decoder, batches       messages of variable size back to values: one, many
+episodes               `/episode_start`, `/episode_end`, `/final_state`
+infos, frames          `/info`; `/camera` and `/frame`
+images/                leaves that are images: how they are compressed
+variable/              Text, Sequence, Graph and OneOf
+shared_dtypes          one dtype for values of several recordings
+"""

@@ -12,8 +12,8 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages import cdr
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["LOG_TIME", "BatchDecoder", "Decode"]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import SpaceError
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["check_layouts", "common_dtype", "field_leaves"]
 

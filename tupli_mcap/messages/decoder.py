@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["MessageDecoder"]
 

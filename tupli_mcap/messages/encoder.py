@@ -21,10 +21,10 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
-from tupli_mcap.messages.exact import check_structure, exact_array, exact_flag, leaf_value, shorten
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.messages.leaves import DType, Leaf
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.spaces.exact import check_structure, exact_array, exact_flag, leaf_value, shorten
+from tupli_mcap.spaces.leaves import DType, Leaf
 
 __all__ = ["COMMIT", "EPISODE_AND_STEP", "HOLE", "SEQUENCE_OFFSET", "RowEncoder", "make_row_encoder"]
 

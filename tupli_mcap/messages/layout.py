@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.messages.leaves import DType, Leaf, ros_type
+from tupli_mcap.spaces.leaves import DType, Leaf, ros_type
 
 __all__ = [
     "BODY",

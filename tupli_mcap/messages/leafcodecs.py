@@ -13,8 +13,8 @@ from gymnasium import spaces
 
 from tupli_mcap.errors import FormatError, SpaceError, StepError
 from tupli_mcap.messages import cdr
-from tupli_mcap.messages.exact import exact_array, shorten
-from tupli_mcap.messages.leaves import ROS_TYPES, ros_type
+from tupli_mcap.spaces.exact import exact_array, shorten
+from tupli_mcap.spaces.leaves import ROS_TYPES, ros_type
 
 __all__ = [
     "Codec",

@@ -14,8 +14,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, SpaceError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.layout import (
     BODY,
     ImageLayout,
@@ -24,9 +24,9 @@ from tupli_mcap.messages.layout import (
     image_layout,
     message_text,
 )
-from tupli_mcap.messages.leaves import ROS_TYPES, DType, Leaf, NameRegistry, flatten_space, structure
-from tupli_mcap.messages.spaces import space_from_json, space_to_json
 from tupli_mcap.messages.variable import VariableField
+from tupli_mcap.spaces.leaves import ROS_TYPES, DType, Leaf, NameRegistry, flatten_space, structure
+from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 
 __all__ = ["FINAL_STATE_SCHEMA", "STEP_SCHEMA", "Stack", "StepLayout", "can_stack", "stack_of"]
 

@@ -35,7 +35,6 @@ from tupli_mcap.messages.leafcodecs import (
     numeric_items,
     text,
 )
-from tupli_mcap.messages.leaves import ROS_TYPES, NameRegistry
 from tupli_mcap.messages.nestedcodecs import (
     Maybe,
     Step,
@@ -51,6 +50,7 @@ from tupli_mcap.messages.nestedcodecs import (
     with_dummy,
 )
 from tupli_mcap.messages.widening import EDGE_LINKS
+from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry
 
 __all__ = ["VariableField"]
 

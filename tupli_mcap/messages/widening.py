@@ -13,8 +13,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.messages.exact import decide_dtype
-from tupli_mcap.messages.leaves import DType, Leaf
+from tupli_mcap.spaces.exact import decide_dtype
+from tupli_mcap.spaces.leaves import DType, Leaf
 
 __all__ = ["EDGE_LINKS", "variable_dtypes"]
 

@@ -7,11 +7,11 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.messages.labels import Labels
-from tupli_mcap.messages.leaves import Leaf
-from tupli_mcap.messages.names import element_names
 from tupli_mcap.plots.series import drawn
 from tupli_mcap.recording.blocks import Array
+from tupli_mcap.spaces.element_names import element_names
+from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["LeafValues"]
 

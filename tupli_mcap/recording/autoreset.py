@@ -25,7 +25,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 from tupli_mcap.errors import StepError
-from tupli_mcap.messages.exact import shorten
+from tupli_mcap.spaces.exact import shorten
 
 __all__ = ["Autoreset"]
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 
-from tupli_mcap import trust
+from tupli_mcap import jsonvalue, trust
 from tupli_mcap.environment import (
     PickleImports,
     canonical_json,
@@ -22,7 +22,6 @@ from tupli_mcap.environment import (
     sha256,
 )
 from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.signature import verify_signature
 from tupli_mcap.recording.signed import SIGNATURE_NAME, claimed_signer

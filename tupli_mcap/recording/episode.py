@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording.events import END_NAMES, EpisodeStart
 
 if TYPE_CHECKING:

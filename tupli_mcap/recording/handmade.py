@@ -10,9 +10,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StepError
-from tupli_mcap.messages import jsonvalue
-from tupli_mcap.messages.exact import exact_flag, shorten
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.cameras import EncodedFrame
 from tupli_mcap.recording.events import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
@@ -22,6 +21,7 @@ from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.recording.work import BEGUN, DONE, Work
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
+from tupli_mcap.spaces.exact import exact_flag, shorten
 
 __all__ = ["EpisodeData", "write_recording"]
 

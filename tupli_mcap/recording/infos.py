@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.messages import jsonvalue
-from tupli_mcap.messages.exact import shorten
-from tupli_mcap.messages.leaves import NameRegistry
 from tupli_mcap.recording.events import read_strings
+from tupli_mcap.spaces.exact import shorten
+from tupli_mcap.spaces.leaves import NameRegistry
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.writer import RecordingWriter

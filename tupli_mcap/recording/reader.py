@@ -13,12 +13,10 @@ import gymnasium as gym
 import numpy as np
 from mcap.records import Channel
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
 from tupli_mcap.errors import FormatError, RecordingError, memory_for
-from tupli_mcap.messages import jsonvalue
-from tupli_mcap.messages.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.claims import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
@@ -34,6 +32,8 @@ from tupli_mcap.recording.signed import SIGNATURE_NAME, voucher
 from tupli_mcap.recording.source import open_source
 from tupli_mcap.recording.stored import StoredSteps
 from tupli_mcap.recording.summary import read_attachment
+from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
+from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.trust import TrustedKey, is_trusted
 
 __all__ = ["AttachmentInfo", "RecordedBenchmark", "Recording"]

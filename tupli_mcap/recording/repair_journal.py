@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import FRAMES_AREA
 from tupli_mcap.recording.contents import step_channels
@@ -21,6 +20,7 @@ from tupli_mcap.recording.repair_gather import Gathered, Piece
 from tupli_mcap.recording.repair_segments import Channels, messages
 from tupli_mcap.recording.rows import RowDeriver
 from tupli_mcap.recording.salvage import Salvage, log_records, running_record, size_behind
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["add_journal"]
 

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StepError
-from tupli_mcap.messages import jsonvalue
-from tupli_mcap.messages.exact import decide_dtype, leaf_value, shorten
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.autoreset import Autoreset
 from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
@@ -23,6 +21,8 @@ from tupli_mcap.recording.step_log import Encoder, StepLog, leaf_encoders
 from tupli_mcap.recording.vector_infos import check_infos, final_states, info_of, reset_info_of
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
+from tupli_mcap.spaces.exact import decide_dtype, leaf_value, shorten
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["VectorRecorder"]
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import StepError
-from tupli_mcap.messages.exact import shorten
+from tupli_mcap.spaces.exact import shorten
 
 __all__ = ["check_infos", "final_info_of", "final_states", "info_of", "reset_info_of"]
 

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.events import INTERRUPTED, EpisodeEnd, EpisodeStart
@@ -21,6 +20,7 @@ from tupli_mcap.recording.findings import Findings
 from tupli_mcap.recording.headers import message_headers
 from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.reader import Recording
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["verify_episodes"]
 

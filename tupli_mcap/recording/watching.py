@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.labels import LABELS_NAME, Labels
 from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.cameras import EncodedFrame, decode_frame
@@ -26,6 +25,7 @@ from tupli_mcap.recording.rows import HOLE, SingleRows
 from tupli_mcap.recording.step_log import StepLog
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.spaces.labels import LABELS_NAME, Labels
 
 __all__ = ["NewInfo", "NewSteps", "Watcher"]
 

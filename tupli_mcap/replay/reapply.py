@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import TupliError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.episode import item_getter
 from tupli_mcap.replay.plan import EpisodePlan, ResetCall

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError
-from tupli_mcap.messages.jsonvalue import loads
+from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import ArtifactMetadata, ArtifactMetadataItem, BaseFilter, compile_predicate
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import SpaceError, StorageError
-from tupli_mcap.messages.jsonvalue import dumps_plain
+from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.recording import EpisodeData
 from tupli_mcap.schema import Episode
 

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.times import iso_utc
@@ -43,7 +43,7 @@ class EpisodeRow(NamedTuple):
     """An episode to catalogue.
 
     `end` is `terminal`, `timeout` or `interrupted`; `created_at` is in ns since 1970 (UTC); `published_in` is the JSON
-    text of a list of group names and `metadata` that of an object, strict JSON as `tupli_mcap.messages.jsonvalue`
+    text of a list of group names and `metadata` that of an object, strict JSON as `tupli_mcap.jsonvalue`
     writes it.
     """
 

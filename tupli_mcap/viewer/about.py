@@ -10,9 +10,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe import describe, nan_text
+from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import title_of
 
 __all__ = ["card", "plain", "send_about"]

@@ -19,7 +19,6 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.cdr import write_string
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, Field, record_dtype
-from tupli_mcap.messages.leaves import Leaf
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.container import Rows
@@ -27,6 +26,7 @@ from tupli_mcap.recording.events import record
 from tupli_mcap.recording.logs import group_records, iter_records
 from tupli_mcap.recording.rewrite import Follower, rewrite_recording
 from tupli_mcap.recording.rows import even_rows
+from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names
 
 __all__ = ["ARRAY_SCHEMA", "STRING_SCHEMA", "WIDEST", "companion_topics", "write_companions"]

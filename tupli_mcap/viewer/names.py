@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["dimension_names", "entity_of", "escaped", "title_of"]
 

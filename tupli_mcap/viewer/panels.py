@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Array, Block
 from tupli_mcap.viewer.sending import Times, send_scalars
 

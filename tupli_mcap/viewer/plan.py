@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.messages.jsonvalue import shown
+from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.about import plain, send_about
 from tupli_mcap.viewer.arrange import blueprint_of

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.messages.jsonvalue import shown
-from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
+from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
 from tupli_mcap.viewer.panels import PALETTE, Place, named, plot

@@ -8,8 +8,8 @@ from typing import Any
 import gymnasium as gym
 
 from tupli_mcap.environment import documented_labels
-from tupli_mcap.messages.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
 from tupli_mcap.wrappers.benchmark import Captured
 
 __all__ = ["with_labels"]

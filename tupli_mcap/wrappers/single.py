@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, StepError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step

@@ -15,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import iterate
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
-from tupli_mcap.messages import jsonvalue
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.autoreset import Autoreset
 from tupli_mcap.recording.durability import Durability

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError, SpaceError
-from tupli_mcap.messages.leaves import ROS_TYPES
+from tupli_mcap.spaces.leaves import ROS_TYPES
 
 __all__ = ["Fields", "Json", "dtype_name", "numbers", "short"]
 

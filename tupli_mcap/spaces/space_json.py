@@ -15,9 +15,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, SpaceError
-from tupli_mcap.messages import jsonvalue
-from tupli_mcap.messages.spacefields import Fields, Json, dtype_name, numbers, short
+from tupli_mcap.spaces.space_fields import Fields, Json, dtype_name, numbers, short
 
 __all__ = ["MAX_DEPTH", "space_from_json", "space_to_json"]
 

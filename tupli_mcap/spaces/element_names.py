@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tupli_mcap.messages.labels import Labels
-from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["element_names", "short_path"]
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from gymnasium import spaces
 
 from tupli_mcap.errors import FormatError, SpaceError
-from tupli_mcap.messages.leaves import Leaf
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["LABELS_MEDIA_TYPE", "LABELS_NAME", "MAX_LABELS", "Labels", "chosen_labels"]
 

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import StepError
-from tupli_mcap.messages.leaves import ROS_TYPES, DType, Leaf
+from tupli_mcap.spaces.leaves import ROS_TYPES, DType, Leaf
 
 __all__ = [
     "check_structure",
