@@ -54,7 +54,7 @@ def test_the_kth_call_of_a_rollout_fails(tmp_path: Path, name: str) -> None:
 
 
 def test_the_harness_notices_a_step_that_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tupli_mcap.recording.container import Container
+    from tupli_mcap.mcap.container import Container
 
     write = Container.write
     monkeypatch.setattr(

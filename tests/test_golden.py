@@ -23,11 +23,11 @@ from mcap_ros2.decoder import DecoderFactory
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.container import PROFILE
+from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.container import PROFILE
 from tupli_mcap.recording.contents import read_contents
 from tupli_mcap.recording.options import WriterOptions
-from tupli_mcap.recording.source import PathSource
 from tupli_mcap.recording.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[1]

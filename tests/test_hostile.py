@@ -30,9 +30,9 @@ from tupli_mcap import RecordEpisodes
 from tupli_mcap.cli.app import _report, app
 from tupli_mcap.dataset import TupliDataset
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.mcap.compression import MAX_RATIO, decompress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.compression import MAX_RATIO, decompress
 from tupli_mcap.recording.journal import RowArea, read_journal
 from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.storage import FileStorage

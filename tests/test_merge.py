@@ -29,8 +29,8 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.source import PathSource
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

@@ -20,8 +20,8 @@ from mcap.reader import make_reader
 from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError
+from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.merge import merge_recordings
 from tupli_mcap.recording.options import WriterOptions
 from tupli_mcap.recording.pictures import decode_pixels

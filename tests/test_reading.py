@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 
 from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.container import CHUNK_ROWS
+from tupli_mcap.mcap.crc import crc32
+from tupli_mcap.mcap.source import PathSource, open_source
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
-from tupli_mcap.recording.container import CHUNK_ROWS
-from tupli_mcap.recording.crc import crc32
-from tupli_mcap.recording.source import PathSource, open_source
 from tupli_mcap.recording.together import do_all
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

@@ -589,7 +589,7 @@ def test_too_little_memory_to_compress_is_one_error(compression: str) -> None:
 import resource
 import numpy as np
 from tupli_mcap import RecordingError
-from tupli_mcap.recording.container import Container
+from tupli_mcap.mcap.container import Container
 container = Container(-1, "r.mcap", {compression!r})
 data = [np.random.default_rng(i).bytes(1 << 17) for i in range(64)]
 container.pack_all(data[:2])

@@ -31,10 +31,10 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.mcap.checksums import with_crc
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording import recover
-from tupli_mcap.recording.checksums import with_crc
-from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.durability import checksum
 from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.journal import JournalContents, RowArea, read_journal

@@ -34,17 +34,17 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.mcap.chunk_records import message_headers
+from tupli_mcap.mcap.container import MAGIC
+from tupli_mcap.mcap.source import PathSource
+from tupli_mcap.mcap.survey import Damage, Found, Survey
 from tupli_mcap.recording import RecoveryReport
 from tupli_mcap.recording.attach import add_attachments
-from tupli_mcap.recording.container import MAGIC
-from tupli_mcap.recording.headers import message_headers
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
 from tupli_mcap.recording.repair_gather import gather
 from tupli_mcap.recording.repair_plan import NewPlaces, make_plan
 from tupli_mcap.recording.repair_segments import Channels
 from tupli_mcap.recording.signature import SIGNATURE_NAME, check_signature, sign_recording
-from tupli_mcap.recording.source import PathSource
-from tupli_mcap.recording.survey import Damage, Found, Survey
 from tupli_mcap.recording.tail import Tail, read_tail
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

@@ -45,8 +45,8 @@ from tupli_mcap.errors import (
     TupliError,
     UntrustedError,
 )
+from tupli_mcap.mcap.container import Container, Prepared, Rows
 from tupli_mcap.recording.attach import add_attachments
-from tupli_mcap.recording.container import Container, Prepared, Rows
 from tupli_mcap.recording.signature import check_signature, sign_recording, verify_signature
 from tupli_mcap.recording.signed import SIGNATURE_NAME, Signed
 from tupli_mcap.recording.verify import verify_recording
@@ -434,7 +434,7 @@ def _metadata_in_the_summary(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     monkeypatch.setattr(Container, "finish", longer)
     monkeypatch.setattr(Container, "_statistics", counted)
-    monkeypatch.setattr("tupli_mcap.recording.container.SummaryOffset", offset)
+    monkeypatch.setattr("tupli_mcap.mcap.container.SummaryOffset", offset)
     return {}
 
 

@@ -22,7 +22,7 @@ from environments import Sampler, roll
 from gymnasium import spaces
 
 from tupli_mcap import RecordEpisodes, Recording, RecordingError, journal_path, rewrite_recording
-from tupli_mcap.recording.lock import FileLock, is_locked
+from tupli_mcap.mcap.lock import FileLock, is_locked
 
 Names = Callable[[Path], Path]
 

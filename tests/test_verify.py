@@ -39,9 +39,10 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap import chunk_records as headers
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording import VerifyReport, headers, rewrite, transfer
-from tupli_mcap.recording.container import Container
+from tupli_mcap.recording import VerifyReport, rewrite, transfer
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.logs import iter_records

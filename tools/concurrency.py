@@ -40,7 +40,7 @@ import numpy as np
 
 from tupli_mcap import FileStorage, Recording, TupliDataset, TupliEnvWrapper
 from tupli_mcap.errors import NotFoundError, StorageError
-from tupli_mcap.recording.lock import is_locked
+from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.schema import EpisodeMetadataCallback, F, FilterEQ, RLTuple
 from tupli_mcap.storage.place import catalog_path
 

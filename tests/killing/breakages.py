@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.encoder import COMMIT, SEQUENCE_OFFSET
 from tupli_mcap.recording import logs, rows
-from tupli_mcap.recording.container import Container
 
 __all__ = ["BREAKAGES"]
 

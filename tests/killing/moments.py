@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from types import CodeType, FrameType
 from typing import Any
 
-from tupli_mcap.recording.container import Container
+from tupli_mcap.mcap.container import Container
 
 __all__ = ["MOMENTS", "Moment", "die", "lay_trap"]
 

@@ -16,7 +16,7 @@ import lz4.frame
 import numpy as np
 import zstandard
 
-from tupli_mcap.recording.container import CHUNK_ROWS, MAGIC
+from tupli_mcap.mcap.container import CHUNK_ROWS, MAGIC
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME
 
 __all__ = [

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.cameras import (
@@ -15,7 +16,6 @@ from tupli_mcap.recording.cameras import (
     FRAME_SCHEMA,
     CameraTopics,
 )
-from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.events import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.recording.imagecodecs import CODEC, image_codecs
 from tupli_mcap.recording.journal import Area, LogArea, RowArea

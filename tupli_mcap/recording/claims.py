@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.compression import MAX_RATIO
+from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording.compression import MAX_RATIO
-from tupli_mcap.recording.container import COMPRESSIONS, MAGIC
 
 __all__ = [
     "EPISODE_TOPICS",

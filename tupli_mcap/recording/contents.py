@@ -11,13 +11,11 @@ import numpy as np
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.checksums import check_crc
-from tupli_mcap.recording.claims import check_chunks
-from tupli_mcap.recording.container import CHUNK_ROWS, Rows
-from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME, EpisodeIndex
-from tupli_mcap.recording.lock import is_locked
-from tupli_mcap.recording.source import Source
-from tupli_mcap.recording.summary import (
+from tupli_mcap.mcap.checksums import check_crc
+from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
+from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.source import Source
+from tupli_mcap.mcap.summary import (
     check_magic,
     foreign,
     has_summary,
@@ -25,6 +23,8 @@ from tupli_mcap.recording.summary import (
     read_metadata,
     read_summary,
 )
+from tupli_mcap.recording.claims import check_chunks
+from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME, EpisodeIndex
 
 __all__ = ["Contents", "NewerVersionError", "check_version", "read_contents"]
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.mcap.compression import decompress
+from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows
+from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
-from tupli_mcap.recording.compression import decompress
-from tupli_mcap.recording.container import COMPRESSIONS, Container, Prepared, Rows
 from tupli_mcap.recording.rows import even_rows
-from tupli_mcap.recording.source import Source
 
 __all__ = ["first_chunks"]
 

@@ -13,8 +13,8 @@ from zlib import crc32
 
 import numpy as np
 
+from tupli_mcap.mcap.crc import crc32_each
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS
-from tupli_mcap.recording.crc import crc32_each
 from tupli_mcap.recording.episode_rows import EpisodeBatch, StartedEpisode
 from tupli_mcap.recording.events import (
     END_FIELDS,

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 from mcap.records import Channel
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.pngcodec import PngCodec
 from tupli_mcap.recording.stackcodec import StackCodec
 from tupli_mcap.spaces.leaves import Leaf

@@ -12,8 +12,8 @@ import numpy as np
 import zstandard
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.compression import MAX_RATIO, decompress
-from tupli_mcap.recording.container import CHUNK_ROWS
+from tupli_mcap.mcap.compression import MAX_RATIO, decompress
+from tupli_mcap.mcap.container import CHUNK_ROWS
 
 __all__ = ["EPISODE_ROWS", "INDEX_NAME", "EpisodeIndex", "IndexBuilder"]
 

@@ -15,8 +15,8 @@ from zlib import crc32
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
-from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.journal import LogArea
 
 __all__ = [

@@ -16,6 +16,8 @@ from mcap.records import Channel
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
 from tupli_mcap.errors import FormatError, RecordingError, memory_for
+from tupli_mcap.mcap.source import open_source
+from tupli_mcap.mcap.summary import read_attachment
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
@@ -29,9 +31,7 @@ from tupli_mcap.recording.imagecodecs import image_codecs
 from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.pieces import Runs, runs_of
 from tupli_mcap.recording.signed import SIGNATURE_NAME, voucher
-from tupli_mcap.recording.source import open_source
 from tupli_mcap.recording.stored import StoredSteps
-from tupli_mcap.recording.summary import read_attachment
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.trust import TrustedKey, is_trusted

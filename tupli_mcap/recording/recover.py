@@ -16,6 +16,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.mcap.source import PathSource, Source
+from tupli_mcap.mcap.summary import foreign, has_summary, parse_record, records
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import FRAMES_AREA
 from tupli_mcap.recording.chunks import ChunkStore
@@ -39,8 +41,6 @@ from tupli_mcap.recording.salvage import (
     to_rows,
 )
 from tupli_mcap.recording.scan import Scan, is_ours, scan
-from tupli_mcap.recording.source import PathSource, Source
-from tupli_mcap.recording.summary import foreign, has_summary, parse_record, records
 from tupli_mcap.system import refused
 
 __all__ = [

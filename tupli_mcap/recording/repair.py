@@ -10,11 +10,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError
+from tupli_mcap.mcap.container import MAGIC, Container
+from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.source import PathSource, Source
+from tupli_mcap.mcap.summary import OTHER_TOOLS
+from tupli_mcap.mcap.survey import Damage, attachment_name
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.container import MAGIC, Container
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.repair_frames import OldCameras, frames_lost
 from tupli_mcap.recording.repair_gather import Gathered, gather, is_recording, may_be_recording
@@ -24,9 +27,6 @@ from tupli_mcap.recording.repair_segments import Channels
 from tupli_mcap.recording.repair_write import RepairWriter
 from tupli_mcap.recording.replacing import replacing, tidy
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
-from tupli_mcap.recording.source import PathSource, Source
-from tupli_mcap.recording.summary import OTHER_TOOLS
-from tupli_mcap.recording.survey import Damage, attachment_name
 from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.system import refused
 

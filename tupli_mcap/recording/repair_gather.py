@@ -12,11 +12,15 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Metadata, Schema
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.checked_records import message_index
+from tupli_mcap.mcap.checksums import check_crc
+from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records, message_headers
+from tupli_mcap.mcap.container import CHUNK_ROWS, MAGIC, PROFILE
+from tupli_mcap.mcap.source import Source
+from tupli_mcap.mcap.summary import parse_record
+from tupli_mcap.mcap.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording.checked import message_index
-from tupli_mcap.recording.checksums import check_crc
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore, Span
-from tupli_mcap.recording.container import CHUNK_ROWS, MAGIC, PROFILE
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
     RECORDING_KEYS,
@@ -24,12 +28,8 @@ from tupli_mcap.recording.contents import (
     check_version,
     is_ours,
 )
-from tupli_mcap.recording.headers import ChunkRecords, chunk_records, message_headers
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.salvage import FinalHole
-from tupli_mcap.recording.source import Source
-from tupli_mcap.recording.summary import parse_record
-from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.recording.tail import Tail
 
 __all__ = ["Gathered", "Piece", "Pieces", "gather", "is_recording", "may_be_recording"]

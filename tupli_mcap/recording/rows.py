@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.encoder import EPISODE_AND_STEP, HOLE, SEQUENCE_OFFSET, ImageSink, make_row_encoder
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.episode_log import EpisodeLog, Foretold
 from tupli_mcap.recording.episode_rows import EpisodeRows, StartedEpisode

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import SECTOR, STATE, checksum, seal_of
 from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea
 from tupli_mcap.recording.logs import iter_records

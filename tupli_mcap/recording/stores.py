@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import FRAMES_AREA, Channels
-from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.episode_log import EpisodeLog
 from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.journal import Journal

@@ -9,11 +9,10 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.checked import attachment_index, checked_attachment
-from tupli_mcap.recording.container import COMPRESSIONS, MAGIC
-from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
-from tupli_mcap.recording.source import Source
-from tupli_mcap.recording.summary import (
+from tupli_mcap.mcap.checked_records import attachment_index, checked_attachment
+from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC
+from tupli_mcap.mcap.source import Source
+from tupli_mcap.mcap.summary import (
     FOOTER_SIZE,
     Summary,
     has_summary,
@@ -22,7 +21,8 @@ from tupli_mcap.recording.summary import (
     read_summary,
     records,
 )
-from tupli_mcap.recording.survey import KnownChunk
+from tupli_mcap.mcap.survey import KnownChunk
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
 
 __all__ = ["Tail", "read_tail"]
 

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.cameras import EncodedFrame, encode_frame, encode_pair
-from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.copies import first_chunks
 from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.episode_log import EpisodeLog, Foretold
 from tupli_mcap.recording.episode_rows import EpisodeRows, StartedEpisode

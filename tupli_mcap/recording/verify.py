@@ -10,20 +10,20 @@ from pathlib import Path
 
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError, TupliError
+from tupli_mcap.mcap.container import Container
+from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.source import PathSource, Source
+from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.container import Container
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
 from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.infos import info_schema
 from tupli_mcap.recording.journal import journal_info, recorded_journal
-from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.recover import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head
 from tupli_mcap.recording.repair_gather import may_be_recording
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
-from tupli_mcap.recording.source import PathSource, Source
-from tupli_mcap.recording.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.recording.verify_episodes import verify_episodes
 from tupli_mcap.recording.verify_frames import verify_frames

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.chunk_records import message_headers
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.cameras import FRAME_LAYOUT, CameraTopics, decode_frame
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.findings import Findings
-from tupli_mcap.recording.headers import message_headers
 from tupli_mcap.recording.pictures import format_of
 from tupli_mcap.recording.reader import Recording
 

@@ -10,10 +10,14 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.checked_records import message_index
+from tupli_mcap.mcap.checksums import check_crc
+from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records
+from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, MAGIC, PROFILE
+from tupli_mcap.mcap.source import Source
+from tupli_mcap.mcap.summary import FOOTER_SIZE, parse_record, records
+from tupli_mcap.mcap.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.messages.layout import CDR_HEADER
-from tupli_mcap.recording.checked import message_index
-from tupli_mcap.recording.checksums import check_crc
-from tupli_mcap.recording.container import CHUNK_ROWS, COMPRESSIONS, MAGIC, PROFILE
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
     RECORDING_KEYS,
@@ -22,11 +26,7 @@ from tupli_mcap.recording.contents import (
     is_ours,
 )
 from tupli_mcap.recording.findings import Findings, VerifyReport
-from tupli_mcap.recording.headers import ChunkRecords, chunk_records
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.source import Source
-from tupli_mcap.recording.summary import FOOTER_SIZE, parse_record, records
-from tupli_mcap.recording.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.recording.tail import Tail
 
 __all__ = ["Structure"]

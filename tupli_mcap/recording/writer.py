@@ -19,9 +19,11 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError
+from tupli_mcap.mcap.container import Container, Rows
+from tupli_mcap.mcap.lock import FileLock
+from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import plan_areas, register_channels
-from tupli_mcap.recording.container import Container, Rows
 from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
 from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.imagecodecs import png_leaves
@@ -35,8 +37,6 @@ from tupli_mcap.recording.journal import (
     journal_path,
     owner_among,
 )
-from tupli_mcap.recording.library import library
-from tupli_mcap.recording.lock import FileLock
 from tupli_mcap.recording.logs import EventLog
 from tupli_mcap.recording.options import WriterOptions, check_options
 from tupli_mcap.recording.recover import metadata_at

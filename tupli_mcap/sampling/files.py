@@ -8,7 +8,7 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
-from tupli_mcap.recording.source import Source, open_source
+from tupli_mcap.mcap.source import Source, open_source
 
 __all__ = ["FileOfMany", "OpenFiles"]
 

@@ -22,8 +22,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.lock import is_locked
 from tupli_mcap.storage.entries import catalog_rows
 from tupli_mcap.storage.rows import RecordingStamp, store_row
 from tupli_mcap.storage.scan import stamp_of

@@ -15,8 +15,8 @@ from typing import Any, Self, TypeVar
 
 from tupli_mcap import files
 from tupli_mcap.errors import FormatError, RecordingError, SignatureError, StorageError
+from tupli_mcap.mcap.lock import drop_private, open_private
 from tupli_mcap.recording import journal_path
-from tupli_mcap.recording.lock import drop_private, open_private
 from tupli_mcap.system import refused
 
 __all__ = ["Lock", "LockError", "fill", "locked", "os_errors", "refusals_told", "write_bytes"]

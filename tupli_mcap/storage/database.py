@@ -15,7 +15,7 @@ from sqlalchemy import URL, Connection, Dialect, Engine, Pool, StaticPool, creat
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from tupli_mcap.errors import FilterError, StorageError
-from tupli_mcap.recording.lock import drop_private
+from tupli_mcap.mcap.lock import drop_private
 from tupli_mcap.storage.atomic import Lock, LockError, locked
 from tupli_mcap.storage.place import is_private, make_private
 from tupli_mcap.storage.sqlite import key_statements, register_functions, table_statements

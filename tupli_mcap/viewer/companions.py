@@ -16,12 +16,12 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.cdr import write_string
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, Field, record_dtype
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.container import Rows
 from tupli_mcap.recording.events import record
 from tupli_mcap.recording.logs import group_records, iter_records
 from tupli_mcap.recording.rewrite import Follower, rewrite_recording

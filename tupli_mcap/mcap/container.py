@@ -36,8 +36,8 @@ from mcap.records import (
 )
 
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.recording.checksums import with_crc
-from tupli_mcap.recording.crc import crc32
+from tupli_mcap.mcap.checksums import with_crc
+from tupli_mcap.mcap.crc import crc32
 from tupli_mcap.system import refused
 
 __all__ = ["CHUNK_ROWS", "MAGIC", "Compression", "Container"]

@@ -10,7 +10,7 @@ import numpy as np
 from mcap.records import AttachmentIndex
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.source import Source
+from tupli_mcap.mcap.source import Source
 
 __all__ = ["attachment_index", "checked_attachment", "message_index"]
 

@@ -18,12 +18,12 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.checked import attachment_index, checked_attachment, message_index
+from tupli_mcap.mcap.checked_records import attachment_index, checked_attachment, message_index
+from tupli_mcap.mcap.compression import MAX_RATIO, decompress
+from tupli_mcap.mcap.container import MAGIC
+from tupli_mcap.mcap.source import Source
+from tupli_mcap.mcap.summary import parse_record
 from tupli_mcap.recording.claims import MAX_CHUNK
-from tupli_mcap.recording.compression import MAX_RATIO, decompress
-from tupli_mcap.recording.container import MAGIC
-from tupli_mcap.recording.source import Source
-from tupli_mcap.recording.summary import parse_record
 
 __all__ = ["Chunk", "Damage", "Found", "KnownChunk", "Survey", "attachment_name"]
 

@@ -22,9 +22,9 @@ from mcap.records import (
 )
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.container import MAGIC, PROFILE
-from tupli_mcap.recording.crc import crc32
-from tupli_mcap.recording.source import Source
+from tupli_mcap.mcap.container import MAGIC, PROFILE
+from tupli_mcap.mcap.crc import crc32
+from tupli_mcap.mcap.source import Source
 
 __all__ = [
     "OTHER_TOOLS",
