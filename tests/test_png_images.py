@@ -21,11 +21,11 @@ from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError
 from tupli_mcap.mcap.container import Rows
+from tupli_mcap.messages.images.pictures import decode_pixels
+from tupli_mcap.messages.images.png import PngCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.merge import merge_recordings
 from tupli_mcap.recording.options import WriterOptions
-from tupli_mcap.recording.pictures import decode_pixels
-from tupli_mcap.recording.pngcodec import PngCodec
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.rows import even_rows

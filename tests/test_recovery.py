@@ -33,10 +33,10 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.mcap.checksums import with_crc
 from tupli_mcap.mcap.container import Container
+from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording import recover
 from tupli_mcap.recording.durability import checksum
-from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.journal import JournalContents, RowArea, read_journal
 from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.salvage import Salvage

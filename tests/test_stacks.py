@@ -20,13 +20,13 @@ from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset, jsonvalue
 from tupli_mcap.dataset import open_columns
+from tupli_mcap.messages.images.stack import StackCodec
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.merge import merge_recordings
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.rows import even_rows
-from tupli_mcap.recording.stackcodec import StackCodec
 from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

@@ -41,7 +41,7 @@ from tupli_mcap import (
 from tupli_mcap.cli import app
 from tupli_mcap.doctor import examine
 from tupli_mcap.environment import named_imports
-from tupli_mcap.messages import encoder
+from tupli_mcap.messages import encode_rows as encoder
 from tupli_mcap.recording.carried import carried_code
 from tupli_mcap.recording.describe import describe
 from tupli_mcap.recording.repair import recover_recording

@@ -227,7 +227,7 @@ def stacked(path: Path, axis: int = 0, **options: Any) -> list[Log]:
 def png_images(path: Path) -> list[Log]:
     env = Played(CAMERA, picture, ENDS)
     with (
-        mock.patch("tupli_mcap.recording.pngcodec.encode_pixels", stored_png),
+        mock.patch("tupli_mcap.messages.images.png.encode_pixels", stored_png),
         RecordEpisodes(
             env, path, image_format="png", compression="none", attachments={}, chunk_size=400
         ) as recorder,
@@ -237,7 +237,7 @@ def png_images(path: Path) -> list[Log]:
 
 
 def png_stacks(path: Path) -> list[Log]:
-    with mock.patch("tupli_mcap.recording.pngcodec.encode_pixels", stored_png):
+    with mock.patch("tupli_mcap.messages.images.png.encode_pixels", stored_png):
         return stacked(path, image_format="png")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.messages.encoder import COMMIT, SEQUENCE_OFFSET
+from tupli_mcap.messages.encode_rows import COMMIT, SEQUENCE_OFFSET
 from tupli_mcap.recording import logs, rows
 
 __all__ = ["BREAKAGES"]

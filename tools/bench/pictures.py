@@ -17,7 +17,7 @@ from PIL import Image
 from tools.bench.data import Array
 from tools.bench.measure import Run, alternate, check, seconds_of
 from tupli_mcap import RecordEpisodes, Recording
-from tupli_mcap.recording.pictures import ImageFormat
+from tupli_mcap.messages.images.pictures import ImageFormat
 
 __all__ = ["compare"]
 

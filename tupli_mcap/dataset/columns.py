@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.messages.common import common_dtype, field_leaves
+from tupli_mcap.messages.shared_dtypes import common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 
 __all__ = ["FieldBuilder", "LeafBuilder", "pick"]

@@ -13,7 +13,7 @@ from tupli_mcap.dataset.columns import FieldBuilder, pick
 from tupli_mcap.dataset.selection import TupleSelector
 from tupli_mcap.dataset.sources import Source
 from tupli_mcap.errors import memory_for
-from tupli_mcap.messages.common import check_layouts
+from tupli_mcap.messages.shared_dtypes import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording

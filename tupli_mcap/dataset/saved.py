@@ -21,7 +21,7 @@ from tupli_mcap import files, jsonvalue
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import FormatError, StorageError
-from tupli_mcap.messages.common import field_leaves
+from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import progress
 from tupli_mcap.recording.blocks import step_bytes

@@ -9,8 +9,8 @@ import numpy as np
 
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.live.target import Target
+from tupli_mcap.messages.images.codecs import CODEC
 from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA, RECORD_HEADER
-from tupli_mcap.recording.imagecodecs import CODEC
 from tupli_mcap.recording.watching import NewSteps, Watcher
 from tupli_mcap.recording.writer import RecordingWriter
 

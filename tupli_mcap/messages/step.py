@@ -24,7 +24,7 @@ from tupli_mcap.messages.layout import (
     image_layout,
     message_text,
 )
-from tupli_mcap.messages.variable import VariableField
+from tupli_mcap.messages.variable.codec import VariableField
 from tupli_mcap.spaces.leaves import ROS_TYPES, DType, Leaf, NameRegistry, flatten_space, structure
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.plots.series import LARGEST
 from tupli_mcap.plots.trace import Trace
@@ -13,7 +14,6 @@ from tupli_mcap.plots.values import LeafValues
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Array, blocks, step_bytes
 from tupli_mcap.recording.describe import RecordingDescription, describe
-from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.spaces.element_names import short_path
 
 __all__ = ["Measured", "measure"]

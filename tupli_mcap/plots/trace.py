@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots.series import drawn
 from tupli_mcap.plots.values import LeafValues
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Array, blocks
-from tupli_mcap.recording.events import END_NAMES
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["Pictures", "Trace", "trace"]

@@ -12,12 +12,12 @@ from mcap.records import Channel
 
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
 from tupli_mcap.mcap.source import Source
+from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart, record
+from tupli_mcap.messages.frames import FRAME_LAYOUT
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.cameras import FRAME_LAYOUT
 from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import Contents
-from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart, record
 from tupli_mcap.recording.facts import Run, runs
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.salvage import FinalHole, to_rows

@@ -11,7 +11,7 @@ import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.recording.events import END_NAMES, EpisodeStart
+from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.columns import Columns

@@ -14,9 +14,7 @@ from zlib import crc32
 import numpy as np
 
 from tupli_mcap.mcap.crc import crc32_each
-from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS
-from tupli_mcap.recording.episode_rows import EpisodeBatch, StartedEpisode
-from tupli_mcap.recording.events import (
+from tupli_mcap.messages.episodes import (
     END_FIELDS,
     START_FIELDS,
     EpisodeEnd,
@@ -25,6 +23,8 @@ from tupli_mcap.recording.events import (
     record,
     start_texts,
 )
+from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS
+from tupli_mcap.recording.episode_rows import EpisodeBatch, StartedEpisode
 from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder
 from tupli_mcap.recording.journal import LogArea
 from tupli_mcap.recording.logs import FRONT, EvenRecords, EventLog, Sink

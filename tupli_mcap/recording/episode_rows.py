@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.messages.encoder import HOLE
+from tupli_mcap.messages.encode_rows import HOLE
+from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd
 from tupli_mcap.recording.durability import STATE
-from tupli_mcap.recording.events import TERMINAL, TIMEOUT, EpisodeEnd
 
 __all__ = ["EpisodeBatch", "EpisodeRows", "StartedEpisode"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.recording.cameras import (
+from tupli_mcap.messages.frames import (
     CAMERA_NAME,
     CAMERA_SCHEMA,
     FRAME_LAYOUT,
@@ -20,9 +20,9 @@ from tupli_mcap.recording.cameras import (
     camera_names,
     decode_frame,
 )
+from tupli_mcap.messages.images.pictures import Picture, decode_picture
 from tupli_mcap.recording.chunks import ChunkStore
 from tupli_mcap.recording.contents import Contents
-from tupli_mcap.recording.pictures import Picture, decode_picture
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.reader import Recording

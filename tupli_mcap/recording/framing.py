@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.recording.cameras import EncodedFrame, encode_frame, encode_pair
-from tupli_mcap.recording.pictures import FrameFormat, check_picture, encode_picture
+from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
+from tupli_mcap.messages.images.pictures import FrameFormat, check_picture, encode_picture
 from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.writer import RecordingWriter
 

@@ -12,11 +12,11 @@ import gymnasium as gym
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StepError
+from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
+from tupli_mcap.messages.frames import EncodedFrame
+from tupli_mcap.messages.infos import InfoRecorder
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.cameras import EncodedFrame
-from tupli_mcap.recording.events import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.recording.framing import CAMERA, put_frame
-from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.options import Mode, WriterOptions
 from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.recording.work import BEGUN, DONE, Work

@@ -16,9 +16,9 @@ import numpy as np
 from tupli_mcap.errors import RecordingError, SpaceError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
+from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
-from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.replacing import replacing, tidy
 from tupli_mcap.recording.rewrite import camera_channels, define, write

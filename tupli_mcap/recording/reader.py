@@ -18,6 +18,9 @@ from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrus
 from tupli_mcap.errors import FormatError, RecordingError, memory_for
 from tupli_mcap.mcap.source import open_source
 from tupli_mcap.mcap.summary import read_attachment
+from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA, EpisodeStart
+from tupli_mcap.messages.images.codecs import image_codecs
+from tupli_mcap.messages.infos import InfoDecoder
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
@@ -25,10 +28,7 @@ from tupli_mcap.recording.claims import EPISODE_TOPICS, StepClaims, check_episod
 from tupli_mcap.recording.columns import FIELDS, ColumnReader, Columns
 from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
-from tupli_mcap.recording.events import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA, EpisodeStart
 from tupli_mcap.recording.frames import Cameras, Frames
-from tupli_mcap.recording.imagecodecs import image_codecs
-from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.pieces import Runs, runs_of
 from tupli_mcap.recording.signed import SIGNATURE_NAME, voucher
 from tupli_mcap.recording.stored import StoredSteps

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from mcap.records import Channel
 
-from tupli_mcap.recording.cameras import (
+from tupli_mcap.messages.frames import (
     CAMERA_NAME,
     CAMERA_SCHEMA,
     FRAME_LAYOUT,

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import FRAMES_AREA
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.events import EpisodeStart
 from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, read_journal, recorded_journal
 from tupli_mcap.recording.recover import STEPS_IN_JOURNAL, belongs, define, misplaced_journal
 from tupli_mcap.recording.repair_gather import Gathered, Piece

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.recording.index import EpisodeIndex
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
 from tupli_mcap.recording.repair_segments import Channels, Ranges, Segment, messages, segments

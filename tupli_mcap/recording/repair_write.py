@@ -16,12 +16,12 @@ import numpy as np
 
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
+from tupli_mcap.messages.episodes import record
+from tupli_mcap.messages.frames import CameraTopics
+from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.cameras import CameraTopics
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
-from tupli_mcap.recording.events import record
-from tupli_mcap.recording.imagecodecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_frames import OldCameras, kept_frames

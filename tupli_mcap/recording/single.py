@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from tupli_mcap.errors import StepError
+from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd
+from tupli_mcap.messages.infos import InfoRecorder
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.widening import variable_dtypes
-from tupli_mcap.recording.events import INTERRUPTED, EpisodeEnd
-from tupli_mcap.recording.infos import InfoRecorder
+from tupli_mcap.messages.variable.widening import variable_dtypes
 from tupli_mcap.recording.rows import SingleRows
 from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
 from tupli_mcap.spaces.exact import check_structure, decide_dtype, exact_array, leaf_value

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from tupli_mcap.mcap.container import Container, Rows
+from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
+from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording.cameras import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.recording.copies import first_chunks
-from tupli_mcap.recording.events import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.reader import Recording

@@ -12,10 +12,10 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StepError
+from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
+from tupli_mcap.messages.infos import InfoRecorder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.autoreset import Autoreset
-from tupli_mcap.recording.events import INTERRUPTED, TERMINAL, TIMEOUT
-from tupli_mcap.recording.infos import InfoRecorder
 from tupli_mcap.recording.single import decide_layout
 from tupli_mcap.recording.step_log import Encoder, StepLog, leaf_encoders
 from tupli_mcap.recording.vector_infos import check_infos, final_states, info_of, reset_info_of

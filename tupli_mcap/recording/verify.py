@@ -14,11 +14,11 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
+from tupli_mcap.messages.images.codecs import png_leaves
+from tupli_mcap.messages.infos import info_schema
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
-from tupli_mcap.recording.imagecodecs import png_leaves
-from tupli_mcap.recording.infos import info_schema
 from tupli_mcap.recording.journal import journal_info, recorded_journal
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.recover import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head

@@ -12,13 +12,13 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import message_headers
 from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
+from tupli_mcap.messages.infos import InfoDecoder
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.events import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.recording.facts import StepFacts, step_facts
 from tupli_mcap.recording.findings import Findings
-from tupli_mcap.recording.infos import InfoDecoder
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.spaces.leaves import Leaf
 

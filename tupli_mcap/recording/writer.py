@@ -22,11 +22,11 @@ from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError
 from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.mcap.writer_name import library
+from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
 from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
-from tupli_mcap.recording.imagecodecs import png_leaves
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.journal import (
     Area,

@@ -6,8 +6,8 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from tupli_mcap.recording.cameras import EncodedFrame
-from tupli_mcap.recording.pictures import FrameFormat, Picture, decode_picture, encode_picture
+from tupli_mcap.messages.frames import EncodedFrame
+from tupli_mcap.messages.images.pictures import FrameFormat, Picture, decode_picture, encode_picture
 
 __all__ = ["Film"]
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import RecordingError, missing_extra
-from tupli_mcap.recording.pictures import Picture, resized
+from tupli_mcap.messages.images.pictures import Picture, resized
 
 __all__ = ["Indexed", "check_movie", "write_movie"]
 

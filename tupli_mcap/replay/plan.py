@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+from tupli_mcap.messages.episodes import INTERRUPTED
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.events import INTERRUPTED
 
 __all__ = ["EpisodePlan", "How", "plan_episodes"]
 

@@ -11,10 +11,10 @@ from typing import Any, Final, NamedTuple
 import gymnasium as gym
 
 from tupli_mcap.errors import RecordingError, TupliError, UntrustedError
+from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.framing import CAMERA, RENDER_MODE
-from tupli_mcap.recording.pictures import FrameFormat, check_format, check_picture, resized
 from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.signed import SIGNATURE_NAME

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import NotFoundError
-from tupli_mcap.messages.common import check_layouts
+from tupli_mcap.messages.shared_dtypes import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.chunks import ChunkCache, ChunkStore

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.messages.batches import BatchDecoder, Decode
-from tupli_mcap.messages.common import common_dtype
+from tupli_mcap.messages.shared_dtypes import common_dtype
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.sampling.gather import TIME, Column, ConstantRows, DecodedRows, RowFormat, Rows
 from tupli_mcap.sampling.index import StepIndex

@@ -15,8 +15,8 @@ from tupli_mcap import trust as _trust
 from tupli_mcap.environment import EnvironmentRecord, sha256
 from tupli_mcap.errors import FormatError, NotFoundError, SignatureError, StepError, StorageError
 from tupli_mcap.files import create
+from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
-from tupli_mcap.recording.cameras import EncodedFrame
 from tupli_mcap.recording.framing import CAMERA
 from tupli_mcap.recording.signature import (
     SIGNATURE_NAME,

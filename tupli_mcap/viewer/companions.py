@@ -19,10 +19,10 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.cdr import write_string
 from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.episodes import record
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, Field, record_dtype
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.events import record
 from tupli_mcap.recording.logs import group_records, iter_records
 from tupli_mcap.recording.rewrite import Follower, rewrite_recording
 from tupli_mcap.recording.rows import even_rows

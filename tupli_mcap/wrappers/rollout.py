@@ -15,10 +15,10 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.messages.infos import RecordInfo
 from tupli_mcap.recording.describe import spread_of
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.framing import RENDER_MODE
-from tupli_mcap.recording.infos import RecordInfo
 from tupli_mcap.recording.options import Mode
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.wrappers.benchmark import CaptureEnv

@@ -15,14 +15,14 @@ from gymnasium.envs.registration import EnvSpec
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
+from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
+from tupli_mcap.messages.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
-from tupli_mcap.recording.events import TERMINAL, TIMEOUT
 from tupli_mcap.recording.framing import CAMERA, FrameRecorder, check_every, check_render_mode
-from tupli_mcap.recording.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.recording.options import Mode, WriterOptions
-from tupli_mcap.recording.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.recording.rotation import Rotation
 from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.recording.work import ASKING, BEGUN, DONE, Work

@@ -7,8 +7,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import Stack, StepLayout, can_stack, stack_of
-from tupli_mcap.recording.pictures import ImageFormat
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["format_version", "with_stacks"]

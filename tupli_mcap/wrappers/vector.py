@@ -17,14 +17,14 @@ from gymnasium.vector.utils import iterate
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
+from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
+from tupli_mcap.messages.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.autoreset import Autoreset
 from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.framing import CAMERA, VectorFrames, check_every, check_render_mode
-from tupli_mcap.recording.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.recording.options import Mode, WriterOptions
-from tupli_mcap.recording.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.recording.rotation import Rotation
 from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.vector_infos import final_info_of, info_of

@@ -13,10 +13,10 @@ from mcap.records import Channel
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import Rows
+from tupli_mcap.messages.images.png import PngCodec
+from tupli_mcap.messages.images.stack import StackCodec
 from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.pngcodec import PngCodec
-from tupli_mcap.recording.stackcodec import StackCodec
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["CODEC", "ImageCodec", "image_codecs", "png_leaves", "uses_codecs"]

@@ -14,7 +14,7 @@ from gymnasium.spaces import GraphInstance
 
 from tupli_mcap.errors import FormatError, StepError
 from tupli_mcap.messages import cdr
-from tupli_mcap.messages.leafcodecs import Codec, Decode, Encode, expect_tuple
+from tupli_mcap.messages.variable.leaf_codecs import Codec, Decode, Encode, expect_tuple
 from tupli_mcap.spaces.exact import shorten
 
 __all__ = [

@@ -14,7 +14,7 @@ import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.recording.events import read_strings
+from tupli_mcap.messages.episodes import read_strings
 from tupli_mcap.spaces.exact import shorten
 from tupli_mcap.spaces.leaves import NameRegistry
 

@@ -24,7 +24,7 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from tupli_mcap.errors import FormatError, SpaceError, StepError
-from tupli_mcap.messages.leafcodecs import (
+from tupli_mcap.messages.variable.leaf_codecs import (
     Codec,
     Decode,
     Encode,
@@ -35,7 +35,7 @@ from tupli_mcap.messages.leafcodecs import (
     numeric_items,
     text,
 )
-from tupli_mcap.messages.nestedcodecs import (
+from tupli_mcap.messages.variable.nested_codecs import (
     Maybe,
     Step,
     decode_dict,
@@ -49,7 +49,7 @@ from tupli_mcap.messages.nestedcodecs import (
     items_of,
     with_dummy,
 )
-from tupli_mcap.messages.widening import EDGE_LINKS
+from tupli_mcap.messages.variable.widening import EDGE_LINKS
 from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry
 
 __all__ = ["VariableField"]

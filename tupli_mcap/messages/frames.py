@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.episodes import read_strings
 from tupli_mcap.messages.layout import IMAGE_SCHEMA, MessageLayout
-from tupli_mcap.recording.events import read_strings
 
 __all__ = [
     "CAMERA_NAME",
