@@ -20,7 +20,7 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording
-from tupli_mcap.recording import journal as journals
+from tupli_mcap.journal import file as journals
 from tupli_mcap.recording import journal_path, writer
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

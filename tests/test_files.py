@@ -230,7 +230,7 @@ def test_a_journal_that_is_not_in_its_place_yet_is_in_use(
     """The map of a journal keeps its lock."""
     found = []
     monkeypatch.setattr(
-        "tupli_mcap.recording.journal.Journal.publish",
+        "tupli_mcap.journal.file.Journal.publish",
         lambda self, **_: found.extend([self._temporary.exists(), *files.left_in(tmp_path)]),
     )
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:

@@ -25,9 +25,9 @@ from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.cli import app
 from tupli_mcap.doctor import examine
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
+from tupli_mcap.journal.file import journal_path
 from tupli_mcap.messages.images.pictures import decode_picture, encode_picture
 from tupli_mcap.recording import rewrite_recording
-from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.schema import FilterEQ
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.vector import RecordEpisodes as RecordVector

@@ -30,10 +30,10 @@ from tupli_mcap import RecordEpisodes
 from tupli_mcap.cli.app import _report, app
 from tupli_mcap.dataset import TupliDataset
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.journal.file import RowArea, read_journal
 from tupli_mcap.mcap.compression import MAX_RATIO, decompress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.journal import RowArea, read_journal
 from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.listing import list_recordings
@@ -565,7 +565,7 @@ def test_holes_of_a_journal_take_no_memory(tmp_path: Path) -> None:
     if path.stat().st_blocks * 512 > area.size:
         pytest.skip("this file system has no holes")
     script = MEASURE.split("def read")[0] + (
-        "from tupli_mcap.recording.journal import read_journal\n"
+        "from tupli_mcap.journal.file import read_journal\n"
         "Path('/proc/self/clear_refs').write_text('5')\nbefore = peak()\n"
         "found = read_journal(Path(sys.argv[1])).data['steps']\n"
         "assert found[100:104].tobytes() == b'here' and not found[200:300].any()\nprint(peak() - before)\n"

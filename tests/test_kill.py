@@ -19,8 +19,8 @@ from killing.kinds import KINDS
 from killing.moments import MOMENTS, die
 
 from tupli_mcap import RecordEpisodes, Recording, files, journal_path, recover_recording
+from tupli_mcap.journal.file import Journal
 from tupli_mcap.mcap.lock import FileLock
-from tupli_mcap.recording.journal import Journal
 from tupli_mcap.recording.vector import VectorRecorder
 from tupli_mcap.recording.vector_rows import VectorRows
 from tupli_mcap.recording.writer import RecordingWriter

@@ -21,12 +21,12 @@ from gymnasium.vector import SyncVectorEnv
 from test_recovery import killed
 
 from tupli_mcap import RecordEpisodes, Recording, journal_path, recover_recording, verify_recording
+from tupli_mcap.journal import file as journals
+from tupli_mcap.journal.committed import Salvage
+from tupli_mcap.journal.file import JournalContents, RowArea, read_journal
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording import journal as journals
-from tupli_mcap.recording.journal import JournalContents, RowArea, read_journal
 from tupli_mcap.recording.rows import HOLE
-from tupli_mcap.recording.salvage import Salvage
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)

@@ -21,7 +21,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from tupli_mcap import RecordEpisodes, Recording, verify_recording
 from tupli_mcap.errors import RecordingError, StepError
-from tupli_mcap.recording.episode_rows import EpisodeRows
+from tupli_mcap.journal.derive import EpisodeRows
 from tupli_mcap.recording.rows import SingleRows
 from tupli_mcap.recording.single import SingleRecorder
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes

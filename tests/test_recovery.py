@@ -31,15 +31,15 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.journal.committed import Salvage
+from tupli_mcap.journal.file import JournalContents, RowArea, read_journal
+from tupli_mcap.journal.logs import iter_records
+from tupli_mcap.journal.seals import checksum
 from tupli_mcap.mcap.checksums import with_crc
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording import recover
-from tupli_mcap.recording.durability import checksum
-from tupli_mcap.recording.journal import JournalContents, RowArea, read_journal
-from tupli_mcap.recording.logs import iter_records
-from tupli_mcap.recording.salvage import Salvage
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)

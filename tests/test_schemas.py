@@ -21,6 +21,7 @@ from referencing import Registry, Resource
 from sample_spaces import SPACES, space_id
 
 from tupli_mcap.benchmark import TupliEnvWrapper
+from tupli_mcap.journal.file import PAGE, Journal, LogArea, RowArea, journal_path
 from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, PROFILE
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.frames import FRAME_LAYOUT, encode_pair
@@ -30,7 +31,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.journal import PAGE, Journal, LogArea, RowArea, journal_path
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.spaces.leaves import ROS_TYPES
 from tupli_mcap.spaces.space_json import space_to_json

@@ -39,13 +39,13 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
 from tupli_mcap.errors import FormatError
+from tupli_mcap.journal.logs import iter_records
 from tupli_mcap.mcap import chunk_records as headers
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording import VerifyReport, rewrite, transfer
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage.verify import verify_paths, verify_storage
 

@@ -6,9 +6,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from tupli_mcap.journal import logs
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.encode_rows import COMMIT, SEQUENCE_OFFSET
-from tupli_mcap.recording import logs, rows
+from tupli_mcap.recording import rows
 
 __all__ = ["BREAKAGES"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from tupli_mcap.journal.file import journal_path
 from tupli_mcap.recording.columns import Columns
 from tupli_mcap.recording.episode import Episode, Episodes, Step
-from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.recording.reader import RecordedBenchmark, Recording
 
 if TYPE_CHECKING:

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.journal.file import journal_info, journal_path, recorded_journal
+from tupli_mcap.journal.seals import sync_file
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import check_magic, has_summary
@@ -18,8 +20,6 @@ from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.chunks import IN_MEMORY
 from tupli_mcap.recording.contents import Contents, read_contents
-from tupli_mcap.recording.durability import sync_file
-from tupli_mcap.recording.journal import journal_info, journal_path, recorded_journal
 from tupli_mcap.recording.recover import belongs, head, metadata_at, misplaced_journal
 from tupli_mcap.recording.signed import SIGNATURE_NAME
 

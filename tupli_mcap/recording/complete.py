@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel
 
+from tupli_mcap.journal.committed import FinalHole, to_rows
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart, record
@@ -20,7 +21,6 @@ from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.facts import Run, runs
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.salvage import FinalHole, to_rows
 from tupli_mcap.recording.scan import Scan
 
 __all__ = ["Unwritten", "chunk_table", "complete"]

@@ -13,6 +13,9 @@ from zlib import crc32
 
 import numpy as np
 
+from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
+from tupli_mcap.journal.file import LogArea
+from tupli_mcap.journal.logs import FRONT, EvenRecords, EventLog, Sink
 from tupli_mcap.mcap.crc import crc32_each
 from tupli_mcap.messages.episodes import (
     END_FIELDS,
@@ -24,10 +27,7 @@ from tupli_mcap.messages.episodes import (
     start_texts,
 )
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS
-from tupli_mcap.recording.episode_rows import EpisodeBatch, StartedEpisode
 from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder
-from tupli_mcap.recording.journal import LogArea
-from tupli_mcap.recording.logs import FRONT, EvenRecords, EventLog, Sink
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels

@@ -16,22 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.summary import foreign, has_summary, parse_record, records
-from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.channels import FRAMES_AREA
-from tupli_mcap.recording.chunks import ChunkStore
-from tupli_mcap.recording.complete import Unwritten, chunk_table, complete
-from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata, step_channels
-from tupli_mcap.recording.journal import (
-    JournalContents,
-    LogArea,
-    RowArea,
-    journal_info,
-    read_journal,
-    recorded_journal,
-)
-from tupli_mcap.recording.salvage import (
+from tupli_mcap.journal.committed import (
     Salvage,
     committed_rows,
     image_rows,
@@ -40,6 +25,21 @@ from tupli_mcap.recording.salvage import (
     size_behind,
     to_rows,
 )
+from tupli_mcap.journal.file import (
+    JournalContents,
+    LogArea,
+    RowArea,
+    journal_info,
+    read_journal,
+    recorded_journal,
+)
+from tupli_mcap.mcap.source import PathSource, Source
+from tupli_mcap.mcap.summary import foreign, has_summary, parse_record, records
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.channels import FRAMES_AREA
+from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.complete import Unwritten, chunk_table, complete
+from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata, step_channels
 from tupli_mcap.recording.scan import Scan, is_ours, scan
 from tupli_mcap.system import refused
 

@@ -12,6 +12,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Metadata, Schema
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.journal.committed import FinalHole
 from tupli_mcap.mcap.checked_records import message_index
 from tupli_mcap.mcap.checksums import check_crc
 from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records, message_headers
@@ -29,7 +30,6 @@ from tupli_mcap.recording.contents import (
     is_ours,
 )
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.salvage import FinalHole
 from tupli_mcap.recording.tail import Tail
 
 __all__ = ["Gathered", "Piece", "Pieces", "gather", "is_recording", "may_be_recording"]

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.journal.committed import Salvage, log_records, running_record, size_behind
+from tupli_mcap.journal.file import JournalContents, LogArea, RowArea, read_journal, recorded_journal
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import FRAMES_AREA
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea, read_journal, recorded_journal
 from tupli_mcap.recording.recover import STEPS_IN_JOURNAL, belongs, define, misplaced_journal
 from tupli_mcap.recording.repair_gather import Gathered, Piece
 from tupli_mcap.recording.repair_segments import Channels, messages
 from tupli_mcap.recording.rows import RowDeriver
-from tupli_mcap.recording.salvage import Salvage, log_records, running_record, size_behind
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["add_journal"]

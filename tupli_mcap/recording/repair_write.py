@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.episodes import record
@@ -23,7 +24,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.repair_frames import OldCameras, kept_frames
 from tupli_mcap.recording.repair_gather import Gathered, PackedStore
 from tupli_mcap.recording.repair_plan import IN_A_HOLE, RUNNING, NewPlaces, Plan, PlannedEpisode

@@ -12,6 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.journal.derive import EpisodeRows, StartedEpisode
+from tupli_mcap.journal.file import RowArea
+from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.encode_rows import (
     EPISODE_AND_STEP,
@@ -23,10 +26,7 @@ from tupli_mcap.messages.encode_rows import (
 from tupli_mcap.messages.episodes import EpisodeEnd
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.durability import STATE, seal
 from tupli_mcap.recording.episode_log import EpisodeLog, Foretold
-from tupli_mcap.recording.episode_rows import EpisodeRows, StartedEpisode
-from tupli_mcap.recording.journal import RowArea
 from tupli_mcap.spaces.exact import exact_array
 from tupli_mcap.spaces.leaves import Leaf
 

@@ -10,13 +10,13 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC, PROFILE, Rows
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import parse_record
 from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.logs import group_records
 
 __all__ = ["Scan", "scan"]
 

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.copies import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.logs import group_records
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.rows import even_rows
 

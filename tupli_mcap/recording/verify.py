@@ -10,6 +10,7 @@ from pathlib import Path
 
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError, TupliError
+from tupli_mcap.journal.file import journal_info, recorded_journal
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import PathSource, Source
@@ -19,7 +20,6 @@ from tupli_mcap.messages.infos import info_schema
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
-from tupli_mcap.recording.journal import journal_info, recorded_journal
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.recover import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head
 from tupli_mcap.recording.repair_gather import may_be_recording

@@ -19,16 +19,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError
-from tupli_mcap.mcap.container import Container, Rows
-from tupli_mcap.mcap.lock import FileLock
-from tupli_mcap.mcap.writer_name import library
-from tupli_mcap.messages.images.codecs import png_leaves
-from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.channels import plan_areas, register_channels
-from tupli_mcap.recording.durability import boot_id, sync_directory, sync_file
-from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
-from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.journal import (
+from tupli_mcap.journal.file import (
     Area,
     Journal,
     journal_aside,
@@ -37,7 +28,16 @@ from tupli_mcap.recording.journal import (
     journal_path,
     owner_among,
 )
-from tupli_mcap.recording.logs import EventLog
+from tupli_mcap.journal.logs import EventLog
+from tupli_mcap.journal.seals import boot_id, sync_directory, sync_file
+from tupli_mcap.mcap.container import Container, Rows
+from tupli_mcap.mcap.lock import FileLock
+from tupli_mcap.mcap.writer_name import library
+from tupli_mcap.messages.images.codecs import png_leaves
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.channels import plan_areas, register_channels
+from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.options import WriterOptions, check_options
 from tupli_mcap.recording.recover import metadata_at
 from tupli_mcap.recording.rows import ImageRows, SingleRows

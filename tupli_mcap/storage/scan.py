@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from tupli_mcap.recording.journal import journal_name
+from tupli_mcap.journal.file import journal_name
 from tupli_mcap.storage.rows import RecordingStamp
 from tupli_mcap.storage.sidecar import DELETING, Deletion, sidecar_path
 

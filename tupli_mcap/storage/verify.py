@@ -12,10 +12,10 @@ from typing import Any
 
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, TupliError
+from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.findings import Findings, VerifyReport
-from tupli_mcap.recording.journal import journal_path
 from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.storage import bundles
 from tupli_mcap.storage.artifacts import ArtifactFiles

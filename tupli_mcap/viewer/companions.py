@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.journal.logs import group_records, iter_records
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.cdr import write_string
 from tupli_mcap.messages.decoder import MessageDecoder
@@ -23,7 +24,6 @@ from tupli_mcap.messages.episodes import record
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, Field, record_dtype
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.logs import group_records, iter_records
 from tupli_mcap.recording.rewrite import Follower, rewrite_recording
 from tupli_mcap.recording.rows import even_rows
 from tupli_mcap.spaces.leaves import Leaf

@@ -15,9 +15,9 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.infos import RecordInfo
 from tupli_mcap.recording.describe import spread_of
-from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.framing import RENDER_MODE
 from tupli_mcap.recording.options import Mode
 from tupli_mcap.recording.reader import Recording

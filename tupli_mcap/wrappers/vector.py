@@ -17,11 +17,11 @@ from gymnasium.vector.utils import iterate
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
+from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.messages.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.autoreset import Autoreset
-from tupli_mcap.recording.durability import Durability
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.framing import CAMERA, VectorFrames, check_every, check_render_mode
 from tupli_mcap.recording.options import Mode, WriterOptions

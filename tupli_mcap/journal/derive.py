@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.journal.seals import STATE
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd
-from tupli_mcap.recording.durability import STATE
 
 __all__ = ["EpisodeBatch", "EpisodeRows", "StartedEpisode"]
 

@@ -29,8 +29,8 @@ import numpy as np
 
 from tupli_mcap import files
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.journal.seals import boot_id, sync_directory
 from tupli_mcap.mcap.source import open_regular
-from tupli_mcap.recording.durability import boot_id, sync_directory
 from tupli_mcap.system import refused
 
 __all__ = [

@@ -15,9 +15,9 @@ from zlib import crc32
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.journal.file import LogArea
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
-from tupli_mcap.recording.journal import LogArea
 
 __all__ = [
     "FRONT",

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.journal.file import JournalContents, LogArea, RowArea
+from tupli_mcap.journal.logs import iter_records
+from tupli_mcap.journal.seals import SECTOR, STATE, checksum, seal_of
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.durability import SECTOR, STATE, checksum, seal_of
-from tupli_mcap.recording.journal import JournalContents, LogArea, RowArea
-from tupli_mcap.recording.logs import iter_records
 from tupli_mcap.recording.rows import RowDeriver, even_rows
 from tupli_mcap.recording.vector_rows import HOLE
 
