@@ -30,7 +30,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli.app import app
 from tupli_mcap.mcap.source import PathSource
-from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

@@ -121,7 +121,7 @@ def test_episodes_are_a_sequence(path: Path) -> None:
 
 
 def test_opening_and_listing_touch_no_step_chunk(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tupli_mcap.recording import chunks
+    from tupli_mcap.recording.columns import chunk_store as chunks
 
     record(path)
     monkeypatch.setattr(chunks.ChunkStore, "_read", lambda *_: pytest.fail("a chunk was read"))

@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from tupli_mcap.journal.file import journal_path
-from tupli_mcap.recording.columns import Columns
+from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.episode import Episode, Episodes, Step
 from tupli_mcap.recording.reader import RecordedBenchmark, Recording
 

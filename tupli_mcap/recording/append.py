@@ -18,7 +18,7 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import check_magic, has_summary
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.chunks import IN_MEMORY
+from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.recover import belongs, head, metadata_at, misplaced_journal
 from tupli_mcap.recording.signed import SIGNATURE_NAME

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.columns import Columns
+from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.reader import Recording
 
 __all__ = ["Array", "Block", "blocks", "step_bytes"]

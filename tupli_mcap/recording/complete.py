@@ -17,7 +17,7 @@ from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, Episode
 from tupli_mcap.messages.frames import FRAME_LAYOUT
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore
+from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.facts import Run, runs
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder

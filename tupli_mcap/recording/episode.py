@@ -14,7 +14,7 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.columns import Columns
+    from tupli_mcap.recording.columns.read import Columns
     from tupli_mcap.recording.frames import Frames
     from tupli_mcap.recording.reader import Recording
 

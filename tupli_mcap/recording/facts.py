@@ -13,7 +13,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
 __all__ = ["Run", "StepFacts", "runs", "step_facts", "sum_up"]
 

@@ -21,7 +21,7 @@ from tupli_mcap.messages.frames import (
     decode_frame,
 )
 from tupli_mcap.messages.images.pictures import Picture, decode_picture
-from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import Contents
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import parse_record
 from tupli_mcap.mcap.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording.chunks import IN_MEMORY, ChunkStore, Span
+from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore, Span
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
     RECORDING_KEYS,

@@ -16,7 +16,7 @@ from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.infos import InfoDecoder
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.facts import StepFacts, step_facts
 from tupli_mcap.recording.findings import Findings
 from tupli_mcap.recording.reader import Recording

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.columns import Columns
+from tupli_mcap.recording.columns.read import Columns
 
 __all__ = ["Block", "RecordedValues", "recorded_values"]
 

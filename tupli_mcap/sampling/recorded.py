@@ -14,7 +14,7 @@ from tupli_mcap.errors import FormatError, memory_for
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.chunks import ChunkCache
+from tupli_mcap.recording.columns.chunk_store import ChunkCache
 from tupli_mcap.sampling.files import OpenFiles
 from tupli_mcap.sampling.gather import TIME, ConstantRows, Rows
 from tupli_mcap.sampling.index import ListedEpisodes, StepIndex

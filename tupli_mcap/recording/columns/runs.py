@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
 __all__ = ["Pieces", "Runs", "final_runs", "items", "items_dtype", "put", "runs_of"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.chunks import ChunkStore
+from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
 __all__ = ["StoredSteps"]
 
