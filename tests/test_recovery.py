@@ -39,7 +39,7 @@ from tupli_mcap.mcap.checksums import with_crc
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording import recover
+from tupli_mcap.recording.recover import unfinished as recover
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)

@@ -41,11 +41,11 @@ from tupli_mcap.mcap.survey import Damage, Found, Survey
 from tupli_mcap.recording import RecoveryReport
 from tupli_mcap.recording.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
-from tupli_mcap.recording.repair_gather import gather
-from tupli_mcap.recording.repair_plan import NewPlaces, make_plan
-from tupli_mcap.recording.repair_segments import Channels
+from tupli_mcap.recording.recover.evidence import gather
+from tupli_mcap.recording.recover.file_end import Tail, read_tail
+from tupli_mcap.recording.recover.plan import NewPlaces, make_plan
+from tupli_mcap.recording.recover.segments import Channels
 from tupli_mcap.recording.signature import SIGNATURE_NAME, check_signature, sign_recording
-from tupli_mcap.recording.tail import Tail, read_tail
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 Steps = dict[tuple[int, int], str]
@@ -647,7 +647,7 @@ def test_headers_of_a_chunk_are_read_once_not_for_each_episode(
         calls.append(len(data))
         return message_headers(data)
 
-    monkeypatch.setattr("tupli_mcap.recording.repair_gather.message_headers", counted)
+    monkeypatch.setattr("tupli_mcap.recording.recover.evidence.message_headers", counted)
     report, recording = recovered(path)
     with recording:
         assert len(recording.episodes) > 500

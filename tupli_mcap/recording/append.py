@@ -20,7 +20,7 @@ from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents, read_contents
-from tupli_mcap.recording.recover import belongs, head, metadata_at, misplaced_journal
+from tupli_mcap.recording.recover.unfinished import belongs, head, metadata_at, misplaced_journal
 from tupli_mcap.recording.signed import SIGNATURE_NAME
 
 if TYPE_CHECKING:
@@ -115,9 +115,9 @@ def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: S
     """What lies behind the end is cut off: the torn record of a killed writer, but not good rows behind damage."""
     if contents.complete or source.size == contents.data_end:
         return
-    from tupli_mcap.recording.repair_gather import gather
-    from tupli_mcap.recording.repair_journal import add_journal
-    from tupli_mcap.recording.tail import read_tail
+    from tupli_mcap.recording.recover.add_journal import add_journal
+    from tupli_mcap.recording.recover.evidence import gather
+    from tupli_mcap.recording.recover.file_end import read_tail
 
     gathered = gather(source, read_tail(source))
     add_journal(gathered)

@@ -19,15 +19,15 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recover.add_journal import add_journal
+from tupli_mcap.recording.recover.evidence import Gathered, gather, is_recording, may_be_recording
+from tupli_mcap.recording.recover.file_end import read_tail
+from tupli_mcap.recording.recover.plan import Plan, make_plan
+from tupli_mcap.recording.recover.segments import Channels
 from tupli_mcap.recording.repair_frames import OldCameras, frames_lost
-from tupli_mcap.recording.repair_gather import Gathered, gather, is_recording, may_be_recording
-from tupli_mcap.recording.repair_journal import add_journal
-from tupli_mcap.recording.repair_plan import Plan, make_plan
-from tupli_mcap.recording.repair_segments import Channels
 from tupli_mcap.recording.repair_write import RepairWriter
 from tupli_mcap.recording.replacing import replacing, tidy
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
-from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.system import refused
 
 __all__ = ["CutEpisode", "DamagedPlace", "LostSteps", "RecoveryReport", "recover_recording", "recovered_path"]

@@ -17,9 +17,9 @@ from tupli_mcap.messages.frames import (
     camera_names,
     encode_pair,
 )
-from tupli_mcap.recording.repair_gather import Gathered, PackedStore
-from tupli_mcap.recording.repair_plan import NewPlaces, PlannedEpisode
-from tupli_mcap.recording.repair_segments import intersection, message_at
+from tupli_mcap.recording.recover.evidence import Gathered, PackedStore
+from tupli_mcap.recording.recover.plan import NewPlaces, PlannedEpisode
+from tupli_mcap.recording.recover.segments import intersection, message_at
 
 __all__ = ["OldCameras", "frames_lost", "kept_frames"]
 

@@ -20,6 +20,7 @@ from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.findings import Findings, VerifyReport
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.signed import (
     SIGNATURE_MEDIA_TYPE,
@@ -28,7 +29,6 @@ from tupli_mcap.recording.signed import (
     Signed,
     is_covered_kind,
 )
-from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.recording.verify_structure import Structure
 
 __all__ = [

@@ -21,10 +21,10 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.recording.recover import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head
-from tupli_mcap.recording.repair_gather import may_be_recording
+from tupli_mcap.recording.recover.evidence import may_be_recording
+from tupli_mcap.recording.recover.file_end import read_tail
+from tupli_mcap.recording.recover.unfinished import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
-from tupli_mcap.recording.tail import read_tail
 from tupli_mcap.recording.verify_episodes import verify_episodes
 from tupli_mcap.recording.verify_frames import verify_frames
 from tupli_mcap.recording.verify_structure import Structure

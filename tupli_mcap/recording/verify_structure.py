@@ -27,7 +27,7 @@ from tupli_mcap.recording.contents import (
 )
 from tupli_mcap.recording.findings import Findings, VerifyReport
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.tail import Tail
+from tupli_mcap.recording.recover.file_end import Tail
 
 __all__ = ["Structure"]
 

@@ -39,7 +39,7 @@ from tupli_mcap.recording.channels import plan_areas, register_channels
 from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.options import WriterOptions, check_options
-from tupli_mcap.recording.recover import metadata_at
+from tupli_mcap.recording.recover.unfinished import metadata_at
 from tupli_mcap.recording.rows import ImageRows, SingleRows
 from tupli_mcap.recording.step_log import StepLog
 from tupli_mcap.recording.stores import Stores

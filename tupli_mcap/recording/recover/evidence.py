@@ -30,7 +30,7 @@ from tupli_mcap.recording.contents import (
     is_ours,
 )
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.tail import Tail
+from tupli_mcap.recording.recover.file_end import Tail
 
 __all__ = ["Gathered", "Piece", "Pieces", "gather", "is_recording", "may_be_recording"]
 

@@ -11,8 +11,8 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import EpisodeIndex
-from tupli_mcap.recording.repair_gather import Gathered, PackedStore
-from tupli_mcap.recording.repair_segments import Channels, Ranges, Segment, messages, segments
+from tupli_mcap.recording.recover.evidence import Gathered, PackedStore
+from tupli_mcap.recording.recover.segments import Channels, Ranges, Segment, messages, segments
 
 __all__ = ["IN_A_HOLE", "RUNNING", "NewPlaces", "Plan", "PlannedEpisode", "Told", "make_plan"]
 

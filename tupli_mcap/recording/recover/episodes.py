@@ -19,9 +19,9 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import Contents
-from tupli_mcap.recording.facts import Run, runs
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.scan import Scan
+from tupli_mcap.recording.recover.prefix import Scan
+from tupli_mcap.recording.recover.step_runs import Run, runs
 
 __all__ = ["Unwritten", "chunk_table", "complete"]
 

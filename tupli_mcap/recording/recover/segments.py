@@ -12,8 +12,8 @@ from tupli_mcap.mcap.chunk_records import message_headers
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.facts import StepFacts, step_facts, sum_up
-from tupli_mcap.recording.repair_gather import Gathered, PackedStore
+from tupli_mcap.recording.recover.evidence import Gathered, PackedStore
+from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts, sum_up
 
 __all__ = ["Channels", "Ranges", "Segment", "intersection", "message_at", "messages", "segments"]
 
