@@ -21,7 +21,8 @@ from gymnasium.vector import SyncVectorEnv
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording
 from tupli_mcap.journal import file as journals
-from tupli_mcap.recording import journal_path, writer
+from tupli_mcap.recording import journal_path
+from tupli_mcap.recording.write import writer
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 KINDS: dict[str, Any] = {

@@ -25,7 +25,8 @@ from tupli_mcap import (
     TupliEnvWrapper,
     recover_recording,
 )
-from tupli_mcap.recording import journal_path, writer
+from tupli_mcap.recording import journal_path
+from tupli_mcap.recording.write import writer
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 

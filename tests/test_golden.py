@@ -27,8 +27,8 @@ from tupli_mcap.mcap.container import PROFILE
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.contents import read_contents
-from tupli_mcap.recording.options import WriterOptions
-from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.recording.write.options import WriterOptions
+from tupli_mcap.recording.write.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"

@@ -25,12 +25,12 @@ from tupli_mcap.messages.images.pictures import decode_pixels
 from tupli_mcap.messages.images.png import PngCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.merge import merge_recordings
-from tupli_mcap.recording.options import WriterOptions
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.rewrite import rewrite_recording
-from tupli_mcap.recording.rows import even_rows
 from tupli_mcap.recording.verify import verify_recording
-from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.recording.write.options import WriterOptions
+from tupli_mcap.recording.write.single_rows import even_rows
+from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.replay.render import render
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

@@ -26,8 +26,8 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.merge import merge_recordings
 from tupli_mcap.recording.repair import recover_recording
 from tupli_mcap.recording.rewrite import rewrite_recording
-from tupli_mcap.recording.rows import even_rows
 from tupli_mcap.recording.verify import verify_recording
+from tupli_mcap.recording.write.single_rows import even_rows
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 Array = np.ndarray[Any, Any]

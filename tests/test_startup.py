@@ -42,7 +42,7 @@ def run(*arguments: str) -> str:
         (run("--help"), [name for name in HEAVY if name != "rich"]),  # draws the help
         (run("record", "--help"), [name for name in HEAVY if name not in ("rich", "pydantic")]),  # typer's
         ("from tupli_mcap import F, FilterEQ", (*EXTRAS, *DATABASE, "gymnasium", "mcap")),
-        ("from tupli_mcap import Recording", (*EXTRAS, *DATABASE, "tupli_mcap.recording.writer")),
+        ("from tupli_mcap import Recording", (*EXTRAS, *DATABASE, "tupli_mcap.recording.write.writer")),
         ("from tupli_mcap import Recording, verify_recording", (*EXTRAS, *DATABASE)),
         (
             "from tupli_mcap import RecordEpisodes; from tupli_mcap.vector import RecordEpisodes",

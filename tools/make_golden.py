@@ -38,7 +38,7 @@ COLUMNS = ("states", "actions", "rewards", "terminals", "timeouts", "infos")
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 1_000_000
 BOOT = "00000000-0000-0000-0000-000000000000"  # none of any machine: what is not shown to be whole does not count
-BOOT_ID = "tupli_mcap.recording.writer.boot_id"
+BOOT_ID = "tupli_mcap.recording.write.writer.boot_id"
 
 Log = dict[str, Any]
 Observe = Callable[[int, int], Any]
@@ -55,7 +55,7 @@ def made_up_world(number: int) -> Iterator[None]:
     with (
         mock.patch("time.time_ns", side_effect=clock),
         mock.patch("uuid.uuid4", return_value=known),
-        mock.patch("tupli_mcap.recording.writer.library", return_value="tupli-mcap 1"),
+        mock.patch("tupli_mcap.recording.write.writer.library", return_value="tupli-mcap 1"),
         mock.patch(BOOT_ID, return_value=BOOT),
         mock.patch("tupli_mcap.recording.rewrite.library", return_value="tupli-mcap 1"),
     ):
@@ -456,7 +456,7 @@ def frames(path: Path) -> list[Log]:
     """A picture of every second state and of each final one; an episode that was cut short, and one appended."""
     env = Painted(POLE, pole, [(3, "terminal"), (4, "timeout"), (9, "terminal")])
     options: dict[str, Any] = {"compression": "none", "attachments": {}, "chunk_size": 300}
-    with mock.patch("tupli_mcap.recording.framing.encode_picture", stored_png):
+    with mock.patch("tupli_mcap.recording.write.frames.encode_picture", stored_png):
         for mode, lengths in (("x", [3, 4, 3]), ("a", [2])):
             with RecordEpisodes(env, path, frames=2, mode=mode, **options) as recorder:  # type: ignore[arg-type]
                 roll(recorder, env, lengths, action)
@@ -464,7 +464,7 @@ def frames(path: Path) -> list[Log]:
 
 
 def unfinished_frames(path: Path) -> list[Log]:
-    with mock.patch("tupli_mcap.recording.framing.encode_picture", stored_png):
+    with mock.patch("tupli_mcap.recording.write.frames.encode_picture", stored_png):
         return unfinished(path, Painted(POLE, pole, ENDS), frames=True)
 
 

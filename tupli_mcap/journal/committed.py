@@ -16,8 +16,8 @@ from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.rows import RowDeriver, even_rows
-from tupli_mcap.recording.vector_rows import HOLE
+from tupli_mcap.recording.write.single_rows import RowDeriver, even_rows
+from tupli_mcap.recording.write.vector_rows import HOLE
 
 __all__ = [
     "FinalHole",

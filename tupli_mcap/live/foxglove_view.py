@@ -12,7 +12,7 @@ from tupli_mcap.live.target import Target
 from tupli_mcap.messages.images.codecs import CODEC
 from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA, RECORD_HEADER
 from tupli_mcap.recording.watching import NewSteps, Watcher
-from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["FoxgloveView"]
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from tupli_mcap.live.target import Target
 from tupli_mcap.recording.watching import Watcher
-from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["Picture", "RerunView"]
 

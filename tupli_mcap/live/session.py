@@ -18,7 +18,7 @@ from typing import Protocol
 
 from tupli_mcap.live.target import parse_target
 from tupli_mcap.recording.watching import Watcher
-from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["LiveSession", "LiveView", "open_session"]
 

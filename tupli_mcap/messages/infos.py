@@ -19,7 +19,7 @@ from tupli_mcap.spaces.exact import shorten
 from tupli_mcap.spaces.leaves import NameRegistry
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.writer import RecordingWriter
+    from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["InfoDecoder", "InfoRecorder", "RecordInfo", "entries_of", "info_schema"]
 

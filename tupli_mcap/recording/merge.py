@@ -17,15 +17,15 @@ from tupli_mcap.errors import RecordingError, SpaceError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
-from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.replacing import replacing, tidy
 from tupli_mcap.recording.rewrite import camera_channels, define, write
-from tupli_mcap.recording.rotation import series
 from tupli_mcap.recording.signed import STATEMENTS
 from tupli_mcap.recording.transfer import Target, Transfer
-from tupli_mcap.recording.writer import LAST_ROW
+from tupli_mcap.recording.write.areas import register_channels
+from tupli_mcap.recording.write.rotation import series
+from tupli_mcap.recording.write.writer import LAST_ROW
 
 __all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]
 

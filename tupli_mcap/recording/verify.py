@@ -17,7 +17,6 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.infos import info_schema
-from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
 from tupli_mcap.recording.reader import Recording
@@ -28,6 +27,7 @@ from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.verify_episodes import verify_episodes
 from tupli_mcap.recording.verify_frames import verify_frames
 from tupli_mcap.recording.verify_structure import Structure
+from tupli_mcap.recording.write.areas import register_channels
 
 __all__ = ["Problem", "VerifyReport", "verify_recording"]
 

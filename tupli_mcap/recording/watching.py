@@ -19,12 +19,12 @@ from tupli_mcap.messages.frames import EncodedFrame, decode_frame
 from tupli_mcap.messages.infos import InfoDecoder
 from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.episode_log import Foretold
 from tupli_mcap.recording.index import EPISODE_ROWS
-from tupli_mcap.recording.rows import HOLE, SingleRows
-from tupli_mcap.recording.step_log import StepLog
-from tupli_mcap.recording.vector_rows import VectorRows
-from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.recording.write.episodes import Foretold
+from tupli_mcap.recording.write.single_rows import HOLE, SingleRows
+from tupli_mcap.recording.write.variable_rows import StepLog
+from tupli_mcap.recording.write.vector_rows import VectorRows
+from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
 
 __all__ = ["NewInfo", "NewSteps", "Watcher"]

@@ -14,10 +14,10 @@ from tupli_mcap.errors import RecordingError, TupliError, UntrustedError
 from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.episode import Episode
-from tupli_mcap.recording.framing import CAMERA, RENDER_MODE
 from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.signed import SIGNATURE_NAME
+from tupli_mcap.recording.write.frames import CAMERA, RENDER_MODE
 from tupli_mcap.replay.attempt import Watch
 from tupli_mcap.replay.certificate import Divergence, SkipKind, Skipped
 from tupli_mcap.replay.certify import Certifier

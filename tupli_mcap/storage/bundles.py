@@ -17,7 +17,6 @@ from tupli_mcap.errors import FormatError, NotFoundError, SignatureError, StepEr
 from tupli_mcap.files import create
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
-from tupli_mcap.recording.framing import CAMERA
 from tupli_mcap.recording.signature import (
     SIGNATURE_NAME,
     Signature,
@@ -25,6 +24,7 @@ from tupli_mcap.recording.signature import (
     sign_recording,
     verify_signature,
 )
+from tupli_mcap.recording.write.frames import CAMERA
 from tupli_mcap.schema import (
     ArtifactMetadata,
     BaseFilter,

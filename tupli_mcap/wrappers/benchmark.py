@@ -12,7 +12,7 @@ import gymnasium as gym
 from tupli_mcap import trust
 from tupli_mcap.environment import capture, note
 from tupli_mcap.errors import RecordingError, TupliError
-from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["CaptureEnv", "Captured"]
 

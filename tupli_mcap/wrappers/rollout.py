@@ -18,9 +18,9 @@ from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.infos import RecordInfo
 from tupli_mcap.recording.describe import spread_of
-from tupli_mcap.recording.framing import RENDER_MODE
-from tupli_mcap.recording.options import Mode
 from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.write.frames import RENDER_MODE
+from tupli_mcap.recording.write.options import Mode
 from tupli_mcap.wrappers.benchmark import CaptureEnv
 from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes

@@ -21,12 +21,12 @@ from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_
 from tupli_mcap.messages.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
-from tupli_mcap.recording.framing import CAMERA, FrameRecorder, check_every, check_render_mode
-from tupli_mcap.recording.options import Mode, WriterOptions
-from tupli_mcap.recording.rotation import Rotation
-from tupli_mcap.recording.single import SingleRecorder
-from tupli_mcap.recording.work import ASKING, BEGUN, DONE, Work
-from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
+from tupli_mcap.recording.write.frames import CAMERA, FrameRecorder, check_every, check_render_mode
+from tupli_mcap.recording.write.options import Mode, WriterOptions
+from tupli_mcap.recording.write.rotation import Rotation
+from tupli_mcap.recording.write.single import SingleRecorder
+from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE, Work
+from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import Captured, CaptureEnv
 from tupli_mcap.wrappers.labels import with_labels

@@ -36,11 +36,11 @@ from tupli_mcap.journal.file import (
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import foreign, has_summary, parse_record, records
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.channels import FRAMES_AREA
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata, step_channels
 from tupli_mcap.recording.recover.episodes import Unwritten, chunk_table, complete
 from tupli_mcap.recording.recover.prefix import Scan, is_ours, scan
+from tupli_mcap.recording.write.areas import FRAMES_AREA
 from tupli_mcap.system import refused
 
 __all__ = [

@@ -18,7 +18,7 @@ from tupli_mcap.errors import RecordingError, StepError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tupli_mcap.recording.writer import RecordingWriter
+    from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["ASKING", "BEGUN", "DONE", "Recorder", "Work"]
 

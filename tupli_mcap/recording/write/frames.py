@@ -12,8 +12,8 @@ import numpy as np
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.images.pictures import FrameFormat, check_picture, encode_picture
-from tupli_mcap.recording.vector import VectorRecorder
-from tupli_mcap.recording.writer import RecordingWriter
+from tupli_mcap.recording.write.vector import VectorRecorder
+from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = [
     "CAMERA",

@@ -35,16 +35,16 @@ from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.channels import plan_areas, register_channels
-from tupli_mcap.recording.episode_log import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.options import WriterOptions, check_options
 from tupli_mcap.recording.recover.unfinished import metadata_at
-from tupli_mcap.recording.rows import ImageRows, SingleRows
-from tupli_mcap.recording.step_log import StepLog
-from tupli_mcap.recording.stores import Stores
-from tupli_mcap.recording.vector_rows import VectorRows
-from tupli_mcap.recording.worker import ChunkWorker
+from tupli_mcap.recording.write.areas import plan_areas, register_channels
+from tupli_mcap.recording.write.compressing import ChunkWorker
+from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
+from tupli_mcap.recording.write.options import WriterOptions, check_options
+from tupli_mcap.recording.write.single_rows import ImageRows, SingleRows
+from tupli_mcap.recording.write.stores import Stores
+from tupli_mcap.recording.write.variable_rows import StepLog
+from tupli_mcap.recording.write.vector_rows import VectorRows
 from tupli_mcap.system import refused
 
 __all__ = [
@@ -125,7 +125,7 @@ class RecordingWriter:
     def _open(self) -> None:
         self.container = Container(self.lock.fd, str(self.path), self.options.compression)
         if self.options.mode == "a" and self.path.stat().st_size:
-            from tupli_mcap.recording.append import resume
+            from tupli_mcap.recording.write.resume import resume
 
             self._is_cut = False
             resume(self)

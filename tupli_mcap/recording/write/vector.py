@@ -15,12 +15,12 @@ from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.infos import InfoRecorder
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.autoreset import Autoreset
-from tupli_mcap.recording.single import decide_layout
-from tupli_mcap.recording.step_log import Encoder, StepLog, leaf_encoders
-from tupli_mcap.recording.vector_infos import check_infos, final_states, info_of, reset_info_of
-from tupli_mcap.recording.vector_rows import VectorRows
-from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
+from tupli_mcap.recording.write.autoreset import Autoreset
+from tupli_mcap.recording.write.single import decide_layout
+from tupli_mcap.recording.write.variable_rows import Encoder, StepLog, leaf_encoders
+from tupli_mcap.recording.write.vector_infos import check_infos, final_states, info_of, reset_info_of
+from tupli_mcap.recording.write.vector_rows import VectorRows
+from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
 from tupli_mcap.spaces.exact import decide_dtype, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 

@@ -16,11 +16,11 @@ from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEO
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.messages.infos import InfoRecorder
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.framing import CAMERA, put_frame
-from tupli_mcap.recording.options import Mode, WriterOptions
-from tupli_mcap.recording.single import SingleRecorder
-from tupli_mcap.recording.work import BEGUN, DONE, Work
-from tupli_mcap.recording.writer import RecordingWriter, ResetFacts
+from tupli_mcap.recording.write.frames import CAMERA, put_frame
+from tupli_mcap.recording.write.options import Mode, WriterOptions
+from tupli_mcap.recording.write.single import SingleRecorder
+from tupli_mcap.recording.write.work import BEGUN, DONE, Work
+from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
 from tupli_mcap.spaces.exact import exact_flag, shorten
 
 __all__ = ["EpisodeData", "write_recording"]

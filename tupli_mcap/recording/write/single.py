@@ -12,8 +12,8 @@ from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd
 from tupli_mcap.messages.infos import InfoRecorder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.variable.widening import variable_dtypes
-from tupli_mcap.recording.rows import SingleRows
-from tupli_mcap.recording.writer import RecordingWriter, ResetFacts, StartedEpisode
+from tupli_mcap.recording.write.single_rows import SingleRows
+from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
 from tupli_mcap.spaces.exact import check_structure, decide_dtype, exact_array, leaf_value
 
 __all__ = ["SingleRecorder", "decide_layout"]

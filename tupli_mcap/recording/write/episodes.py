@@ -30,7 +30,7 @@ from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS
 from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.channels import Channels
+    from tupli_mcap.recording.write.areas import Channels
 
 __all__ = ["EPISODE_AND_ENV", "EpisodeLog", "Foretold", "ResetFacts", "StartedEpisode"]
 

@@ -24,7 +24,7 @@ from tupli_mcap.recording.recover.unfinished import belongs, head, metadata_at, 
 from tupli_mcap.recording.signed import SIGNATURE_NAME
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.writer import RecordingWriter
+    from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["restore_container", "resume"]
 

@@ -26,7 +26,7 @@ from tupli_mcap.messages.encode_rows import (
 from tupli_mcap.messages.episodes import EpisodeEnd
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.episode_log import EpisodeLog, Foretold
+from tupli_mcap.recording.write.episodes import EpisodeLog, Foretold
 from tupli_mcap.spaces.exact import exact_array
 from tupli_mcap.spaces.leaves import Leaf
 

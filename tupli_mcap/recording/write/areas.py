@@ -19,7 +19,7 @@ from tupli_mcap.messages.frames import (
 from tupli_mcap.messages.images.codecs import CODEC, image_codecs
 from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
-from tupli_mcap.recording.rows import CHUNKS_PER_HALF, rows_per_half
+from tupli_mcap.recording.write.single_rows import CHUNKS_PER_HALF, rows_per_half
 
 __all__ = ["FRAMES_AREA", "Channels", "plan_areas", "register_channels"]
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.options import Mode, WriterOptions, check_local
-from tupli_mcap.recording.writer import LAST_ROW, RecordingWriter, finish_recording
+from tupli_mcap.recording.write.options import Mode, WriterOptions, check_local
+from tupli_mcap.recording.write.writer import LAST_ROW, RecordingWriter, finish_recording
 
 __all__ = ["Rotation", "series"]
 
