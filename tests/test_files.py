@@ -25,7 +25,7 @@ from tupli_mcap import (
     rewrite_recording,
 )
 from tupli_mcap.cli.app import app
-from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.recording.edit.attach import add_attachments
 
 HOLDER = """
 import sys, time

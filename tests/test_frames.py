@@ -603,7 +603,7 @@ class TestDamage:
 
 def rewrite_wrongly(recording: Recording, target: Path, what: str) -> None:
     """A copy in which one message of the frames is another."""
-    from tupli_mcap.recording.transfer import Transfer
+    from tupli_mcap.recording.edit.assemble import Transfer
 
     real = Transfer._messages
 

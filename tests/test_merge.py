@@ -256,7 +256,7 @@ class TestMerge:
     def test_recordings_that_take_too_many_turns_have_one_each(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("tupli_mcap.recording.merge._MOST_TURNS", 2)
+        monkeypatch.setattr("tupli_mcap.recording.edit.merge._MOST_TURNS", 2)
         a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"
         for path, seed in ((a, 1), (b, 2), (a, 3)):
             record(path, seed=seed, steps=40, mode="a" if path.exists() else "x")

@@ -24,7 +24,7 @@ from tupli_mcap.cli import app
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import MissingExtraError, RecordingError, UntrustedError
 from tupli_mcap.recording import rewrite_recording
-from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.signature import SIGNATURE_NAME, sign_recording
 from tupli_mcap.replay import render
 from tupli_mcap.replay.movie import Indexed

@@ -39,7 +39,7 @@ from tupli_mcap.mcap.container import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.survey import Damage, Found, Survey
 from tupli_mcap.recording import RecoveryReport
-from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
 from tupli_mcap.recording.recover.evidence import gather
 from tupli_mcap.recording.recover.file_end import Tail, read_tail

@@ -37,7 +37,7 @@ from tupli_mcap.cli import terminal as terminal_module
 from tupli_mcap.cli.output import print_json
 from tupli_mcap.cli.recordings import print_episodes
 from tupli_mcap.cli.terminal import one_line, say_json, visible
-from tupli_mcap.recording.attach import add_attachments
+from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.schema import ArtifactMetadata, EpisodeHeader, EpisodeMetadataCallback, RLTuple
 
 # A title, a bell, a line erased, a colour of one character (CSI), text that runs backwards, another line, markup, DEL.

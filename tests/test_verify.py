@@ -44,7 +44,9 @@ from tupli_mcap.mcap import chunk_records as headers
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording import VerifyReport, rewrite, transfer
+from tupli_mcap.recording import VerifyReport
+from tupli_mcap.recording.edit import assemble as transfer
+from tupli_mcap.recording.edit import rewrite
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage.verify import verify_paths, verify_storage

@@ -44,7 +44,7 @@ from tupli_mcap.environment import named_imports
 from tupli_mcap.messages import encode_rows as encoder
 from tupli_mcap.recording.carried import carried_code
 from tupli_mcap.recording.describe import describe
-from tupli_mcap.recording.repair import recover_recording
+from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.signature import check_signature
 from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.replay import certify, render

@@ -40,7 +40,7 @@ def _merge(
     later one follow the others, and rows that may not go back in time get a later one; a warning says how many.
     The new recording has ids of its own, the environment of the first one, and no signature.
     """
-    from tupli_mcap.recording.merge import merge_recordings
+    from tupli_mcap.recording.edit.merge import merge_recordings
 
     report = merge_recordings(files, output, overwrite=force, dry_run=dry_run)
     if as_json:
@@ -65,7 +65,7 @@ def _split(
     """
     if (episodes is None) == (max_bytes is None):
         raise typer.BadParameter("expected either --episodes or --max-bytes")
-    from tupli_mcap.recording.merge import split_recording
+    from tupli_mcap.recording.edit.merge import split_recording
 
     parts = split_recording(file, output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
     if as_json:

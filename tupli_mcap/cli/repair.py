@@ -14,8 +14,8 @@ from tupli_mcap.cli.replaying import Replays, episode_numbers
 from tupli_mcap.cli.terminal import fail, say
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording.edit.repair import RecoveryReport
     from tupli_mcap.recording.findings import VerifyReport
-    from tupli_mcap.recording.repair import RecoveryReport
 
 __all__ = ["register"]
 
@@ -134,7 +134,7 @@ def _recover(
     episode and step; an episode that lost steps in the middle becomes several. Exit code 1 only if nothing
     could be saved, or no step of a recording that had some.
     """
-    from tupli_mcap.recording.repair import recover_recording
+    from tupli_mcap.recording.edit.repair import recover_recording
 
     report = recover_recording(file, output, overwrite=force, dry_run=dry_run)
     if as_json:

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 from tupli_mcap import files, signing, trust
 from tupli_mcap.environment import canonical_json, sha256
 from tupli_mcap.errors import FormatError, SignatureError
-from tupli_mcap.recording.attach import add_attachments
 from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.edit.attach import add_attachments
+from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.findings import Findings, VerifyReport
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.recover.file_end import read_tail
-from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.signed import (
     SIGNATURE_MEDIA_TYPE,
     SIGNATURE_NAME,

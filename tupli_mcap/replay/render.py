@@ -13,9 +13,9 @@ import gymnasium as gym
 from tupli_mcap.errors import RecordingError, TupliError, UntrustedError
 from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.episode import Episode
-from tupli_mcap.recording.replacing import replacing
-from tupli_mcap.recording.rewrite import rewrite_recording
 from tupli_mcap.recording.signed import SIGNATURE_NAME
 from tupli_mcap.recording.write.frames import CAMERA, RENDER_MODE
 from tupli_mcap.replay.attempt import Watch

@@ -24,7 +24,7 @@ from tupli_mcap.messages.episodes import record
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, Field, record_dtype
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.rewrite import Follower, rewrite_recording
+from tupli_mcap.recording.edit.rewrite import Follower, rewrite_recording
 from tupli_mcap.recording.write.single_rows import even_rows
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names

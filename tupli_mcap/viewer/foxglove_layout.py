@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.replacing import replacing
+from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.companions import WIDEST, companion_topics

@@ -12,7 +12,7 @@ from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording.copies import first_chunks
+from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.write.single_rows import even_rows

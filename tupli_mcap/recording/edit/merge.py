@@ -18,11 +18,11 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.edit.assemble import Target, Transfer
+from tupli_mcap.recording.edit.replacing import replacing, tidy
+from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.recording.replacing import replacing, tidy
-from tupli_mcap.recording.rewrite import camera_channels, define, write
 from tupli_mcap.recording.signed import STATEMENTS
-from tupli_mcap.recording.transfer import Target, Transfer
 from tupli_mcap.recording.write.areas import register_channels
 from tupli_mcap.recording.write.rotation import series
 from tupli_mcap.recording.write.writer import LAST_ROW

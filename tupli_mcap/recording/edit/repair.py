@@ -17,6 +17,9 @@ from tupli_mcap.mcap.summary import OTHER_TOOLS
 from tupli_mcap.mcap.survey import Damage, attachment_name
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
+from tupli_mcap.recording.edit.repaired_frames import OldCameras, frames_lost
+from tupli_mcap.recording.edit.replacing import replacing, tidy
+from tupli_mcap.recording.edit.write_repaired import RepairWriter
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.recover.add_journal import add_journal
@@ -24,9 +27,6 @@ from tupli_mcap.recording.recover.evidence import Gathered, gather, is_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.plan import Plan, make_plan
 from tupli_mcap.recording.recover.segments import Channels
-from tupli_mcap.recording.repair_frames import OldCameras, frames_lost
-from tupli_mcap.recording.repair_write import RepairWriter
-from tupli_mcap.recording.replacing import replacing, tidy
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
 from tupli_mcap.system import refused
 

@@ -13,8 +13,8 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.recording.contents import Contents, read_contents
+from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.replacing import replacing
 from tupli_mcap.recording.write.resume import restore_container
 
 __all__ = ["add_attachments"]

@@ -1,0 +1,10 @@
+"""New recordings out of others.
+
+assemble                          takes episodes over into a new file
+copy_chunks                       chunks that can be copied as they are
+merge                             several recordings into one, or one into several
+rewrite                           a recording with fewer episodes
+attach                            adds attachments
+repair                            `recover_recording`; write_repaired and repaired_frames write what it found
+replacing                         the new file takes the place of the old one
+"""
