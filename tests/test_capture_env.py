@@ -21,7 +21,7 @@ from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper, 
 from tupli_mcap.cli import app
 from tupli_mcap.environment import EnvironmentRecord, build, note
 from tupli_mcap.errors import RecordingError, StorageError, TupliError, UntrustedError
-from tupli_mcap.recording.verify import verify_recording
+from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.schema import F
 from tupli_mcap.storage.document import unpack
 from tupli_mcap.vector import RecordEpisodes as RecordVector

@@ -22,9 +22,9 @@ from typer.testing import CliRunner
 
 from tupli_mcap import RecordEpisodes, Recording, RecordingError
 from tupli_mcap.cli.app import app
+from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
-from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 from tupli_mcap.viewer.companions import companion_topics, write_companions
 from tupli_mcap.viewer.foxglove_layout import foxglove_layout

@@ -18,7 +18,7 @@ from fuzzing.run import MUTATORS, Case, Fuzzer, case_of
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.verify import verify_recording
+from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.sampling import steps_of
 
 SEEDS = {seed.name: seed for seed in load_seeds()}

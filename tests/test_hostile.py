@@ -33,8 +33,8 @@ from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import RowArea, read_journal
 from tupli_mcap.mcap.compression import MAX_RATIO, decompress
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.listing import list_recordings
 

@@ -24,10 +24,10 @@ from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.images.pictures import decode_pixels
 from tupli_mcap.messages.images.png import PngCodec
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
-from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.recording.write.options import WriterOptions
 from tupli_mcap.recording.write.single_rows import even_rows
 from tupli_mcap.recording.write.writer import RecordingWriter

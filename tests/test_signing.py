@@ -46,10 +46,10 @@ from tupli_mcap.errors import (
     UntrustedError,
 )
 from tupli_mcap.mcap.container import Container, Prepared, Rows
+from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.signature import check_signature, sign_recording, verify_signature
 from tupli_mcap.recording.signed import SIGNATURE_NAME, Signed
-from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.schema import ArtifactMetadata, FilterEQ
 
 

@@ -23,10 +23,10 @@ from tupli_mcap.dataset import open_columns
 from tupli_mcap.messages.images.stack import StackCodec
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
-from tupli_mcap.recording.verify import verify_recording
 from tupli_mcap.recording.write.single_rows import even_rows
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

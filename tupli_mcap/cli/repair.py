@@ -14,8 +14,8 @@ from tupli_mcap.cli.replaying import Replays, episode_numbers
 from tupli_mcap.cli.terminal import fail, say
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording.check.report import VerifyReport
     from tupli_mcap.recording.edit.repair import RecoveryReport
-    from tupli_mcap.recording.findings import VerifyReport
 
 __all__ = ["register"]
 
@@ -88,7 +88,7 @@ def _verify(
 
 def _print_verified(report: VerifyReport) -> None:
     """A line on a file, one on each problem that does not follow from another, and what to do about them."""
-    from tupli_mcap.recording.findings import RECOVER
+    from tupli_mcap.recording.check.report import RECOVER
 
     unread = report.kind == "recording" and not (report.ok or report.episodes)
     facts = (

@@ -11,10 +11,10 @@ from tupli_mcap.recording.episode import Episode, Episodes, Step
 from tupli_mcap.recording.reader import RecordedBenchmark, Recording
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording.check.verify import Problem, VerifyReport, verify_recording
     from tupli_mcap.recording.edit.merge import MergeReport, Part, merge_recordings, split_recording
     from tupli_mcap.recording.edit.repair import RecoveryReport, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording
-    from tupli_mcap.recording.verify import Problem, VerifyReport, verify_recording
     from tupli_mcap.recording.write.from_values import EpisodeData, write_recording
 
 # Imported on first use: who records or reads needs none of them.

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 from tupli_mcap import files, signing, trust
 from tupli_mcap.environment import canonical_json, sha256
 from tupli_mcap.errors import FormatError, SignatureError
+from tupli_mcap.recording.check.report import Findings, VerifyReport
+from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
-from tupli_mcap.recording.findings import Findings, VerifyReport
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.recover.file_end import read_tail
@@ -29,7 +30,6 @@ from tupli_mcap.recording.signed import (
     Signed,
     is_covered_kind,
 )
-from tupli_mcap.recording.verify_structure import Structure
 
 __all__ = [
     "SIGNATURE_NAME",

@@ -18,6 +18,7 @@ from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import FOOTER_SIZE, parse_record, records
 from tupli_mcap.mcap.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.messages.layout import CDR_HEADER
+from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
     RECORDING_KEYS,
@@ -25,7 +26,6 @@ from tupli_mcap.recording.contents import (
     check_version,
     is_ours,
 )
-from tupli_mcap.recording.findings import Findings, VerifyReport
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recover.file_end import Tail
 

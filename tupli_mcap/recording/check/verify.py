@@ -17,16 +17,16 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.infos import info_schema
+from tupli_mcap.recording.check.episodes import verify_episodes
+from tupli_mcap.recording.check.frames import verify_frames
+from tupli_mcap.recording.check.report import Findings, Problem, VerifyReport
+from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import NewerVersionError
-from tupli_mcap.recording.findings import Findings, Problem, VerifyReport
 from tupli_mcap.recording.reader import Recording
 from tupli_mcap.recording.recover.evidence import may_be_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.unfinished import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head
 from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
-from tupli_mcap.recording.verify_episodes import verify_episodes
-from tupli_mcap.recording.verify_frames import verify_frames
-from tupli_mcap.recording.verify_structure import Structure
 from tupli_mcap.recording.write.areas import register_channels
 
 __all__ = ["Problem", "VerifyReport", "verify_recording"]

@@ -1,0 +1,8 @@
+"""Whether a recording is what it says it is.
+
+verify        `verify_recording`: does everything below
+structure     the records of the file, and their checksums
+episodes      the index and the events against the steps
+frames        frames and images against the steps
+report        what is found, for people and as JSON
+"""
