@@ -45,7 +45,7 @@ from tupli_mcap.recording.recover.evidence import gather
 from tupli_mcap.recording.recover.file_end import Tail, read_tail
 from tupli_mcap.recording.recover.plan import NewPlaces, make_plan
 from tupli_mcap.recording.recover.segments import Channels
-from tupli_mcap.recording.signature import SIGNATURE_NAME, check_signature, sign_recording
+from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, check_signature, sign_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 Steps = dict[tuple[int, int], str]

@@ -38,7 +38,7 @@ from tupli_mcap.cli.app import app
 from tupli_mcap.environment import EnvironmentRecord, note
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.edit.repair import recover_recording
-from tupli_mcap.recording.signature import sign_recording
+from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.replay import Certificate, certify, render, values
 from tupli_mcap.signing import SigningKey
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes

@@ -14,7 +14,7 @@ from tupli_mcap.cli.terminal import say
 
 if TYPE_CHECKING:
     from tupli_mcap.environment import PickleImports
-    from tupli_mcap.recording.carried import CarriedCode
+    from tupli_mcap.recording.sign.carried_code import CarriedCode
 
 __all__ = ["register"]
 
@@ -49,7 +49,7 @@ def _trust(
     no trust. Only this user's processes trust it from then on; one changed byte of the environment ends
     that. --key trusts every environment that somebody signs, see bundle --sign.
     """
-    from tupli_mcap.recording.carried import carried_code, set_trust
+    from tupli_mcap.recording.sign.carried_code import carried_code, set_trust
 
     if sum((show, remove, listed, key is not None)) > 1:
         raise typer.BadParameter("--show, --remove, --list and --key exclude each other")
@@ -97,7 +97,7 @@ def _untrust(
     only it has signed is not trusted either.
     """
     from tupli_mcap import trust
-    from tupli_mcap.recording.carried import untrust
+    from tupli_mcap.recording.sign.carried_code import untrust
     from tupli_mcap.signing import find_key, fingerprint
 
     if (what is None) == (key is None):

@@ -31,7 +31,7 @@ from tupli_mcap.recording.columns.stored_steps import StoredSteps
 from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.frames import Cameras, Frames
-from tupli_mcap.recording.signed import SIGNATURE_NAME, voucher
+from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, voucher
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.trust import TrustedKey, is_trusted

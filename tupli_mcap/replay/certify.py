@@ -12,7 +12,7 @@ import gymnasium as gym
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.carried import foreign_options, options_are_trusted
+from tupli_mcap.recording.sign.carried_code import foreign_options, options_are_trusted
 from tupli_mcap.replay.attempt import Attempt, Watch, attempt, repeats_itself
 from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, SkipKind, Skipped
 from tupli_mcap.replay.compare import Checker, Difference

@@ -17,7 +17,7 @@ from tupli_mcap.errors import FormatError, NotFoundError, SignatureError, StepEr
 from tupli_mcap.files import create
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
-from tupli_mcap.recording.signature import (
+from tupli_mcap.recording.sign.sign import (
     SIGNATURE_NAME,
     Signature,
     episodes_alike,

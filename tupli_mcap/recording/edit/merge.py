@@ -22,7 +22,7 @@ from tupli_mcap.recording.edit.assemble import Target, Transfer
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.recording.signed import STATEMENTS
+from tupli_mcap.recording.sign.signature_file import STATEMENTS
 from tupli_mcap.recording.write.areas import register_channels
 from tupli_mcap.recording.write.rotation import series
 from tupli_mcap.recording.write.writer import LAST_ROW

@@ -27,7 +27,7 @@ from tupli_mcap.recording.recover.evidence import Gathered, gather, is_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.plan import Plan, make_plan
 from tupli_mcap.recording.recover.segments import Channels
-from tupli_mcap.recording.signature import SIGNATURE_NAME, verify_signature
+from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, verify_signature
 from tupli_mcap.system import refused
 
 __all__ = ["CutEpisode", "DamagedPlace", "LostSteps", "RecoveryReport", "recover_recording", "recovered_path"]

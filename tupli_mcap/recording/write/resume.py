@@ -21,7 +21,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents, read_contents
 from tupli_mcap.recording.recover.unfinished import belongs, head, metadata_at, misplaced_journal
-from tupli_mcap.recording.signed import SIGNATURE_NAME
+from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.write.writer import RecordingWriter

@@ -23,8 +23,8 @@ from tupli_mcap.environment import (
 )
 from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
 from tupli_mcap.recording.reader import Recording
-from tupli_mcap.recording.signature import verify_signature
-from tupli_mcap.recording.signed import SIGNATURE_NAME, claimed_signer
+from tupli_mcap.recording.sign.sign import verify_signature
+from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, claimed_signer
 
 __all__ = [
     "CarriedCode",
