@@ -34,9 +34,9 @@ from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.cli.app import app
 from tupli_mcap.errors import MissingExtraError, RecordingError
 from tupli_mcap.live import LiveSession
+from tupli_mcap.live.follow import Watcher
 from tupli_mcap.live.session import _Meter
 from tupli_mcap.live.target import parse_target
-from tupli_mcap.recording.watching import Watcher
 from tupli_mcap.recording.write.options import WriterOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes

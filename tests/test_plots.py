@@ -41,7 +41,7 @@ from tupli_mcap.plots.draw_trace import by_scale
 from tupli_mcap.plots.draw_values import LEVELS, quantiles
 from tupli_mcap.plots.gather import measure
 from tupli_mcap.plots.series import bands, bin_count, bin_edges, running_mean
-from tupli_mcap.recording.sketch import sketch
+from tupli_mcap.recording.series import sketch
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
 UNIT = spaces.Box(-1, 1, (3,), np.float32)
@@ -790,7 +790,7 @@ def test_of_a_long_recording_a_sketch_reads_a_few_chunks(
 ) -> None:
     path = record(cartpole.with_name("long.mcap"), gym.make("CartPole-v1"), 3000, chunk_size=2048)
     monkeypatch.setattr(
-        "tupli_mcap.recording.sketch.READ_BYTES", 16 * 77 * 10
+        "tupli_mcap.recording.series.READ_BYTES", 16 * 77 * 10
     )  # ten steps at each of 16 places
     with Recording(path) as recording:
         loaded: set[int] = set()

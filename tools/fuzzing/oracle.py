@@ -14,7 +14,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.read import FIELDS
-from tupli_mcap.recording.describe import describe
+from tupli_mcap.recording.description import describe
 from tupli_mcap.sampling import steps_of
 from tupli_mcap.sampling.steps import map_arrays
 

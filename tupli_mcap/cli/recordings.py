@@ -32,7 +32,7 @@ from tupli_mcap.errors import TupliError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from tupli_mcap.recording.describe import RecordingDescription, Spread
+    from tupli_mcap.recording.description import RecordingDescription, Spread
     from tupli_mcap.schema import EpisodeHeader
     from tupli_mcap.wrappers.benchmark import CaptureEnv
     from tupli_mcap.wrappers.rollout import RolloutSummary
@@ -217,7 +217,7 @@ def _held(output: Path, limit: float | None) -> str:
 
 def _mean_text(summary: RolloutSummary) -> list[str]:
     """The mean return, and what it leaves out; nothing where no episode was recorded."""
-    from tupli_mcap.recording.describe import nan_text
+    from tupli_mcap.recording.description import nan_text
 
     odd = nan_text(summary.return_nan, summary.episodes)
     if summary.return_nan < summary.episodes:
@@ -238,7 +238,7 @@ def _ls(
     its writer was killed or failed, and all steps that were finished are there, if its journal is.
     Deleted episodes of a storage are not counted.
     """
-    from tupli_mcap.recording.describe import nan_text
+    from tupli_mcap.recording.description import nan_text
     from tupli_mcap.storage.listing import list_recordings
 
     found = list(list_recordings(paths or [Path()]))
@@ -279,7 +279,7 @@ def _info(
     from dataclasses import asdict
 
     from tupli_mcap.recording import Recording
-    from tupli_mcap.recording.describe import describe
+    from tupli_mcap.recording.description import describe
 
     with Recording(file) as recording:
         description = describe(recording)
@@ -410,7 +410,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
 def _spread_text(spread: Spread | None, episodes: int, of: str = "") -> str:
     if spread is None:
         return ""
-    from tupli_mcap.recording.describe import nan_text
+    from tupli_mcap.recording.description import nan_text
 
     odd = nan_text(spread.nan, episodes)
     if spread.nan == episodes:

@@ -11,7 +11,7 @@ from tupli_mcap.cli.terminal import can_print, say, terminal_width
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Recording
-    from tupli_mcap.recording.sketch import Series
+    from tupli_mcap.recording.series import Series
 
 __all__ = ["print_sketch", "sparkline"]
 
@@ -45,7 +45,7 @@ def sparkline(values: Sequence[float], *, zero_based: bool = False, blocks: str 
 
 def print_sketch(recording: Recording) -> None:
     """Returns and lengths over episodes, and how rewards, actions and states are distributed."""
-    from tupli_mcap.recording.sketch import sketch
+    from tupli_mcap.recording.series import sketch
 
     room = (terminal_width() or _WIDEST + _OTHERS) - _OTHERS
     found = sketch(recording, max(_NARROWEST, min(_WIDEST, room)))

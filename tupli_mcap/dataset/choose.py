@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from tupli_mcap.dataset.sources import episode_headers
-from tupli_mcap.recording.choice import WORDS, Positions, named_positions
 from tupli_mcap.recording.episode import Episode
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.which import WORDS, Positions, named_positions
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate
 from tupli_mcap.storage.sidecar import Notes
 

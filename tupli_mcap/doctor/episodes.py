@@ -13,7 +13,7 @@ from tupli_mcap.doctor.message_text import plural, share
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Array, Block
-from tupli_mcap.recording.describe import state_of
+from tupli_mcap.recording.description import state_of
 
 __all__ = [
     "FinalStates",

@@ -11,8 +11,8 @@ import uuid
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from tupli_mcap.live.follow import Watcher
 from tupli_mcap.live.target import Target
-from tupli_mcap.recording.watching import Watcher
 from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["Picture", "RerunView"]

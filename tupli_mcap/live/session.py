@@ -16,8 +16,8 @@ import warnings
 import weakref
 from typing import Protocol
 
+from tupli_mcap.live.follow import Watcher
 from tupli_mcap.live.target import parse_target
-from tupli_mcap.recording.watching import Watcher
 from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["LiveSession", "LiveView", "open_session"]

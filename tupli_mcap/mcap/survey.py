@@ -23,7 +23,7 @@ from tupli_mcap.mcap.compression import MAX_RATIO, decompress
 from tupli_mcap.mcap.container import MAGIC
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import parse_record
-from tupli_mcap.recording.claims import MAX_CHUNK
+from tupli_mcap.recording.limits import MAX_CHUNK
 
 __all__ = ["Chunk", "Damage", "Found", "KnownChunk", "Survey", "attachment_name"]
 

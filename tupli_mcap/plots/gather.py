@@ -13,7 +13,7 @@ from tupli_mcap.plots.trace import Trace
 from tupli_mcap.plots.values import LeafValues
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Array, blocks, step_bytes
-from tupli_mcap.recording.describe import RecordingDescription, describe
+from tupli_mcap.recording.description import RecordingDescription, describe
 from tupli_mcap.spaces.element_names import short_path
 
 __all__ = ["Measured", "measure"]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.episode import Episode, Episodes, Step
-from tupli_mcap.recording.reader import RecordedBenchmark, Recording
+from tupli_mcap.recording.recording import RecordedBenchmark, Recording
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.check.verify import Problem, VerifyReport, verify_recording

@@ -11,7 +11,7 @@ import numpy as np
 
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.read import Columns
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 
 __all__ = ["Array", "Block", "blocks", "step_bytes"]
 

@@ -23,8 +23,8 @@ from tupli_mcap.mcap.summary import (
     read_metadata,
     read_summary,
 )
-from tupli_mcap.recording.claims import check_chunks
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME, EpisodeIndex
+from tupli_mcap.recording.limits import check_chunks
 
 __all__ = ["Contents", "NewerVersionError", "check_version", "read_contents"]
 

@@ -16,7 +16,7 @@ from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 if TYPE_CHECKING:
     from tupli_mcap.recording.columns.read import Columns
     from tupli_mcap.recording.frames import Frames
-    from tupli_mcap.recording.reader import Recording
+    from tupli_mcap.recording.recording import Recording
 
 __all__ = ["Episode", "Episodes", "Step", "item_getter"]
 

@@ -25,7 +25,7 @@ from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import Contents
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.reader import Recording
+    from tupli_mcap.recording.recording import Recording
 
 __all__ = ["Cameras", "Frames"]
 

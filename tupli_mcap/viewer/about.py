@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.describe import describe, nan_text
+from tupli_mcap.recording.description import describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import title_of
 

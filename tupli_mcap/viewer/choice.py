@@ -13,7 +13,7 @@ import numpy as np
 
 from tupli_mcap.errors import FilterError, RecordingError, TupliError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.choice import named_positions
+from tupli_mcap.recording.which import named_positions
 from tupli_mcap.viewer.plan import Chosen
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.live.follow import NewInfo, NewSteps, Watcher
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.describe import nan_text, spread_of
-from tupli_mcap.recording.watching import NewInfo, NewSteps, Watcher
+from tupli_mcap.recording.description import nan_text, spread_of
 from tupli_mcap.viewer.about import plain
 from tupli_mcap.viewer.arrange import blueprint_of
 from tupli_mcap.viewer.blocks import Array

@@ -120,7 +120,7 @@ def times_of(block: Block) -> Times:
 
 def name_of(recording: Recording) -> str:
     """The environment's name, else the file's."""
-    from tupli_mcap.recording.describe import describe
+    from tupli_mcap.recording.description import describe
 
     return describe(recording).environment or Path(recording.name).stem
 

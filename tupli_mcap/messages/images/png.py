@@ -14,7 +14,7 @@ from tupli_mcap.messages.frames import EncodedFrame, decode_frame, encode_frame
 from tupli_mcap.messages.images.pictures import decode_pixels, encode_pixels
 from tupli_mcap.messages.images.stack import new_frames
 from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
-from tupli_mcap.recording.claims import MAX_CHUNK
+from tupli_mcap.recording.limits import MAX_CHUNK
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["PngCodec"]

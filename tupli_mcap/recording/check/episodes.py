@@ -18,7 +18,7 @@ from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.leaves import Leaf
 

@@ -13,7 +13,7 @@ from tupli_mcap.messages.images.pictures import format_of
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 
 __all__ = ["verify_frames"]
 

@@ -22,7 +22,7 @@ from tupli_mcap.recording.check.frames import verify_frames
 from tupli_mcap.recording.check.report import Findings, Problem, VerifyReport
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import NewerVersionError
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.evidence import may_be_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.unfinished import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head

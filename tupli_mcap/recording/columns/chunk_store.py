@@ -25,7 +25,7 @@ from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.crc import crc32
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording.claims import MAX_CHUNK, StepClaims
+from tupli_mcap.recording.limits import MAX_CHUNK, StepClaims
 
 __all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Located", "Span"]
 

@@ -12,10 +12,10 @@ import numpy as np
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages.batches import LOG_TIME, BatchDecoder, Decode
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.claims import check_bools
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.runs import Pieces, Runs, final_runs, items, items_dtype, put
 from tupli_mcap.recording.columns.threads import do_all
+from tupli_mcap.recording.limits import check_bools
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["FIELDS", "ColumnReader", "Columns"]

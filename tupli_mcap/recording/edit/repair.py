@@ -21,7 +21,7 @@ from tupli_mcap.recording.edit.repaired_frames import OldCameras, frames_lost
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.write_repaired import RepairWriter
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.add_journal import add_journal
 from tupli_mcap.recording.recover.evidence import Gathered, gather, is_recording, may_be_recording
 from tupli_mcap.recording.recover.file_end import read_tail

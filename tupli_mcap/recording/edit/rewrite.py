@@ -17,7 +17,7 @@ from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.assemble import Follower, NewFrames, Target, Transfer
 from tupli_mcap.recording.edit.replacing import replacing
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, stays_signed
 from tupli_mcap.recording.write.areas import register_channels
 

@@ -15,8 +15,8 @@ from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC, PROFILE, Rows
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import parse_record
-from tupli_mcap.recording.claims import MAX_CHUNK
 from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.limits import MAX_CHUNK
 
 __all__ = ["Scan", "scan"]
 

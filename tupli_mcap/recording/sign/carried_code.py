@@ -22,7 +22,7 @@ from tupli_mcap.environment import (
     sha256,
 )
 from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.sign.sign import verify_signature
 from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, claimed_signer
 

@@ -21,7 +21,7 @@ from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.sign.signature_file import (
     SIGNATURE_MEDIA_TYPE,

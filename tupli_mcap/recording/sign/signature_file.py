@@ -13,7 +13,7 @@ from tupli_mcap.environment import canonical_json
 from tupli_mcap.errors import FormatError
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.reader import Recording
+    from tupli_mcap.recording.recording import Recording
 
 __all__ = [
     "SIGNATURE_MEDIA_TYPE",

@@ -23,7 +23,6 @@ from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoDecoder
 from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
-from tupli_mcap.recording.claims import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.read import FIELDS, ColumnReader, Columns
 from tupli_mcap.recording.columns.runs import Runs, runs_of
@@ -31,6 +30,7 @@ from tupli_mcap.recording.columns.stored_steps import StoredSteps
 from tupli_mcap.recording.contents import Contents, read_contents, step_channels
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.frames import Cameras, Frames
+from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
 from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, voucher
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from tupli_mcap.errors import TupliError
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.columns.read import Columns
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 from tupli_mcap.spaces.element_names import element_names
 from tupli_mcap.spaces.leaves import Leaf
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from tupli_mcap.errors import FilterError, RecordingError
-from tupli_mcap.recording.reader import Recording
+from tupli_mcap.recording.recording import Recording
 
 __all__ = ["WORDS", "Positions", "named_positions"]
 
