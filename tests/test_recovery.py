@@ -33,12 +33,11 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.journal.committed import Salvage
 from tupli_mcap.journal.file import JournalContents, RowArea, read_journal
-from tupli_mcap.journal.logs import iter_records
 from tupli_mcap.journal.seals import checksum
 from tupli_mcap.mcap.checksums import with_crc
 from tupli_mcap.mcap.container import Container
+from tupli_mcap.mcap.records import BODY, iter_records
 from tupli_mcap.messages.episodes import EpisodeStart
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.recover import unfinished as recover
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

@@ -20,8 +20,8 @@ from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset, jsonvalue
 from tupli_mcap.dataset import open_columns
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.images.stack import StackCodec
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings

@@ -39,11 +39,10 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.logs import iter_records
 from tupli_mcap.mcap import chunk_records as headers
 from tupli_mcap.mcap.container import Container
+from tupli_mcap.mcap.records import BODY, iter_records
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording import VerifyReport
 from tupli_mcap.recording.edit import assemble as transfer
 from tupli_mcap.recording.edit import rewrite

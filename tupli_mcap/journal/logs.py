@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 
-from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.file import LogArea
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, RECORD_HEADER, iter_records
 
 __all__ = [
     "FRONT",
@@ -27,7 +26,6 @@ __all__ = [
     "Sink",
     "as_rows",
     "group_records",
-    "iter_records",
 ]
 
 Sink = Callable[[Rows], None]
@@ -35,25 +33,6 @@ LOG_HEADER = 64  # bytes of a half before its records
 _KEPT = 16  # times that a log has gone to the file
 FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
 _LOG_TIME = FRONT.size - 8
-
-
-def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
-    """(offset, end, channel, sequence, log_time) of the Message records in `data`.
-
-    Raises:
-        FormatError: bytes that are no whole Message record.
-    """
-    while start < len(data):
-        if start + BODY > len(data):
-            raise FormatError(f"expected a message record at byte {start}, found {len(data) - start} bytes")
-        opcode, length, channel, sequence, log_time, _ = RECORD_HEADER.unpack_from(data, start)
-        end = start + 9 + length
-        if opcode != 5 or length < BODY - 9 or end > len(data):
-            raise FormatError(
-                f"expected a message record at byte {start}, found opcode {opcode} of {length} bytes"
-            )
-        yield start, end, channel, sequence, log_time
-        start = end
 
 
 def group_records(data: memoryview, *, sealed: bool = False) -> list[Rows]:

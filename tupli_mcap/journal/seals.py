@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 
 from tupli_mcap import files
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.messages.layout import BODY
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.system import refused
 
 __all__ = [

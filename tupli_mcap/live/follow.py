@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.logs import EventLog, iter_records
+from tupli_mcap.journal.logs import EventLog
+from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records
 from tupli_mcap.messages.frames import EncodedFrame, decode_frame
 from tupli_mcap.messages.infos import InfoDecoder
-from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import EPISODE_ROWS
 from tupli_mcap.recording.write.episodes import Foretold

@@ -10,8 +10,9 @@ import numpy as np
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.live.follow import NewSteps, Watcher
 from tupli_mcap.live.target import Target
+from tupli_mcap.mcap.records import RECORD_HEADER
 from tupli_mcap.messages.images.codecs import CODEC
-from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA, RECORD_HEADER
+from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
 from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["FoxgloveView"]

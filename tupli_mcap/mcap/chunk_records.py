@@ -11,10 +11,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.logs import iter_records
+from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, iter_records
 from tupli_mcap.mcap.summary import parse_record
-from tupli_mcap.messages.layout import BODY, HEADER_FIELDS
-from tupli_mcap.recording.limits import MAX_ROWS_A_BYTE
 
 __all__ = ["HEADERS", "ChunkRecords", "chunk_records", "message_headers"]
 

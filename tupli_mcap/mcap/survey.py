@@ -21,9 +21,9 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.checked_records import attachment_index, checked_attachment, message_index
 from tupli_mcap.mcap.compression import MAX_RATIO, decompress
 from tupli_mcap.mcap.container import MAGIC
+from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import parse_record
-from tupli_mcap.recording.limits import MAX_CHUNK
 
 __all__ = ["Chunk", "Damage", "Found", "KnownChunk", "Survey", "attachment_name"]
 

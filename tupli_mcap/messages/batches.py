@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages import cdr
 from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.leaves import Leaf
 

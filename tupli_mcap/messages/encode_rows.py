@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
-from tupli_mcap.messages.layout import BODY
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import check_structure, exact_array, exact_flag, leaf_value, shorten
 from tupli_mcap.spaces.leaves import DType, Leaf

@@ -7,7 +7,7 @@ import struct
 from typing import NamedTuple
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, RECORD_HEADER
 
 __all__ = [
     "END_FIELDS",

@@ -13,36 +13,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.mcap.records import _OPCODE_MESSAGE, BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
 from tupli_mcap.spaces.leaves import DType, Leaf, ros_type
 
 __all__ = [
-    "BODY",
-    "CDR_HEADER",
-    "HEADER_FIELDS",
     "IMAGE_NAME",
     "IMAGE_SCHEMA",
-    "RECORD_HEADER",
     "Field",
     "MessageLayout",
     "image_layout",
     "record_dtype",
 ]
 
-CDR_HEADER = b"\x00\x01\x00\x00"
-# opcode, record length, channel, sequence, log_time, publish_time; then the CDR header
-RECORD_HEADER = struct.Struct("<BQHIQQ")
-BODY = RECORD_HEADER.size + len(CDR_HEADER)  # offset of the CDR body in a Message record
-_OPCODE_MESSAGE = 5
-
-HEADER_FIELDS: list[tuple[str, str, int]] = [
-    ("#opcode", "u1", 0),
-    ("#length", "<u8", 1),
-    ("#channel", "<u2", 9),
-    ("#sequence", "<u4", 11),
-    ("#log_time", "<u8", 15),
-    ("#publish_time", "<u8", 23),
-    ("#cdr", "<u4", 31),
-]
 
 _TIME_MSG = "int32 sec\nuint32 nanosec\n"
 _SEPARATOR = "=" * 80 + "\n"

@@ -16,14 +16,8 @@ import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, SpaceError
-from tupli_mcap.messages.layout import (
-    BODY,
-    ImageLayout,
-    MessageLayout,
-    field_line,
-    image_layout,
-    message_text,
-)
+from tupli_mcap.mcap.records import BODY
+from tupli_mcap.messages.layout import ImageLayout, MessageLayout, field_line, image_layout, message_text
 from tupli_mcap.messages.variable.codec import VariableField
 from tupli_mcap.spaces.leaves import ROS_TYPES, DType, Leaf, NameRegistry, flatten_space, structure
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json

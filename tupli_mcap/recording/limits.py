@@ -11,12 +11,10 @@ import numpy as np
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.compression import MAX_RATIO
 from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC
-from tupli_mcap.messages.layout import BODY
+from tupli_mcap.mcap.records import BODY, MAX_CHUNK, MAX_ROWS_A_BYTE
 
 __all__ = [
     "EPISODE_TOPICS",
-    "MAX_CHUNK",
-    "MAX_ROWS_A_BYTE",
     "StepClaims",
     "check_bools",
     "check_chunks",
@@ -24,13 +22,9 @@ __all__ = [
     "check_rows",
 ]
 
-MAX_CHUNK = 1 << 31
 EPISODE_TOPICS = ("/episode_start", "/episode_end", "/final_state")
 _U32 = 2**32 - 1
 _CHUNK_FIXED = 9 + 40  # of a Chunk record, before and after the name of its compression
-MAX_ROWS_A_BYTE = 16
-"""Messages that a byte of a compressed chunk may stand for at most: each has a number of its own (`sequence`), so that
-no compressor gets far below a byte a message."""
 _NAMED = np.array([_CHUNK_FIXED + len(name.replace("none", "")) for name in COMPRESSIONS], np.uint64)
 _RATIOS = np.array([MAX_RATIO[name] for name in COMPRESSIONS], np.uint64)
 Array = np.ndarray[Any, Any]

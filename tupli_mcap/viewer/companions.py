@@ -16,12 +16,13 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.journal.logs import group_records, iter_records
+from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.container import Rows
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
 from tupli_mcap.messages.cdr import write_string
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import record
-from tupli_mcap.messages.layout import BODY, CDR_HEADER, Field, record_dtype
+from tupli_mcap.messages.layout import Field, record_dtype
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.rewrite import Follower, rewrite_recording

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.live.follow import NewInfo, NewSteps, Watcher
+from tupli_mcap.mcap.records import BODY, RECORD_HEADER
 from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.messages.layout import BODY, RECORD_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Array, Block, Piece

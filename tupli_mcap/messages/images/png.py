@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.logs import iter_records
 from tupli_mcap.mcap.container import Rows
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, MAX_CHUNK, RECORD_HEADER, iter_records
 from tupli_mcap.messages.frames import EncodedFrame, decode_frame, encode_frame
 from tupli_mcap.messages.images.pictures import decode_pixels, encode_pixels
 from tupli_mcap.messages.images.stack import new_frames
-from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
-from tupli_mcap.recording.limits import MAX_CHUNK
+from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["PngCodec"]

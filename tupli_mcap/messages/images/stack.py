@@ -9,8 +9,8 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.messages.layout import BODY, ImageLayout
-from tupli_mcap.recording.limits import MAX_CHUNK
+from tupli_mcap.mcap.records import BODY, MAX_CHUNK
+from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["StackCodec", "new_frames"]

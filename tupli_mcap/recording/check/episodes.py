@@ -11,10 +11,10 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import message_headers
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.infos import InfoDecoder
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore

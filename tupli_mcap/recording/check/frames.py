@@ -8,9 +8,9 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import message_headers
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.frames import FRAME_LAYOUT, CameraTopics, decode_frame
 from tupli_mcap.messages.images.pictures import format_of
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recording import Recording

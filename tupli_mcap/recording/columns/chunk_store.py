@@ -19,13 +19,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.logs import iter_records
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.crc import crc32
+from tupli_mcap.mcap.records import BODY, MAX_CHUNK, iter_records
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.messages.layout import BODY
-from tupli_mcap.recording.limits import MAX_CHUNK, StepClaims
+from tupli_mcap.recording.limits import StepClaims
 
 __all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Located", "Span"]
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.container import Container, Rows
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.recording import Recording

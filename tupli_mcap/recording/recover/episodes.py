@@ -12,10 +12,10 @@ from mcap.records import Channel
 
 from tupli_mcap.journal.committed import FinalHole, to_rows
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.frames import FRAME_LAYOUT
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import Contents

@@ -13,10 +13,10 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC, PROFILE, Rows
+from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import parse_record
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.limits import MAX_CHUNK
 
 __all__ = ["Scan", "scan"]
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tupli_mcap.mcap.chunk_records import message_headers
-from tupli_mcap.messages.layout import BODY
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.recover.evidence import Gathered, PackedStore

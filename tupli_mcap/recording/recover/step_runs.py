@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.messages.layout import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 

@@ -17,6 +17,7 @@ from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import LogArea
 from tupli_mcap.journal.logs import FRONT, EvenRecords, EventLog, Sink
 from tupli_mcap.mcap.crc import crc32_each
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS
 from tupli_mcap.messages.episodes import (
     END_FIELDS,
     START_FIELDS,
@@ -26,7 +27,6 @@ from tupli_mcap.messages.episodes import (
     record,
     start_texts,
 )
-from tupli_mcap.messages.layout import BODY, CDR_HEADER, HEADER_FIELDS
 from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ import numpy as np
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.journal.seals import Durability, check_durability
+from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.messages.images.pictures import ImageFormat
-from tupli_mcap.recording.limits import MAX_CHUNK
 from tupli_mcap.system import refused
 
 __all__ = ["Mode", "WriterOptions", "check_local", "check_options"]

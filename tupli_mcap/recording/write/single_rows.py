@@ -16,6 +16,7 @@ from tupli_mcap.journal.derive import EpisodeRows, StartedEpisode
 from tupli_mcap.journal.file import RowArea
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.container import Rows
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, RECORD_HEADER
 from tupli_mcap.messages.encode_rows import (
     EPISODE_AND_STEP,
     HOLE,
@@ -24,7 +25,7 @@ from tupli_mcap.messages.encode_rows import (
     make_row_encoder,
 )
 from tupli_mcap.messages.episodes import EpisodeEnd
-from tupli_mcap.messages.layout import BODY, CDR_HEADER, RECORD_HEADER, ImageLayout
+from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog, Foretold
 from tupli_mcap.spaces.exact import exact_array

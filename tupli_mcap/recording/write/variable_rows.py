@@ -13,7 +13,7 @@ from tupli_mcap.errors import StepError
 from tupli_mcap.journal.file import LogArea
 from tupli_mcap.journal.logs import FRONT, LOG_HEADER, Sink, as_rows, group_records
 from tupli_mcap.journal.seals import STATE, seal
-from tupli_mcap.messages.layout import BODY, CDR_HEADER
+from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import exact_array, exact_flag, leaf_value, structure_check
 from tupli_mcap.spaces.leaves import Leaf

@@ -17,7 +17,7 @@ from tupli_mcap.journal.derive import EpisodeRows, StartedEpisode
 from tupli_mcap.journal.file import RowArea
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.messages.layout import BODY
+from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog, Foretold
 from tupli_mcap.recording.write.single_rows import HOLE, Array, StartChunks
