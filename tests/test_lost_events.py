@@ -25,8 +25,8 @@ from tupli_mcap.journal import file as journals
 from tupli_mcap.journal.committed import Salvage
 from tupli_mcap.journal.file import JournalContents, RowArea, read_journal
 from tupli_mcap.mcap.container import Container
+from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.write.single_rows import HOLE
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)

@@ -20,6 +20,7 @@ from mcap.reader import make_reader
 from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError
+from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.images.pictures import decode_pixels
 from tupli_mcap.messages.images.png import PngCodec
@@ -29,7 +30,6 @@ from tupli_mcap.recording.edit.merge import merge_recordings
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.write.options import WriterOptions
-from tupli_mcap.recording.write.single_rows import even_rows
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.replay.render import render
 from tupli_mcap.vector import RecordEpisodes as RecordVector

@@ -20,6 +20,7 @@ from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset, jsonvalue
 from tupli_mcap.dataset import open_columns
+from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.images.stack import StackCodec
 from tupli_mcap.messages.step import StepLayout
@@ -27,7 +28,6 @@ from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
-from tupli_mcap.recording.write.single_rows import even_rows
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 Array = np.ndarray[Any, Any]

@@ -10,13 +10,13 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.file import JournalContents, LogArea, RowArea
+from tupli_mcap.journal.rows import RowDeriver, even_rows
 from tupli_mcap.journal.seals import SECTOR, STATE, checksum, seal_of
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records
 from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.write.single_rows import RowDeriver, even_rows
-from tupli_mcap.recording.write.vector_rows import HOLE
 
 __all__ = [
     "FinalHole",

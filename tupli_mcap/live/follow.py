@@ -16,12 +16,13 @@ import numpy as np
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records
+from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.frames import EncodedFrame, decode_frame
 from tupli_mcap.messages.infos import InfoDecoder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import EPISODE_ROWS
 from tupli_mcap.recording.write.episodes import Foretold
-from tupli_mcap.recording.write.single_rows import HOLE, SingleRows
+from tupli_mcap.recording.write.single_rows import SingleRows
 from tupli_mcap.recording.write.variable_rows import StepLog
 from tupli_mcap.recording.write.vector_rows import VectorRows
 from tupli_mcap.recording.write.writer import RecordingWriter

@@ -17,6 +17,7 @@ from gymnasium import spaces
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.journal.logs import group_records
+from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
 from tupli_mcap.messages.cdr import write_string
@@ -26,7 +27,6 @@ from tupli_mcap.messages.layout import Field, record_dtype
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.rewrite import Follower, rewrite_recording
-from tupli_mcap.recording.write.single_rows import even_rows
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names
 

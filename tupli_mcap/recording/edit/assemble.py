@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from tupli_mcap.journal.logs import group_records
+from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
@@ -15,7 +16,6 @@ from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.write.single_rows import even_rows
 
 __all__ = ["Follower", "NewFrames", "Target", "Transfer"]
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
-from tupli_mcap.recording.write.single_rows import even_rows
 
 __all__ = ["first_chunks"]
 

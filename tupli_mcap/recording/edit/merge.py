@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import RecordingError, SpaceError
+from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
@@ -25,7 +26,6 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.sign.signature_file import STATEMENTS
 from tupli_mcap.recording.write.areas import register_channels
 from tupli_mcap.recording.write.rotation import series
-from tupli_mcap.recording.write.writer import LAST_ROW
 
 __all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.journal.logs import group_records
+from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.episodes import record
@@ -28,7 +29,6 @@ from tupli_mcap.recording.recover.evidence import Gathered, PackedStore
 from tupli_mcap.recording.recover.plan import IN_A_HOLE, RUNNING, NewPlaces, Plan, PlannedEpisode
 from tupli_mcap.recording.recover.segments import Channels, message_at, messages
 from tupli_mcap.recording.write.areas import register_channels
-from tupli_mcap.recording.write.single_rows import even_rows
 
 __all__ = ["RECOVERED", "RepairWriter"]
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.journal.file import Area, LogArea, RowArea
+from tupli_mcap.journal.rows import rows_per_half
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.messages.frames import (
@@ -19,7 +20,7 @@ from tupli_mcap.messages.frames import (
 from tupli_mcap.messages.images.codecs import CODEC, image_codecs
 from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
-from tupli_mcap.recording.write.single_rows import CHUNKS_PER_HALF, rows_per_half
+from tupli_mcap.recording.write.single_rows import CHUNKS_PER_HALF
 
 __all__ = ["FRAMES_AREA", "Channels", "plan_areas", "register_channels"]
 

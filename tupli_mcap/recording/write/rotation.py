@@ -15,9 +15,10 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, WriterOptions, check_local
-from tupli_mcap.recording.write.writer import LAST_ROW, RecordingWriter, finish_recording
+from tupli_mcap.recording.write.writer import RecordingWriter, finish_recording
 
 __all__ = ["Rotation", "series"]
 

@@ -8,12 +8,13 @@ import numpy as np
 
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import EventLog
+from tupli_mcap.journal.rows import RowDeriver
 from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.write.areas import FRAMES_AREA, Channels
 from tupli_mcap.recording.write.episodes import EpisodeLog
-from tupli_mcap.recording.write.single_rows import ImageRows, RowDeriver, SingleRows
+from tupli_mcap.recording.write.single_rows import ImageRows, SingleRows
 from tupli_mcap.recording.write.variable_rows import StepLog
 from tupli_mcap.recording.write.vector_rows import VectorRows
 

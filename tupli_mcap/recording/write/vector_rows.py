@@ -18,9 +18,10 @@ from tupli_mcap.journal.file import RowArea
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY
+from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog, Foretold
-from tupli_mcap.recording.write.single_rows import HOLE, Array, StartChunks
+from tupli_mcap.recording.write.single_rows import Array, StartChunks
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.spaces.leaves import Leaf
 

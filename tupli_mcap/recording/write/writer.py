@@ -29,6 +29,7 @@ from tupli_mcap.journal.file import (
     owner_among,
 )
 from tupli_mcap.journal.logs import EventLog
+from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.journal.seals import boot_id, sync_directory, sync_file
 from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.mcap.lock import FileLock
@@ -57,7 +58,6 @@ __all__ = [
 ]
 
 RECORDING_METADATA = "tupli_mcap.recording"
-LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
 
 
 _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
