@@ -34,6 +34,7 @@ from tupli_mcap.mcap.source import open_regular
 from tupli_mcap.system import refused
 
 __all__ = [
+    "FRAMES_AREA",
     "Journal",
     "LogArea",
     "RowArea",
@@ -406,3 +407,6 @@ def _area(entry: Mapping[str, Any]) -> Area:
     if type(entry["name"]) is not str or any(type(n) is not int or not 0 <= n < 1 << 48 for n in sizes):
         raise ValueError(entry)
     return RowArea(**values) if entry["kind"] == "rows" else LogArea(**values)
+
+
+FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name

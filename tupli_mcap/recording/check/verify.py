@@ -27,7 +27,7 @@ from tupli_mcap.recording.recover.evidence import may_be_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.unfinished import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head
 from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, verify_signature
-from tupli_mcap.recording.write.areas import register_channels
+from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["Problem", "VerifyReport", "verify_recording"]
 

@@ -19,7 +19,7 @@ from tupli_mcap.recording.edit.assemble import Follower, NewFrames, Target, Tran
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, stays_signed
-from tupli_mcap.recording.write.areas import register_channels
+from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["Follower", "NewFrames", "camera_channels", "define", "rewrite_recording", "write"]
 

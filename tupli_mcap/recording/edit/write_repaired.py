@@ -28,7 +28,7 @@ from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilde
 from tupli_mcap.recording.recover.evidence import Gathered, PackedStore
 from tupli_mcap.recording.recover.plan import IN_A_HOLE, RUNNING, NewPlaces, Plan, PlannedEpisode
 from tupli_mcap.recording.recover.segments import Channels, message_at, messages
-from tupli_mcap.recording.write.areas import register_channels
+from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["RECOVERED", "RepairWriter"]
 

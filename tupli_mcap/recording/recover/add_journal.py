@@ -11,7 +11,14 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import Salvage, log_records, running_record, size_behind
-from tupli_mcap.journal.file import JournalContents, LogArea, RowArea, read_journal, recorded_journal
+from tupli_mcap.journal.file import (
+    FRAMES_AREA,
+    JournalContents,
+    LogArea,
+    RowArea,
+    read_journal,
+    recorded_journal,
+)
 from tupli_mcap.journal.rows import RowDeriver
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
@@ -19,7 +26,6 @@ from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.recover.evidence import Gathered, Piece
 from tupli_mcap.recording.recover.segments import Channels, messages
 from tupli_mcap.recording.recover.unfinished import STEPS_IN_JOURNAL, belongs, define, misplaced_journal
-from tupli_mcap.recording.write.areas import FRAMES_AREA
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["add_journal"]

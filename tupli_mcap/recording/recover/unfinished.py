@@ -26,6 +26,7 @@ from tupli_mcap.journal.committed import (
     to_rows,
 )
 from tupli_mcap.journal.file import (
+    FRAMES_AREA,
     JournalContents,
     LogArea,
     RowArea,
@@ -40,7 +41,6 @@ from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata, step_channels
 from tupli_mcap.recording.recover.episodes import Unwritten, chunk_table, complete
 from tupli_mcap.recording.recover.prefix import Scan, is_ours, scan
-from tupli_mcap.recording.write.areas import FRAMES_AREA
 from tupli_mcap.system import refused
 
 __all__ = [

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from tupli_mcap.journal.file import Journal
+from tupli_mcap.journal.file import FRAMES_AREA, Journal
 from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.journal.rows import RowDeriver
 from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import IndexBuilder
-from tupli_mcap.recording.write.areas import FRAMES_AREA, Channels
+from tupli_mcap.recording.topics import Channels
 from tupli_mcap.recording.write.episodes import EpisodeLog
 from tupli_mcap.recording.write.single_rows import ImageRows, SingleRows
 from tupli_mcap.recording.write.variable_rows import StepLog

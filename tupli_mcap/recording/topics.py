@@ -1,0 +1,103 @@
+"""Topics, and the channels that a layout needs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.mcap.container import Container
+from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
+from tupli_mcap.messages.frames import CAMERA_NAME, CAMERA_SCHEMA, FRAME_NAME, FRAME_SCHEMA, CameraTopics
+from tupli_mcap.messages.images.codecs import CODEC, image_codecs
+from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
+from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
+
+__all__ = [
+    "Channels",
+    "register_channels",
+]
+
+
+class Channels(NamedTuple):
+    """MCAP channel ids."""
+
+    steps: list[int]
+    images: list[list[int]]  # by image leaf, then by sub-environment
+    final_state: int
+    start: int
+    end: int
+    info: int | None
+    cameras: list[tuple[int, int]]  # of one camera, by sub-environment: `/camera/<name>` and `/frame/<name>`
+
+
+def register_channels(
+    container: Container,
+    name: str,
+    layout: StepLayout,
+    sub_environments: int | None,
+    info: tuple[str, Mapping[str, str]] | None,
+    cameras: Sequence[str] = (),
+    png: Collection[str] = (),
+) -> Channels:
+    """Adds the channels a layout needs, or finds them in a recording that is appended to.
+
+    `sub_environments` is None for a single environment; `info` is the schema and the metadata of `/info`.
+    `cameras` are names; the ids of the last one's channels are returned. `png` are the image leaves that are stored as
+    PNG, by name.
+
+    Raises:
+        RecordingError: a channel of that topic has another schema.
+    """
+    known = {channel.topic: channel.id for channel in container.channels.values()}
+    schemas = {schema.name: schema.id for schema in container.schemas.values()}
+
+    def channel(topic: str, schema: str, text: str, metadata: Mapping[str, str]) -> int:
+        if topic in known:
+            old = container.schemas[container.channels[known[topic]].schema_id]
+            if old.data != text.encode():
+                raise RecordingError(
+                    f"{name} records {topic} with other fields; choose the same, or another file"
+                )
+            return known[topic]
+        if schema not in schemas:
+            schemas[schema] = container.add_schema(schema, text)
+        return container.add_channel(topic, schemas[schema], metadata)
+
+    description = layout.to_metadata()
+    tops = [""] if sub_environments is None else [f"/env_{i}" for i in range(sub_environments)]
+    steps = [
+        channel(f"{top}/step", STEP_SCHEMA, layout.step_schema, {**description, "env": str(i)})
+        for i, top in enumerate(tops)
+    ]
+    images = [
+        [
+            channel(
+                f"{top}/image/{leaf.name}",
+                *((CAMERA_NAME, CAMERA_SCHEMA) if leaf.name in png else (IMAGE_NAME, IMAGE_SCHEMA)),
+                {"env": str(i), "leaf": leaf.name, **({CODEC: "png"} if leaf.name in png else {})},
+            )
+            for i, top in enumerate(tops)
+        ]
+        for leaf in layout.images
+    ]
+    others = (
+        channel("/final_state", FINAL_STATE_SCHEMA, layout.final_schema, description),
+        channel("/episode_start", START_NAME, START_SCHEMA, {}),
+        channel("/episode_end", END_NAME, END_SCHEMA, {}),
+        None if info is None else channel("/info", "tupli_mcap/msg/Info", info[0], info[1]),
+    )
+    pairs: list[tuple[int, int]] = []
+    for name in cameras:
+        pairs = []
+        for i in range(len(tops)):
+            topics = CameraTopics.of(name, None if sub_environments is None else i)
+            about = {"env": str(i), "camera": name}
+            pairs.append(
+                (
+                    channel(topics.camera, CAMERA_NAME, CAMERA_SCHEMA, {}),
+                    channel(topics.frame, FRAME_NAME, FRAME_SCHEMA, about),
+                )
+            )
+    container.codecs = image_codecs(layout, container.channels)
+    return Channels(steps, images, *others, pairs)
