@@ -197,7 +197,7 @@ def _saying_what_is_safe(output: Path, limit: float | None, *, replaces: bool) -
 
 def _held(output: Path, limit: float | None) -> str:
     from tupli_mcap.recording import Recording
-    from tupli_mcap.recording.write.rotation import series
+    from tupli_mcap.recording.file_series import series
 
     first, others = (output, {}) if limit is None else series(output)
     paths = [path for path in (first, *others.values()) if path.exists()]

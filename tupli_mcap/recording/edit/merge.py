@@ -22,10 +22,10 @@ from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.assemble import Target, Transfer
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
+from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.sign.signature_file import STATEMENTS
 from tupli_mcap.recording.topics import register_channels
-from tupli_mcap.recording.write.rotation import series
 
 __all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -16,31 +15,18 @@ from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.rows import LAST_ROW
+from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, WriterOptions, check_local
 from tupli_mcap.recording.write.writer import RecordingWriter, finish_recording
 
-__all__ = ["Rotation", "series"]
+__all__ = [
+    "Rotation",
+]
 
 _PATIENCE = 1.25  # a running episode is cut when the limit is exceeded by a quarter
 _MOST_ROWS = LAST_ROW - (1 << 26)
 _CUT_ROWS = LAST_ROW - (1 << 25)
-_NUMBERED = re.compile(r"(.+)_([0-9]{4,})\Z")
-
-
-def series(path: Path) -> tuple[Path, dict[int, Path]]:
-    """The first file of the series that a path belongs to, and those that follow it and exist, by number."""
-    match = _NUMBERED.match(path.stem)
-    base = path if match is None else path.with_stem(match[1])
-    if match is not None and not base.exists():
-        base = path
-    pattern = re.compile(re.escape(base.stem) + r"_([0-9]{4,})" + re.escape(base.suffix) + r"\Z")
-    found = {}
-    with contextlib.suppress(OSError):
-        for name in os.listdir(base.parent):  # noqa: PTH208 - names are all it takes
-            if number := pattern.match(name):
-                found[int(number[1])] = base.with_name(name)
-    return base, dict(sorted(found.items()))
 
 
 class Rotation:
