@@ -26,7 +26,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import PROFILE
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.contents import read_contents
+from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.write.options import WriterOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -13,20 +12,14 @@ from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.checksums import check_crc
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
-from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import (
-    check_magic,
-    foreign,
-    has_summary,
-    read_attachment,
-    read_metadata,
-    read_summary,
-)
-from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME, EpisodeIndex
-from tupli_mcap.recording.limits import check_chunks
+from tupli_mcap.recording.index import EPISODE_ROWS, EpisodeIndex
 
-__all__ = ["Contents", "NewerVersionError", "check_version", "read_contents"]
+__all__ = [
+    "Contents",
+    "NewerVersionError",
+    "check_version",
+]
 
 RECORDING_METADATA = "tupli_mcap.recording"
 RECORDING_KEYS = (
@@ -38,8 +31,6 @@ CHANNEL_KEYS = (
 )  # fmt: skip
 _VERSIONS = ("1", "2")
 _PLACE = re.compile("(?:/env_([0-9]+))?/(image|frame)/(.+)", re.DOTALL)
-_ATTEMPTS = 5
-_PAUSE = 0.01  # seconds: a writer begins, ends or goes on within that
 _VALUES = (
     ("uuid", "32 hexadecimal digits", re.compile("[0-9a-f]{32}")),
     ("created_ns", "a time in decimal digits", re.compile("[0-9]{1,19}")),
@@ -80,59 +71,6 @@ class Contents:
         numbers = self.index.episodes["episode"]
         free = max(self.used_episodes, int(numbers.max()) + 1 if len(numbers) else 0)
         return max(free, int(told)) if re.fullmatch("[0-9]{1,10}", told) else free
-
-
-def read_contents(source: Source) -> Contents:
-    """Reads a finished file by its summary, another by recovery; anew if a writer changes it meanwhile.
-
-    Raises:
-        FormatError: no MCAP file, no recording of ours, or damaged.
-    """
-    for _ in range(_ATTEMPTS):
-        size = source.size
-        try:
-            return _read_contents(source)
-        except FormatError:
-            source.refresh()
-            if source.size == size and (source.path is None or not is_locked(source.path)):
-                raise
-        time.sleep(_PAUSE)
-    return _read_contents(source)
-
-
-def _read_contents(source: Source) -> Contents:
-    check_magic(source)
-    if not has_summary(source):
-        from tupli_mcap.recording.recover.unfinished import find_journal, recover_contents
-
-        journal = find_journal(source)  # a writer that closed in between has left a summary, and no journal
-        if not has_summary(source):
-            return recover_contents(source, journal)
-    summary = read_summary(source)
-    if RECORDING_METADATA not in summary.metadata:
-        raise foreign(source, f"it has no metadata {RECORDING_METADATA!r}")
-    metadata = check_metadata(source, read_metadata(source, summary.metadata[RECORDING_METADATA]))
-    if INDEX_NAME not in summary.attachments:
-        raise FormatError(
-            f"{source.name}: the recording has no episode index {INDEX_NAME!r}; recover it into a new file"
-        )
-    attachment = summary.attachments.pop(INDEX_NAME)
-    index = EpisodeIndex.decode(read_attachment(source, attachment), source.name)
-    if len(index.chunks) != summary.chunks:
-        raise FormatError(
-            f"{source.name}: the episode index lists {len(index.chunks)} chunks, the summary {summary.chunks}"
-        )
-    check_chunks(index.chunks, attachment.offset, source.name)
-    return Contents(
-        metadata,
-        summary.schemas,
-        summary.channels,
-        summary.attachments,
-        list(summary.metadata.values()),
-        index.chunks,
-        index=index,
-        data_end=attachment.offset,
-    )
 
 
 def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:

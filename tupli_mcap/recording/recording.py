@@ -27,10 +27,11 @@ from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.read import FIELDS, ColumnReader, Columns
 from tupli_mcap.recording.columns.runs import Runs, runs_of
 from tupli_mcap.recording.columns.stored_steps import StoredSteps
-from tupli_mcap.recording.contents import Contents, read_contents, step_channels
+from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.frames import Cameras, Frames
 from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
+from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, voucher
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf

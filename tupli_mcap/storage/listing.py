@@ -11,7 +11,7 @@ from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.description import spread_of, state_of
-from tupli_mcap.recording.recover.unfinished import metadata_at
+from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.storage.scan import scan
 from tupli_mcap.storage.sidecar import Notes
 from tupli_mcap.system import refused

@@ -19,7 +19,7 @@ from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, Storag
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
-from tupli_mcap.recording.recover.unfinished import metadata_at
+from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.storage.ahead import Ahead, ReadRecording
 from tupli_mcap.storage.atomic import Lock, os_errors

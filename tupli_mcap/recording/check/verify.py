@@ -25,7 +25,8 @@ from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.evidence import may_be_recording
 from tupli_mcap.recording.recover.file_end import read_tail
-from tupli_mcap.recording.recover.unfinished import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs, head
+from tupli_mcap.recording.recover.prefix import head
+from tupli_mcap.recording.recover.unfinished import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
 from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, verify_signature
 from tupli_mcap.recording.topics import register_channels
 

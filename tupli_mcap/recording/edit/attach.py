@@ -12,9 +12,10 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.recording.contents import Contents, read_contents
+from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
+from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.write.resume import restore_container
 
 __all__ = ["add_attachments"]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import zlib
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
@@ -14,11 +16,17 @@ from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC, PROFILE, Rows
 from tupli_mcap.mcap.records import MAX_CHUNK
-from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import parse_record
+from tupli_mcap.mcap.source import PathSource, Source
+from tupli_mcap.mcap.summary import foreign, parse_record
+from tupli_mcap.recording.contents import RECORDING_METADATA, check_metadata
 from tupli_mcap.recording.index import INDEX_NAME
 
-__all__ = ["Scan", "scan"]
+__all__ = [
+    "Scan",
+    "head",
+    "metadata_at",
+    "scan",
+]
 
 _RECORD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
@@ -169,3 +177,21 @@ def _other_definition(source: Source, opcode: int, body: memoryview, found: Scan
 def is_ours(found: Scan) -> bool:
     """True if the header names our profile."""
     return found.profile == PROFILE
+
+
+def head(source: Source) -> dict[str, str]:
+    """The metadata of a recording, from its first records. Raises FormatError if they are missing or not ours."""
+    found = scan(source, only_metadata=True)
+    if RECORDING_METADATA not in found.metadata:
+        if is_ours(found) or found.profile == "":
+            raise FormatError(
+                f"{source.name}: the file is cut off or damaged before its first step; nothing can be read from it"
+            )
+        raise foreign(source, f"its profile is {found.profile!r}")
+    return check_metadata(source, found.metadata[RECORDING_METADATA])
+
+
+def metadata_at(path: Path) -> dict[str, str]:
+    """The same of the file at a path. Raises RecordingError too: it cannot be opened."""
+    with contextlib.closing(PathSource(path)) as source:
+        return head(source)

@@ -34,13 +34,13 @@ from tupli_mcap.journal.file import (
     read_journal,
     recorded_journal,
 )
-from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.summary import foreign, has_summary, parse_record, records
+from tupli_mcap.mcap.source import Source
+from tupli_mcap.mcap.summary import has_summary, parse_record, records
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata, step_channels
+from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.recover.episodes import Unwritten, chunk_table, complete
-from tupli_mcap.recording.recover.prefix import Scan, is_ours, scan
+from tupli_mcap.recording.recover.prefix import Scan, head, scan
 from tupli_mcap.system import refused
 
 __all__ = [
@@ -49,8 +49,6 @@ __all__ = [
     "belongs",
     "define",
     "find_journal",
-    "head",
-    "metadata_at",
     "misplaced_journal",
     "recover_contents",
 ]
@@ -62,24 +60,6 @@ KEEP_JOURNAL = (
 )
 _EVENTS = ("events", "info")
 _ATTEMPTS = 100
-
-
-def head(source: Source) -> dict[str, str]:
-    """The metadata of a recording, from its first records. Raises FormatError if they are missing or not ours."""
-    found = scan(source, only_metadata=True)
-    if RECORDING_METADATA not in found.metadata:
-        if is_ours(found) or found.profile == "":
-            raise FormatError(
-                f"{source.name}: the file is cut off or damaged before its first step; nothing can be read from it"
-            )
-        raise foreign(source, f"its profile is {found.profile!r}")
-    return check_metadata(source, found.metadata[RECORDING_METADATA])
-
-
-def metadata_at(path: Path) -> dict[str, str]:
-    """The same of the file at a path. Raises RecordingError too: it cannot be opened."""
-    with contextlib.closing(PathSource(path)) as source:
-        return head(source)
 
 
 def recover_contents(source: Source, journal: JournalContents | Exception | None) -> Contents:

@@ -19,8 +19,10 @@ from tupli_mcap.mcap.summary import check_magic, has_summary
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
-from tupli_mcap.recording.contents import Contents, read_contents
-from tupli_mcap.recording.recover.unfinished import belongs, head, metadata_at, misplaced_journal
+from tupli_mcap.recording.contents import Contents
+from tupli_mcap.recording.open import read_contents
+from tupli_mcap.recording.recover.prefix import head, metadata_at
+from tupli_mcap.recording.recover.unfinished import belongs, misplaced_journal
 from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME
 
 if TYPE_CHECKING:
