@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from tupli_mcap import trust
-from tupli_mcap.errors import NotFoundError, SignatureError, missing_extra
-from tupli_mcap.system import refused
+from tupli_mcap.errors import NotFoundError, SignatureError, missing_extra, os_reason
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -182,7 +181,7 @@ def _read(path: Path) -> bytes:
             f"the key {str(path)!r} cannot be read: {err.strerror}; give the path of a key"
         ) from err
     except OSError as err:
-        raise SignatureError(f"the key {str(path)!r} cannot be read: {refused(err)}") from err
+        raise SignatureError(f"the key {str(path)!r} cannot be read: {os_reason(err)}") from err
 
 
 class _Library(NamedTuple):

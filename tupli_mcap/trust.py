@@ -26,8 +26,7 @@ from typing import NamedTuple
 import platformdirs
 
 from tupli_mcap import files
-from tupli_mcap.errors import TupliError
-from tupli_mcap.system import refused
+from tupli_mcap.errors import TupliError, os_reason
 
 __all__ = [
     "TrustedKey",
@@ -216,14 +215,14 @@ def _store(name: str, text: str) -> None:
         _make_private_dir(path.parent)
         files.write_bytes(path, text.encode(), permissions=0o600)
     except OSError as err:
-        raise TupliError(f"the signature {str(path)!r} cannot be written: {refused(err)}") from err
+        raise TupliError(f"the signature {str(path)!r} cannot be written: {os_reason(err)}") from err
 
 
 def _remove(path: Path) -> None:
     try:
         path.unlink(missing_ok=True)
     except OSError as err:
-        raise TupliError(f"the signature {str(path)!r} cannot be removed: {refused(err)}") from err
+        raise TupliError(f"the signature {str(path)!r} cannot be removed: {os_reason(err)}") from err
 
 
 def _check_digest(digest: str) -> None:
@@ -246,7 +245,7 @@ def _key(*, create: bool) -> bytes | None:
         if not create:
             return None
     except OSError as err:
-        raise TupliError(f"the key {str(path)!r} cannot be read: {refused(err)}") from err
+        raise TupliError(f"the key {str(path)!r} cannot be read: {os_reason(err)}") from err
     try:
         _make_private_dir(path.parent)
         # The first process to link wins; the others read its key.
@@ -254,7 +253,7 @@ def _key(*, create: bool) -> bytes | None:
             files.write_bytes(path, secrets.token_bytes(_KEY_BYTES), overwrite=False, permissions=0o600)
         return _read_key(path)
     except OSError as err:
-        raise TupliError(f"the key {str(path)!r} cannot be made: {refused(err)}") from err
+        raise TupliError(f"the key {str(path)!r} cannot be made: {os_reason(err)}") from err
 
 
 def _read_key(path: Path) -> bytes:

@@ -28,10 +28,9 @@ from uuid import uuid4
 import numpy as np
 
 from tupli_mcap import files
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.journal.seals import boot_id, sync_directory
 from tupli_mcap.mcap.source import open_regular
-from tupli_mcap.system import refused
 
 __all__ = [
     "FRAMES_AREA",
@@ -160,7 +159,7 @@ class Journal:
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise RecordingError(
-                f"{path}: could not make the journal of {size} bytes: {refused(err)} (journal_dir=)"
+                f"{path}: could not make the journal of {size} bytes: {os_reason(err)} (journal_dir=)"
             ) from err
 
     def publish(self, *, durable: bool = False, replaced: str = "") -> None:
@@ -178,7 +177,9 @@ class Journal:
         except OSError as err:
             with contextlib.suppress(OSError):
                 self._temporary.unlink()
-            raise RecordingError(f"{self.path}: could not put the journal in place: {refused(err)}") from err
+            raise RecordingError(
+                f"{self.path}: could not put the journal in place: {os_reason(err)}"
+            ) from err
         if durable:
             sync_directory(self.path.parent)
 
@@ -211,7 +212,7 @@ class Journal:
             self._map.flush()
         except OSError as err:
             raise RecordingError(
-                f"{self.path}: the journal could not be synced to the disk: {refused(err)}"
+                f"{self.path}: the journal could not be synced to the disk: {os_reason(err)}"
             ) from err
 
     def close(self) -> None:

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from tupli_mcap import files
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.mcap.records import BODY
-from tupli_mcap.system import refused
 
 __all__ = [
     "SECTOR",
@@ -85,7 +84,7 @@ def sync_file(fd: int, name: str) -> None:
         else:
             os.fsync(fd)
     except OSError as err:
-        raise RecordingError(f"{name}: could not be synced to the disk: {refused(err)}") from err
+        raise RecordingError(f"{name}: could not be synced to the disk: {os_reason(err)}") from err
 
 
 def sync_directory(path: Path) -> None:
@@ -97,4 +96,4 @@ def sync_directory(path: Path) -> None:
     try:
         files.sync(path)
     except OSError as err:
-        raise RecordingError(f"{path}: could not be synced to the disk: {refused(err)}") from err
+        raise RecordingError(f"{path}: could not be synced to the disk: {os_reason(err)}") from err

@@ -35,10 +35,9 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.mcap.checksums import with_crc
 from tupli_mcap.mcap.crc import crc32
-from tupli_mcap.system import refused
 
 __all__ = ["CHUNK_ROWS", "MAGIC", "Compression", "Container"]
 
@@ -161,7 +160,7 @@ class Container:
             with contextlib.suppress(OSError):  # what stays behind is no whole record, and is not read
                 os.ftruncate(self._fd, start)
             raise RecordingError(
-                f"{self._name}: could not write {sum(map(len, parts))} bytes at offset {start}: {refused(err)}; "
+                f"{self._name}: could not write {sum(map(len, parts))} bytes at offset {start}: {os_reason(err)}; "
                 "what was recorded before stays readable"
             ) from err
         self.position = position

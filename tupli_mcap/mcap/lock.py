@@ -20,8 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tupli_mcap import files
-from tupli_mcap.errors import RecordingError
-from tupli_mcap.system import refused
+from tupli_mcap.errors import RecordingError, os_reason
 
 __all__ = ["FileLock", "drop_private", "is_locked", "open_private", "writers_kept_out"]
 
@@ -142,7 +141,7 @@ class FileLock:
             self._file = _open_file(self._temporary, "x+")
         except OSError as err:
             self._temporary = None
-            reason = refused(err)
+            reason = os_reason(err)
             if isinstance(err, FileNotFoundError):
                 reason = "its directory does not exist; make it"
             elif self._old is not None:
@@ -174,7 +173,7 @@ class FileLock:
         except FileExistsError as err:
             raise _exists(self._shown) from err
         except OSError as err:
-            raise RecordingError(f"{self._shown} cannot be recorded to: {refused(err)}") from err
+            raise RecordingError(f"{self._shown} cannot be recorded to: {os_reason(err)}") from err
         self._temporary = None
         _drop_file(self._old)
         self._old = None
@@ -213,7 +212,7 @@ class FileLock:
         try:
             _close_file(self._file)
         except OSError as err:
-            raise RecordingError(f"{self._shown} could not be closed: {refused(err)}") from err
+            raise RecordingError(f"{self._shown} could not be closed: {os_reason(err)}") from err
 
 
 def _exists(path: Path) -> RecordingError:
@@ -243,7 +242,7 @@ def _open_locked(path: Path, *, mode: str = "r+", hint: str) -> io.FileIO:
         except FileNotFoundError as err:
             raise RecordingError(f"{path} cannot be recorded to: it does not exist; {hint}") from err
         except OSError as err:
-            raise RecordingError(f"{path} cannot be recorded to: {refused(err)}") from err
+            raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
         try:
             _lock(file.fileno(), path)
             if _is_at(file.fileno(), path):
@@ -251,7 +250,7 @@ def _open_locked(path: Path, *, mode: str = "r+", hint: str) -> io.FileIO:
         except BaseException as err:
             _drop_file(file)
             if isinstance(err, OSError):
-                raise RecordingError(f"{path} cannot be recorded to: {refused(err)}") from err
+                raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
             raise
         # it was deleted or replaced between opening and locking: what is written to it would be lost
         _drop_file(file)
@@ -266,7 +265,7 @@ def _lock(fd: int, path: Path) -> None:
             return
         except OSError as err:
             if err.errno not in _BUSY:
-                raise RecordingError(f"{path} cannot be locked: {refused(err)}") from err
+                raise RecordingError(f"{path} cannot be locked: {os_reason(err)}") from err
             if time.monotonic() > deadline or not _try_shared(fd):
                 raise RecordingError(f"{path} is being recorded by another writer; close it first") from err
         time.sleep(0.001)
@@ -310,4 +309,4 @@ def is_locked(path: Path) -> bool:
     except (FileNotFoundError, PermissionError):
         return False
     except OSError as err:
-        raise RecordingError(f"{path}: cannot tell whether it is being recorded: {refused(err)}") from err
+        raise RecordingError(f"{path}: cannot tell whether it is being recorded: {os_reason(err)}") from err

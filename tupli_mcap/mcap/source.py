@@ -13,8 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, TypeVar
 
-from tupli_mcap.errors import FormatError, RecordingError, missing_extra
-from tupli_mcap.system import refused
+from tupli_mcap.errors import FormatError, RecordingError, missing_extra, os_reason
 
 __all__ = ["Source", "open_regular", "open_source"]
 
@@ -92,7 +91,7 @@ class PathSource:
         except FileNotFoundError as err:
             raise RecordingError(f"{path} does not exist; give the path of a recording (.mcap)") from err
         except OSError as err:
-            raise RecordingError(f"{path} cannot be opened: {refused(err)}") from err
+            raise RecordingError(f"{path} cannot be opened: {os_reason(err)}") from err
         except ValueError as err:
             raise RecordingError(f"{path!r} cannot be opened: {err}") from err  # a NUL in it
         try:
@@ -154,7 +153,7 @@ class PathSource:
         try:
             status = os.fstat(self._fd)
         except OSError as err:
-            raise RecordingError(f"{self.name} cannot be read: {refused(err)}") from err
+            raise RecordingError(f"{self.name} cannot be read: {os_reason(err)}") from err
         if stat.S_ISDIR(status.st_mode):
             raise RecordingError(
                 f"{self.name} is a directory; give a recording (.mcap), or open it as a FileStorage"
@@ -237,7 +236,7 @@ def _refusals_told(name: str, offset: int, length: int, read: Callable[[], _T]) 
         return read()
     except OSError as err:
         raise RecordingError(
-            f"{name}: could not read {length} bytes at offset {offset}: {refused(err)}"
+            f"{name}: could not read {length} bytes at offset {offset}: {os_reason(err)}"
         ) from err
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from tupli_mcap.dataset.choose import choose_among
 from tupli_mcap.dataset.subjects import Examinable, Subject, subjects_of
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.plots.card import card, notes_of, title_of
 from tupli_mcap.plots.compose import compose
 from tupli_mcap.plots.gather import Measured, measure
@@ -22,7 +22,6 @@ from tupli_mcap.plots.style import styled
 from tupli_mcap.plots.trace import Trace, trace
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.atomic import write_bytes
-from tupli_mcap.system import refused
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -106,7 +105,7 @@ class Report:
         except FileExistsError as err:
             raise RecordingError(f"{goal} exists; choose another name, or overwrite it") from err
         except OSError as err:
-            raise RecordingError(f"{goal} cannot be written: {refused(err)}") from err
+            raise RecordingError(f"{goal} cannot be written: {os_reason(err)}") from err
         return goal
 
     def png(self) -> bytes:

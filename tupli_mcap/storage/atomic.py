@@ -14,10 +14,9 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from tupli_mcap import files
-from tupli_mcap.errors import FormatError, RecordingError, SignatureError, StorageError
+from tupli_mcap.errors import FormatError, RecordingError, SignatureError, StorageError, os_reason
 from tupli_mcap.mcap.lock import drop_private, open_private
 from tupli_mcap.recording import journal_path
-from tupli_mcap.system import refused
 
 __all__ = ["Lock", "LockError", "fill", "locked", "os_errors", "refusals_told", "write_bytes"]
 
@@ -64,7 +63,7 @@ def os_errors(what: str, path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as err:
-        raise StorageError(f"{what} {str(path)!r}: {refused(err)}") from err
+        raise StorageError(f"{what} {str(path)!r}: {os_reason(err)}") from err
 
 
 def refusals_told(cls: type[_Class]) -> type[_Class]:
@@ -82,7 +81,7 @@ def _told(method: Callable[..., Any]) -> Callable[..., Any]:
             return method(self, *args, **kwargs)
         except OSError as err:
             place = self.root if err.filename is None else os.fsdecode(err.filename)
-            raise StorageError(f"{method.__name__} failed at {str(place)!r}: {refused(err)}") from err
+            raise StorageError(f"{method.__name__} failed at {str(place)!r}: {os_reason(err)}") from err
 
     return call
 
@@ -128,7 +127,7 @@ class Lock:
             self._fd = locked(self._path)
         except OSError as err:
             raise LockError(
-                f"cannot change the storage: its lock {str(self._path)!r} cannot be taken: {refused(err)}"
+                f"cannot change the storage: its lock {str(self._path)!r} cannot be taken: {os_reason(err)}"
             ) from err
 
     def __exit__(

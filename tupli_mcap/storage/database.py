@@ -14,13 +14,12 @@ from urllib.parse import quote
 from sqlalchemy import URL, Connection, Dialect, Engine, Pool, StaticPool, create_engine, event, select
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
-from tupli_mcap.errors import FilterError, StorageError
+from tupli_mcap.errors import FilterError, StorageError, os_reason
 from tupli_mcap.mcap.lock import drop_private
 from tupli_mcap.storage.atomic import Lock, LockError, locked
 from tupli_mcap.storage.place import is_private, make_private
 from tupli_mcap.storage.sqlite import key_statements, register_functions, table_statements
 from tupli_mcap.storage.tables import APPLICATION_ID, DECLARED, METADATA, VERSION
-from tupli_mcap.system import refused
 
 _BUSY_MS: Final = 30_000
 _ATTEMPTS: Final = 100  # to open a file that others replace
@@ -424,7 +423,7 @@ def _usable(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as err:
-        raise CatalogUnusableError(f"catalog {str(path)!r} cannot be used: {refused(err)}") from err
+        raise CatalogUnusableError(f"catalog {str(path)!r} cannot be used: {os_reason(err)}") from err
 
 
 @contextlib.contextmanager

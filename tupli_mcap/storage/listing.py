@@ -7,14 +7,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.errors import RecordingError, TupliError, os_reason
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.description import spread_of, state_of
 from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.storage.scan import scan
 from tupli_mcap.storage.sidecar import Notes
-from tupli_mcap.system import refused
 
 __all__ = ["Compactable", "ListedRecording", "compactable", "find_recordings", "list_recordings"]
 
@@ -57,7 +56,7 @@ def find_recordings(path: Path) -> list[Path]:
         try:
             return [path / item.relative for item in sorted(scan(path))]
         except OSError as err:
-            raise RecordingError(f"{path} cannot be read: {refused(err)}") from err
+            raise RecordingError(f"{path} cannot be read: {os_reason(err)}") from err
     if not path.exists():
         raise RecordingError(f"{path} does not exist; give a recording (.mcap) or a directory of them")
     return [path]

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError
+from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError, os_reason
 from tupli_mcap.mcap.container import MAGIC, Container
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import PathSource, Source
@@ -28,7 +28,6 @@ from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.plan import Plan, make_plan
 from tupli_mcap.recording.recover.segments import Channels
 from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, verify_signature
-from tupli_mcap.system import refused
 
 __all__ = ["CutEpisode", "DamagedPlace", "LostSteps", "RecoveryReport", "recover_recording", "recovered_path"]
 
@@ -147,7 +146,7 @@ def recover_recording(
     try:
         _check(path, goal, overwrite=overwrite, dry_run=dry_run)
     except OSError as err:
-        raise RecordingError(f"{path} cannot be recovered to {goal}: {refused(err)}") from err
+        raise RecordingError(f"{path} cannot be recovered to {goal}: {os_reason(err)}") from err
     opened = PathSource(path)
     try:
         if dry_run:

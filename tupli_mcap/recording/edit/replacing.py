@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tupli_mcap import files
-from tupli_mcap.errors import RecordingError
-from tupli_mcap.system import refused
+from tupli_mcap.errors import RecordingError, os_reason
 
 __all__ = ["replacing", "tidy"]
 
@@ -29,7 +28,7 @@ def replacing(goal: Path, permissions: int = 0o666) -> Iterator[tuple[int, Path]
             finally:
                 os.close(fd)
     except OSError as err:
-        raise RecordingError(f"{goal} cannot be written: {refused(err)}") from err
+        raise RecordingError(f"{goal} cannot be written: {os_reason(err)}") from err
 
 
 def tidy(directory: Path) -> None:

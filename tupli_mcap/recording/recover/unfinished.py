@@ -15,7 +15,7 @@ from typing import Any
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.journal.committed import (
     Salvage,
     committed_rows,
@@ -41,7 +41,6 @@ from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.recover.episodes import Unwritten, chunk_table, complete
 from tupli_mcap.recording.recover.prefix import Scan, head, scan
-from tupli_mcap.system import refused
 
 __all__ = [
     "KEEP_JOURNAL",
@@ -168,7 +167,7 @@ def _read(source: Source, path: Path, only: Collection[str] | None = None) -> Jo
         raise _unreadable(source.name, err) from err
     except OSError as err:
         raise RecordingError(
-            f"{source.name} was not finished, and its journal {path.name} cannot be read: {refused(err)}"
+            f"{source.name} was not finished, and its journal {path.name} cannot be read: {os_reason(err)}"
         ) from err
 
 

@@ -10,11 +10,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.journal.seals import Durability, check_durability
 from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.messages.images.pictures import ImageFormat
-from tupli_mcap.system import refused
 
 __all__ = ["Mode", "WriterOptions", "check_local", "check_options"]
 
@@ -80,5 +79,5 @@ def check_options(path: str | os.PathLike[str], options: WriterOptions) -> Write
         if not Path(options.journal_dir).is_dir():
             raise RecordingError(f"{expected}; make it")
     except OSError as err:
-        raise RecordingError(f"{expected}: {refused(err)}") from err
+        raise RecordingError(f"{expected}: {os_reason(err)}") from err
     return options._replace(journal_dir=os.path.realpath(options.journal_dir))

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError
+from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError, os_reason
 from tupli_mcap.journal.file import (
     Area,
     Journal,
@@ -47,7 +47,6 @@ from tupli_mcap.recording.write.single_rows import ImageRows, SingleRows
 from tupli_mcap.recording.write.stores import Stores
 from tupli_mcap.recording.write.variable_rows import StepLog
 from tupli_mcap.recording.write.vector_rows import VectorRows
-from tupli_mcap.system import refused
 
 __all__ = [
     "EPISODE_AND_ENV",
@@ -119,7 +118,7 @@ class RecordingWriter:
                 with contextlib.suppress(RecordingError):
                     lock.release()
             if isinstance(err, OSError):
-                raise RecordingError(f"{self.path} cannot be recorded to: {refused(err)}") from err
+                raise RecordingError(f"{self.path} cannot be recorded to: {os_reason(err)}") from err
             raise
         _live.add(self)
 
@@ -144,7 +143,7 @@ class RecordingWriter:
             os.ftruncate(self.lock.fd, 0)
         except OSError as err:
             raise RecordingError(
-                f"{self.path} cannot be emptied ({refused(err)}); choose a regular file"
+                f"{self.path} cannot be emptied ({os_reason(err)}); choose a regular file"
             ) from err
         now = time.time_ns()
         values = {
@@ -221,7 +220,9 @@ class RecordingWriter:
         try:
             os.ftruncate(self.lock.fd, at)
         except OSError as err:
-            raise RecordingError(f"{self.path} could not be cut off at offset {at}: {refused(err)}") from err
+            raise RecordingError(
+                f"{self.path} could not be cut off at offset {at}: {os_reason(err)}"
+            ) from err
         self._is_cut = True
 
     def _areas(self, step_capacity: int = 0) -> list[Area]:
