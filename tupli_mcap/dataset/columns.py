@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.shared_dtypes import common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 
 __all__ = ["FieldBuilder", "LeafBuilder", "pick"]
 
-Array = np.ndarray[Any, Any]
 Keep = Array | None  # a bool mask of rows, a slice as None: all
 
 

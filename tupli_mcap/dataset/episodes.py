@@ -7,13 +7,13 @@ from typing import Any, overload
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.tuples import Tuples
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem
 
 __all__ = ["EpisodeItems", "items_of"]
 
-Array = np.ndarray[Any, Any]
 Columns = tuple[Mapping[str, Any], Array, StepLayout | None]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.columns import FieldBuilder, pick
 from tupli_mcap.dataset.selection import TupleSelector
 from tupli_mcap.dataset.sources import Source
@@ -26,8 +27,6 @@ __all__ = ["Selected", "read_columns"]
 _BLOCK_BYTES = 64 << 20
 _VARIABLE_STEP_BYTES = 4096  # a guess, for steps of variable size
 _RECORDED = ("states", "actions", "rewards", "terminals", "timeouts", "next_states")
-
-Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)

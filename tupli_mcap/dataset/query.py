@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from typing import Any, Self
 
-import numpy as np
-
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.columns import pick
 from tupli_mcap.dataset.loading import Selected, read_columns
 from tupli_mcap.dataset.parsers import map_columns
@@ -21,8 +20,6 @@ from tupli_mcap.sampling.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_keys
 
 __all__ = ["Query"]
-
-Array = np.ndarray[Any, Any]
 
 
 class Query:

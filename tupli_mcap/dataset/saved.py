@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from tupli_mcap import files, jsonvalue
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import FormatError, StorageError
@@ -32,7 +33,6 @@ from tupli_mcap.storage.atomic import os_errors
 
 __all__ = ["SavedColumns", "open_columns", "save_columns"]
 
-Array = np.ndarray[Any, Any]
 _MANIFEST = "manifest.json"
 _BLOCK_BYTES = 16 << 20  # of steps that are written together
 _BLOCK = 4096  # steps that are close to each other

@@ -13,11 +13,11 @@ from typing import TypeAlias
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset import TupliDataset
 from tupli_mcap.dataset.choose import candidates
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.blocks import Array
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.listing import find_recordings

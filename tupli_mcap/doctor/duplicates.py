@@ -8,12 +8,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Place, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic
 from tupli_mcap.doctor.message_text import plural, share
 from tupli_mcap.doctor.values import bounds
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.blocks import Array, Block
+from tupli_mcap.recording.blocks import Block
 
 __all__ = ["Digests", "duplicate_episodes"]
 

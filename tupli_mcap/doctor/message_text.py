@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from tupli_mcap.recording.blocks import Array
+from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["dimension_text", "dimensions", "duration", "plural", "share", "unravel"]

@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.doctor.findings import Finding, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace
 from tupli_mcap.doctor.message_text import duration, plural, share
-from tupli_mcap.recording.blocks import Array, Block
+from tupli_mcap.recording.blocks import Block
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = [

@@ -9,12 +9,13 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array, DType
 from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace, value_bytes
 from tupli_mcap.doctor.message_text import dimension_text, dimensions, plural
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.blocks import Array, Block
-from tupli_mcap.spaces.leaves import DType, Leaf
+from tupli_mcap.recording.blocks import Block
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["LeafValues", "bounds", "constant_dimension", "infinity", "nan", "outside_space", "unused_action"]
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.file import JournalContents, LogArea, RowArea
 from tupli_mcap.journal.rows import RowDeriver, even_rows
@@ -29,7 +30,6 @@ __all__ = [
     "to_rows",
 ]
 
-Array = np.ndarray[Any, Any]
 SEQUENCE_END = 15  # of `sequence` in a Message record
 EPISODE_END = BODY + 4  # of `episode` in a step's
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.recording.write.single_rows import Array
 
 __all__ = [
     "RowDeriver",

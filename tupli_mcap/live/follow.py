@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records
@@ -30,7 +31,6 @@ from tupli_mcap.spaces.labels import LABELS_NAME, Labels
 
 __all__ = ["NewInfo", "NewSteps", "Watcher"]
 
-Array = np.ndarray[Any, Any]
 _EPISODES = 4096  # ended episodes looked at in one go
 _HEADER = RECORD_HEADER.size
 _START = struct.Struct("<IIQ")  # episode, sub-environment and first row, with which starts begin

@@ -10,6 +10,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, iter_records
 from tupli_mcap.mcap.summary import parse_record
@@ -19,7 +20,6 @@ __all__ = ["HEADERS", "ChunkRecords", "chunk_records", "message_headers"]
 _RECORD = struct.Struct("<BQ")
 _BLOCK = 1 << 16  # records whose headers are looked at together
 HEADERS = np.dtype([(name, kind) for name, kind, _ in HEADER_FIELDS] + [("#offset", "<u8")])
-Array = np.ndarray[Any, Any]
 
 
 class ChunkRecords(NamedTuple):

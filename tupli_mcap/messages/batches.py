@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages import cdr
@@ -17,7 +18,6 @@ from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["LOG_TIME", "BatchDecoder", "Decode"]
 
-Array = np.ndarray[Any, Any]
 Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]  # `steps` or `finals` of a `BatchDecoder`
 LOG_TIME = "#log_time"  # the name of the times (ns), as in the rows of constant size
 _LOG_TIME_AT = 15  # in a record

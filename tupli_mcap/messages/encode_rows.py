@@ -20,11 +20,12 @@ from typing import Any, Protocol
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import DType
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import check_structure, exact_array, exact_flag, leaf_value, shorten
-from tupli_mcap.spaces.leaves import DType, Leaf
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["COMMIT", "EPISODE_AND_STEP", "HOLE", "SEQUENCE_OFFSET", "RowEncoder", "make_row_encoder"]
 

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import DType
 from tupli_mcap.mcap.records import _OPCODE_MESSAGE, BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
-from tupli_mcap.spaces.leaves import DType, Leaf, ros_type
+from tupli_mcap.spaces.leaves import Leaf, ros_type
 
 __all__ = [
     "IMAGE_NAME",

@@ -15,11 +15,12 @@ import gymnasium as gym
 import numpy as np
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import DType
 from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.layout import ImageLayout, MessageLayout, field_line, image_layout, message_text
 from tupli_mcap.messages.variable.codec import VariableField
-from tupli_mcap.spaces.leaves import ROS_TYPES, DType, Leaf, NameRegistry, flatten_space, structure
+from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf, NameRegistry, flatten_space, structure
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 
 __all__ = ["FINAL_STATE_SCHEMA", "STEP_SCHEMA", "Stack", "StepLayout", "can_stack", "stack_of"]

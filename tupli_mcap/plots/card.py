@@ -7,10 +7,10 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots.gather import Measured
 from tupli_mcap.plots.style import number_text, seed_text
-from tupli_mcap.recording.blocks import Array
 from tupli_mcap.recording.description import nan_text
 
 __all__ = ["card", "notes_of", "title_of"]

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.plots.draw_values import colour_bar
 from tupli_mcap.plots.gather import Measured
 from tupli_mcap.plots.page import Cell, Page
 from tupli_mcap.plots.series import LARGEST, bin_count, bin_edges, drawn
 from tupli_mcap.plots.style import cut
-from tupli_mcap.recording.blocks import Array
 
 __all__ = ["add_coverage", "most_varying"]
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots.gather import Measured
 from tupli_mcap.plots.page import Cell, Page
 from tupli_mcap.plots.series import bands, bin_count, bin_edges, drawn, running_mean, window_of
 from tupli_mcap.plots.style import BLUE, ENDS, GREY, INK, colours, drawable, legend_above, show_alone
-from tupli_mcap.recording.blocks import Array
 
 __all__ = ["add_episodes"]
 

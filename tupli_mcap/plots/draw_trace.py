@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.plots.draw_values import colour_bar, value_names
 from tupli_mcap.plots.gather import Measured
 from tupli_mcap.plots.page import Cell, Page
 from tupli_mcap.plots.style import BLUE, INK, SERIES, cut, number_text
 from tupli_mcap.plots.trace import Pictures, Trace
 from tupli_mcap.plots.values import LeafValues
-from tupli_mcap.recording.blocks import Array
 from tupli_mcap.spaces.element_names import short_path
 
 __all__ = ["add_trace", "by_scale"]

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.plots.page import LEFT, Cell, Page
 from tupli_mcap.plots.series import bin_count, bin_edges
 from tupli_mcap.plots.style import GREY, VERMILION, colours, cut, number_text, show_alone
 from tupli_mcap.plots.values import LeafValues
-from tupli_mcap.recording.blocks import Array
 from tupli_mcap.spaces.element_names import short_path
 
 __all__ = ["LEVELS", "Dimension", "add_values", "colour_bar", "quantiles", "value_names"]

@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.plots.series import LARGEST
 from tupli_mcap.plots.trace import Trace
 from tupli_mcap.plots.values import LeafValues
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.blocks import Array, blocks, step_bytes
+from tupli_mcap.recording.blocks import blocks, step_bytes
 from tupli_mcap.recording.description import RecordingDescription, describe
 from tupli_mcap.spaces.element_names import short_path
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tupli_mcap.recording.blocks import Array
+from tupli_mcap.arrays import Array
 
 __all__ = ["LARGEST", "Bands", "bands", "bin_count", "bin_edges", "drawn", "running_mean", "window_of"]
 

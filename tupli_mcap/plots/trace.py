@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots.series import drawn
 from tupli_mcap.plots.values import LeafValues
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.blocks import Array, blocks
+from tupli_mcap.recording.blocks import blocks
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["Pictures", "Trace", "trace"]

@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.plots.series import drawn
-from tupli_mcap.recording.blocks import Array
 from tupli_mcap.spaces.element_names import element_names
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf

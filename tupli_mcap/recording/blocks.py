@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.recording import Recording
 
 __all__ = ["Array", "Block", "blocks", "step_bytes"]
 
-Array = np.ndarray[Any, Any]
 
 BLOCK_BYTES = 8 << 20
 _VARIABLE_STEP_BYTES = 2048  # a guess, for steps of variable size

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, NamedTuple, overload
 
 import numpy as np
 from mcap.records import Channel, Schema
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages.frames import (
     CAMERA_NAME,
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Cameras", "Frames"]
 
-Array = np.ndarray[Any, Any]
 _SHAPES = ((CAMERA_NAME, CAMERA_SCHEMA), (FRAME_NAME, FRAME_SCHEMA))
 
 

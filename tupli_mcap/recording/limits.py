@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.compression import MAX_RATIO
 from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC
@@ -27,7 +28,6 @@ _U32 = 2**32 - 1
 _CHUNK_FIXED = 9 + 40  # of a Chunk record, before and after the name of its compression
 _NAMED = np.array([_CHUNK_FIXED + len(name.replace("none", "")) for name in COMPRESSIONS], np.uint64)
 _RATIOS = np.array([MAX_RATIO[name] for name in COMPRESSIONS], np.uint64)
-Array = np.ndarray[Any, Any]
 
 
 def check_chunks(table: Array, end: int, name: str) -> None:

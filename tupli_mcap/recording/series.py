@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.columns.read import Columns
@@ -18,7 +19,6 @@ from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["Series", "Sketch", "sketch"]
 
-Array = np.ndarray[Any, Any]
 
 READ_BYTES = 4 << 20
 """Steps of so many bytes are read at most; of longer recordings, some at a few places."""

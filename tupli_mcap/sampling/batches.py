@@ -7,15 +7,13 @@ from collections.abc import Iterator, Mapping, Sized
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-
+from tupli_mcap.arrays import Array
 from tupli_mcap.sampling.draws import Numbers
 from tupli_mcap.sampling.items import Items, checked_count
 from tupli_mcap.sampling.steps import SamplingError
 
 __all__ = ["Batches"]
 
-Array = np.ndarray[Any, Any]
 T = TypeVar("T")
 
 

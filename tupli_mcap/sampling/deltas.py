@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.sampling.items import Parts, StepItems
 from tupli_mcap.sampling.steps import SamplingError, Steps
 from tupli_mcap.sampling.windows import shaped_rows
 
 __all__ = ["DeltaWindow", "DeltaWindows", "Unit"]
 
-Array = np.ndarray[Any, Any]
 Unit = Literal["steps", "seconds", "clock"]
 UNITS = ("steps", "seconds", "clock")
 KEYS = {

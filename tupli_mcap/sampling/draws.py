@@ -8,6 +8,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.sampling.items import Items, checked_count, checked_numbers
 from tupli_mcap.sampling.shuffling import through_buffer
 from tupli_mcap.sampling.steps import SamplingError
@@ -16,7 +17,6 @@ from tupli_mcap.schema import BaseFilter, F
 
 __all__ = ["Numbers", "Order", "Sampler", "Shuffle", "Weights"]
 
-Array = np.ndarray[Any, Any]
 Shuffle = Literal["exact", "blocks"]
 Weights = Array | Sequence[float] | F | BaseFilter
 _DRAWS, _EPOCHS = 0, 1  # streams of random numbers

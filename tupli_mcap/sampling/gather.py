@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.batches import LOG_TIME, Decode
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.runs import items, items_dtype, put
@@ -24,8 +25,6 @@ TIME = LOG_TIME  # the column of times (uint64, ns)
 # Threads that decode small chunks take the interpreter from each other at every one: for so few, one thread is quicker.
 _FEW_CHUNKS = 128
 _LARGE_CHUNK = 1 << 20  # bytes
-
-Array = np.ndarray[Any, Any]
 
 
 class Column(NamedTuple):

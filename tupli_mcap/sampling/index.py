@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.messages.shared_dtypes import check_layouts
 from tupli_mcap.messages.step import StepLayout
@@ -21,8 +22,6 @@ from tupli_mcap.sampling.segments import Segments, SegmentsBuilder
 from tupli_mcap.schema import EpisodeHeader
 
 __all__ = ["ListedEpisodes", "StepIndex", "positions_of"]
-
-Array = np.ndarray[Any, Any]
 
 
 class ListedEpisodes(NamedTuple):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.sampling.steps import SamplingError, Steps
 from tupli_mcap.schema import BaseFilter, F
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Items", "Parts", "StepItems", "checked_count", "checked_numbers"]
 
-Array = np.ndarray[Any, Any]
 T = TypeVar("T")
 _MANY = 1 << 20  # items that are looked at together
 _MOST = 1 << 48  # of what can be counted here; sums of a few such numbers are integers of 64 bits

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, memory_for
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
@@ -26,7 +27,6 @@ __all__ = ["CACHE_BYTES", "THREADS", "RecordedSteps", "steps_of"]
 CACHE_BYTES = 512 << 20
 THREADS = min(4, os.cpu_count() or 1)
 _PLAIN = {"terminals": "terminal", "timeouts": "timeout", "times": TIME}
-Array = np.ndarray[Any, Any]
 
 
 class _Plan(NamedTuple):

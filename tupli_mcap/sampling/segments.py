@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Piece", "Segments", "SegmentsBuilder", "by_value"]
+from tupli_mcap.arrays import Array
 
-Array = np.ndarray[Any, Any]
+__all__ = ["Piece", "Segments", "SegmentsBuilder", "by_value"]
 
 
 class Piece(NamedTuple):

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-__all__ = ["through_buffer"]
+from tupli_mcap.arrays import Array
 
-Array = np.ndarray[Any, Any]
+__all__ = ["through_buffer"]
 
 
 def through_buffer(

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
 from tupli_mcap.messages.step import StepLayout
 
@@ -24,7 +25,6 @@ __all__ = [
 ]
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
-Array = np.ndarray[Any, Any]
 _MAX_ITEM = 1 << 30  # bytes of an item of an array
 _BLOCK = 4096  # steps in memory that are close to each other
 _TOGETHER = 1 << 16  # rows that are looked at together

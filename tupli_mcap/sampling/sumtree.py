@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-__all__ = ["SumTree"]
+from tupli_mcap.arrays import Array
 
-Array = np.ndarray[Any, Any]
+__all__ = ["SumTree"]
 
 
 class SumTree:

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.sampling.items import Parts, StepItems, checked_count
 from tupli_mcap.sampling.steps import SamplingError, Steps, checked_fields, map_arrays
 
 __all__ = ["TRANSITION_FIELDS", "Transition", "Transitions"]
 
-Array = np.ndarray[Any, Any]
 TRANSITION_FIELDS = ("states", "actions", "rewards", "next_states", "terminals", "timeouts")
 
 

@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.sampling.items import Items, Parts, checked_count
 from tupli_mcap.sampling.steps import FIELDS, SamplingError, Steps, checked_fields, map_arrays
 
 __all__ = ["Pad", "Window", "Windows", "shaped_rows"]
 
-Array = np.ndarray[Any, Any]
 Pad = Literal["none", "repeat", "zero"]
 PADS = ("none", "repeat", "zero")
 FIVE = ("states", "actions", "rewards", "terminals", "timeouts")

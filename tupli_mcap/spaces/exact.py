@@ -11,8 +11,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import DType
 from tupli_mcap.errors import StepError
-from tupli_mcap.spaces.leaves import ROS_TYPES, DType, Leaf
+from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf
 
 __all__ = [
     "check_structure",

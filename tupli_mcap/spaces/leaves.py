@@ -16,11 +16,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import DType
 from tupli_mcap.errors import SpaceError
 
 __all__ = [
     "ROS_TYPES",
-    "DType",
     "Leaf",
     "NameRegistry",
     "flatten_space",
@@ -28,7 +28,6 @@ __all__ = [
     "structure",
 ]
 
-DType = np.dtype[Any]
 
 # float16 has no ROS type: its bit pattern is stored, and the channel's metadata says so.
 ROS_TYPES: dict[str, str] = {

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset import SavedColumns, TupliDataset
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.sampling import SamplingError, Steps
@@ -32,7 +33,6 @@ except ImportError as err:
 
 __all__ = ["RecordedBuffer", "RecordedEpisode", "RecordedReplayBuffer", "mdp_dataset", "replay_buffer"]
 
-Array = np.ndarray[Any, Any]
 _FIELDS = ("states", "actions", "rewards")
 
 

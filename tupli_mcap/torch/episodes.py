@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.sampling import Items, Steps, Window
 from tupli_mcap.sampling.steps import checked_fields, map_arrays
 from tupli_mcap.sampling.windows import FIVE
 
 __all__ = ["Episodes"]
-
-Array = np.ndarray[Any, Any]
 
 
 class Episodes(Items[Window]):

@@ -16,11 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.sampling import Items
 
 __all__ = ["Batches", "Blocks", "Part", "blocks_of"]
-
-Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)

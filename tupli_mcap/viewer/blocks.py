@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.recording import Columns, Recording
 
 __all__ = ["TIMELINES", "Block", "Finals", "Piece", "blocks_of", "row_counts"]
@@ -14,7 +15,6 @@ __all__ = ["TIMELINES", "Block", "Finals", "Piece", "blocks_of", "row_counts"]
 TIMELINES = ("step", "episode_time", "time")
 _MAX_ROWS = 65_536  # larger chunks make the viewer no faster
 _MAX_BYTES = 32 << 20
-Array = np.ndarray[Any, Any]
 
 
 class Piece(NamedTuple):

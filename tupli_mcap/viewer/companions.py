@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.journal.rows import even_rows
@@ -32,7 +33,6 @@ from tupli_mcap.viewer.names import dimension_names
 
 __all__ = ["ARRAY_SCHEMA", "STRING_SCHEMA", "WIDEST", "companion_topics", "write_companions"]
 
-Array = np.ndarray[Any, Any]
 WIDEST = 64  # elements of a leaf that gets a companion: more lines than that are no plot
 _SEPARATOR = "=" * 80 + "\n"
 ARRAY_SCHEMA = (

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.live.follow import NewInfo, NewSteps, Watcher
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.description import nan_text, spread_of
 from tupli_mcap.viewer.about import plain
 from tupli_mcap.viewer.arrange import blueprint_of
-from tupli_mcap.viewer.blocks import Array
 from tupli_mcap.viewer.live_env import MOST_INFOS, LiveEnv, columns_of
 from tupli_mcap.viewer.panels import PALETTE, Place
 from tupli_mcap.viewer.scene import live_scene

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.live.follow import NewInfo, NewSteps, Watcher
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.leaves import Leaf
-from tupli_mcap.viewer.blocks import Array, Block, Piece
+from tupli_mcap.viewer.blocks import Block, Piece
 from tupli_mcap.viewer.panels import Panel, Place, Rewards, Series
 from tupli_mcap.viewer.pictures import Camera, HeatMap
 from tupli_mcap.viewer.scene import Scene

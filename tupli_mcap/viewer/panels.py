@@ -8,8 +8,9 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
-from tupli_mcap.viewer.blocks import Array, Block
+from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.sending import Times, send_scalars
 
 __all__ = ["ENDS", "PALETTE", "Panel", "Place", "Rewards", "Series", "flat_values", "named", "plot"]

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
-from tupli_mcap.viewer.blocks import Array, Block
+from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.panels import Place, flat_values, named
 from tupli_mcap.viewer.sending import Times, blob_array, column_of, send_blobs, send_tensors
 

@@ -9,11 +9,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.step import StepLayout, can_stack
 from tupli_mcap.recording import Recording
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
-from tupli_mcap.viewer.blocks import Array
 from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, escaped, magnitudes, title_of
 from tupli_mcap.viewer.panels import Panel, Rewards, Series
 from tupli_mcap.viewer.pictures import Camera, Grid, HeatMap, Picture

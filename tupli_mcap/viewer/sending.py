@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
+
 __all__ = [
     "Times", "blob_array", "column_of", "send_blobs", "send_scalars", "send_tensors", "send_texts", "tensor_array"
 ]  # fmt: skip
-
-Array = np.ndarray[Any, Any]
 
 
 class Times:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, MAX_CHUNK, RECORD_HEADER, iter_records
@@ -18,7 +19,6 @@ from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["PngCodec"]
 
-Array = np.ndarray[Any, Any]
 _STAMP = struct.Struct("<iI")  # kept bit for bit, also one that no clock says
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, MAX_CHUNK
@@ -15,7 +16,6 @@ from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["StackCodec", "new_frames"]
 
-Array = np.ndarray[Any, Any]
 _LENGTH = struct.Struct("<Q")  # of a Message record, after its opcode
 _HEIGHT_WIDTH = struct.Struct("<II")
 _COUNT = struct.Struct("<I")

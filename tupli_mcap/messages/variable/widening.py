@@ -13,8 +13,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import DType
 from tupli_mcap.spaces.exact import decide_dtype
-from tupli_mcap.spaces.leaves import DType, Leaf
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["EDGE_LINKS", "variable_dtypes"]
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import message_headers
 from tupli_mcap.mcap.records import BODY
@@ -23,8 +24,6 @@ from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["verify_episodes"]
-
-Array = np.ndarray[Any, Any]
 
 
 def verify_episodes(recording: Recording, findings: Findings) -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import message_headers
 from tupli_mcap.mcap.records import BODY
@@ -17,7 +16,6 @@ from tupli_mcap.recording.recording import Recording
 
 __all__ = ["verify_frames"]
 
-Array = np.ndarray[Any, Any]
 _TOLD = 3  # rows of a channel that are named, of each defect
 
 

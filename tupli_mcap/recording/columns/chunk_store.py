@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS
@@ -28,7 +29,6 @@ from tupli_mcap.recording.limits import StepClaims
 
 __all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Located", "Span"]
 
-Array = np.ndarray[Any, Any]
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
 _CHUNK_HEAD = struct.Struct(
     "<BQQQQII"

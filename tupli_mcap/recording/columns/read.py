@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.messages.batches import LOG_TIME, BatchDecoder, Decode
 from tupli_mcap.messages.step import StepLayout
@@ -21,7 +22,6 @@ from tupli_mcap.spaces.leaves import Leaf
 __all__ = ["FIELDS", "ColumnReader", "Columns"]
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
-Array = np.ndarray[Any, Any]
 _MANY_ROWS = 1000  # fewer are copied before they have been looked at in another way
 
 

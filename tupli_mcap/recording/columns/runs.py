@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
 __all__ = ["Pieces", "Runs", "final_runs", "items", "items_dtype", "put", "runs_of"]
 
-Array = np.ndarray[Any, Any]
 _LITTLE = sys.byteorder == "little"  # as the rows are
 _FEW = 4  # so many pieces are copied one by one
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.container import Container, Rows
@@ -19,7 +20,6 @@ from tupli_mcap.recording.recording import Recording
 
 __all__ = ["Follower", "NewFrames", "Target", "Transfer"]
 
-Array = np.ndarray[Any, Any]
 _CHUNK = 256 * 1024
 _START, _END, _FINAL = "/episode_start", "/episode_end", "/final_state"
 

@@ -30,8 +30,6 @@ from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["add_journal"]
 
-Array = np.ndarray[Any, Any]
-
 
 def add_journal(gathered: Gathered) -> None:
     """Reads the journal of an unfinished recording, and takes the rows that the file does not have."""

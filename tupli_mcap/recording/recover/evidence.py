@@ -11,6 +11,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Metadata, Schema
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
 from tupli_mcap.mcap.checked_records import message_index
@@ -34,7 +35,6 @@ from tupli_mcap.recording.recover.file_end import Tail
 
 __all__ = ["Gathered", "Piece", "Pieces", "gather", "is_recording", "may_be_recording"]
 
-Array = np.ndarray[Any, Any]
 _CACHE = 64 << 20
 _HEADERS = 16  # chunks whose headers are kept: a message at a time is taken from them
 _HEAD = 4096  # the recording's metadata record begins within so many bytes

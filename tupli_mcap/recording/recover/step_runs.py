@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
@@ -17,7 +18,6 @@ from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
 __all__ = ["Run", "StepFacts", "runs", "step_facts", "sum_up"]
 
-Array = np.ndarray[Any, Any]
 _TIME, _BEFORE_TIME = struct.Struct("<q"), 15  # of a Message record
 
 

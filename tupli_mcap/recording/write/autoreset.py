@@ -24,12 +24,12 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.spaces.exact import shorten
 
 __all__ = ["Autoreset"]
 
-Array = np.ndarray[Any, Any]
 Mode = Literal["NextStep", "SameStep", "Disabled"]
 _MODES: tuple[Mode, ...] = ("NextStep", "SameStep", "Disabled")
 _OTHERWISE = (

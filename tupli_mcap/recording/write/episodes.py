@@ -13,6 +13,7 @@ from zlib import crc32
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import LogArea
 from tupli_mcap.journal.logs import FRONT, EvenRecords, EventLog, Sink
@@ -37,7 +38,6 @@ __all__ = ["EPISODE_AND_ENV", "EpisodeLog", "Foretold", "ResetFacts", "StartedEp
 _RECORD = BODY - len(CDR_HEADER)  # bytes of a record before its CDR header
 _LENGTH = _RECORD - 9  # of which its length counts
 EPISODE_AND_ENV = struct.Struct("<II")
-Array = np.ndarray[Any, Any]
 _Fields = tuple[tuple[str, str, int], ...]
 # the fields that differ between messages of plain episodes: name, format, offset in the CDR body
 _BOTH: _Fields = (("episode", "<u4", 0), ("env", "<u4", 4))

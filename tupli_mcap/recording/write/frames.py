@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.images.pictures import FrameFormat, check_picture, encode_picture
@@ -25,7 +26,6 @@ __all__ = [
     "put_frame",
 ]
 
-Array = np.ndarray[Any, Any]
 Ask = Callable[..., Any]
 CAMERA: Final = "render"
 """The camera that `env.render()` is."""

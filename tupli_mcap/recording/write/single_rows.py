@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeRows, StartedEpisode
 from tupli_mcap.journal.file import RowArea
 from tupli_mcap.journal.rows import RowDeriver, even_rows
@@ -44,7 +45,6 @@ __all__ = [
 _IMAGE_HEAD = struct.Struct(f"<IQQ{len(CDR_HEADER)}siI")
 # of a single environment: what is done once a half finds cold caches, and takes as long for few rows as for many
 CHUNKS_PER_HALF = 2
-Array = np.ndarray[Any, Any]
 Sink = Callable[[Rows], None]
 StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]  # begins to make chunks; the result writes them
 

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.infos import InfoRecorder
@@ -26,7 +27,6 @@ from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["VectorRecorder"]
 
-Array = np.ndarray[Any, Any]
 _BOOL = np.dtype(np.bool_)
 
 
