@@ -39,13 +39,14 @@ from tupli_mcap.mcap.container import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.survey import Damage, Found, Survey
 from tupli_mcap.recording import RecoveryReport
+from tupli_mcap.recording.check.signature import check_signature
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
 from tupli_mcap.recording.recover.evidence import gather
 from tupli_mcap.recording.recover.file_end import Tail, read_tail
 from tupli_mcap.recording.recover.plan import NewPlaces, make_plan
 from tupli_mcap.recording.recover.segments import Channels
-from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, check_signature, sign_recording
+from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, sign_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 Steps = dict[tuple[int, int], str]

@@ -46,10 +46,11 @@ from tupli_mcap.errors import (
     UntrustedError,
 )
 from tupli_mcap.mcap.container import Container, Prepared, Rows
+from tupli_mcap.recording.check.signature import check_signature, verify_signature
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.attach import add_attachments
-from tupli_mcap.recording.sign.sign import check_signature, sign_recording, verify_signature
-from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, Signed
+from tupli_mcap.recording.sign.sign import sign_recording
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
 from tupli_mcap.schema import ArtifactMetadata, FilterEQ
 
 

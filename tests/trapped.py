@@ -42,11 +42,11 @@ from tupli_mcap.cli import app
 from tupli_mcap.doctor import examine
 from tupli_mcap.environment import named_imports
 from tupli_mcap.messages import encode_rows as encoder
+from tupli_mcap.recording.check.signature import check_signature
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.description import describe
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.sign.carried_code import carried_code
-from tupli_mcap.recording.sign.sign import check_signature
 from tupli_mcap.replay import certify, render
 from tupli_mcap.viewer.companions import write_companions
 

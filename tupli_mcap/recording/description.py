@@ -12,7 +12,7 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.sign.signature_file import claimed_signer
+from tupli_mcap.recording.signature_file import claimed_signer
 
 __all__ = [
     "ChannelFacts",

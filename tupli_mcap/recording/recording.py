@@ -32,7 +32,7 @@ from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.frames import Cameras, Frames
 from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
 from tupli_mcap.recording.open import read_contents
-from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, voucher
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME, voucher
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.trust import TrustedKey, is_trusted

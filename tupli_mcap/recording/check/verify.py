@@ -20,6 +20,7 @@ from tupli_mcap.messages.infos import info_schema
 from tupli_mcap.recording.check.episodes import verify_episodes
 from tupli_mcap.recording.check.frames import verify_frames
 from tupli_mcap.recording.check.report import Findings, Problem, VerifyReport
+from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.recording import Recording
@@ -27,7 +28,7 @@ from tupli_mcap.recording.recover.evidence import may_be_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.prefix import head
 from tupli_mcap.recording.recover.unfinished import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
-from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, verify_signature
+from tupli_mcap.recording.sign.sign import SIGNATURE_NAME
 from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["Problem", "VerifyReport", "verify_recording"]

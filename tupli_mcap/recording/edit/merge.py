@@ -24,7 +24,7 @@ from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
 from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.sign.signature_file import STATEMENTS
+from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]

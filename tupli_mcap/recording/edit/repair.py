@@ -16,6 +16,7 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import OTHER_TOOLS
 from tupli_mcap.mcap.survey import Damage, attachment_name
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.edit.repaired_frames import OldCameras, frames_lost
 from tupli_mcap.recording.edit.replacing import replacing, tidy
@@ -27,7 +28,7 @@ from tupli_mcap.recording.recover.evidence import Gathered, gather, is_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.plan import Plan, make_plan
 from tupli_mcap.recording.recover.segments import Channels
-from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, verify_signature
+from tupli_mcap.recording.sign.sign import SIGNATURE_NAME
 
 __all__ = ["CutEpisode", "DamagedPlace", "LostSteps", "RecoveryReport", "recover_recording", "recovered_path"]
 

@@ -18,7 +18,7 @@ from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.assemble import Follower, NewFrames, Target, Transfer
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, stays_signed
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
 from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["Follower", "NewFrames", "camera_channels", "define", "rewrite_recording", "write"]

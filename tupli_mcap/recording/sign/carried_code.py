@@ -22,9 +22,9 @@ from tupli_mcap.environment import (
     sha256,
 )
 from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
+from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.sign.sign import verify_signature
-from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME, claimed_signer
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME, claimed_signer
 
 __all__ = [
     "CarriedCode",

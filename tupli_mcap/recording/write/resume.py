@@ -23,7 +23,7 @@ from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.recover.prefix import head, metadata_at
 from tupli_mcap.recording.recover.unfinished import belongs, misplaced_journal
-from tupli_mcap.recording.sign.signature_file import SIGNATURE_NAME
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.write.writer import RecordingWriter

@@ -1,0 +1,191 @@
+"""A signature, held against all that it covers.
+
+The manifest covers what is read from a file, not its bytes: chunks may be compressed anew, and attachments that were
+added since (a replay certificate, a quality card) are named as not covered.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Container, Mapping
+from typing import Any, NamedTuple
+
+from tupli_mcap import signing, trust
+from tupli_mcap.environment import canonical_json, sha256
+from tupli_mcap.errors import FormatError, SignatureError
+from tupli_mcap.recording.check.report import Findings, VerifyReport
+from tupli_mcap.recording.check.structure import Structure
+from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.recover.file_end import read_tail
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME, STATEMENTS, Signed, is_covered_kind
+
+__all__ = [
+    "Signature",
+    "check_readers",
+    "check_signature",
+    "manifest",
+    "manifest_of_episodes",
+    "verify_signature",
+]
+
+
+# Of the metadata; the other keys are about the file as it happened to be written.
+_IDENTITY = ("uuid", "format_version", "library", "created_ns", "benchmark_id")
+
+
+class Signature(NamedTuple):
+    """A signature that fits its recording.
+
+    public_key: of the signer, 64 hex digits. fingerprint: the same as `ssh-keygen -l` shows it.
+    name: what this user calls the key; None where the key is not trusted here.
+    environment: the digest of the environment that was signed; None if the recording carries none.
+    not_covered: attachments that were added after signing, or that others may replace (a replay certificate).
+    """
+
+    public_key: str
+    fingerprint: str
+    name: str | None
+    environment: str | None
+    not_covered: tuple[str, ...]
+
+    @property
+    def trusted(self) -> bool:
+        """Whether this user trusts the key."""
+        return self.name is not None
+
+
+def check_signature(recording: Recording) -> Signature | None:
+    """As `verify_signature`; None if the recording is not signed."""
+    return verify_signature(recording) if SIGNATURE_NAME in recording.attachments else None
+
+
+def verify_signature(recording: Recording, walk: Structure | None = None) -> Signature:
+    """Checks the signature of a recording against everything it covers; all chunks are read.
+
+    walk: of the file, if somebody has made it already.
+
+    Raises:
+        SignatureError: there is none, or it does not fit: the message says what was changed.
+        FormatError: the file is damaged.
+        MissingExtraError: the extra `sign` is not installed.
+    """
+    name = recording.name
+    if SIGNATURE_NAME not in recording.attachments:
+        raise SignatureError(f"{name} is not signed; ask for a bundle made with `tupli-mcap bundle --sign`")
+    signed = Signed.decode(recording.read_attachment(SIGNATURE_NAME), name)
+    fingerprint = signing.fingerprint(signed.public_key)
+    if not signed.fits():
+        raise SignatureError(f"{name}: its signature was not made by the key {fingerprint} that it names")
+    if not recording.complete:
+        raise SignatureError(f"{name}: what was signed is finished, this recording is not")
+    found = manifest(recording)
+    _compare(signed.manifest, found, f"{name}, signed by {fingerprint}")
+    check_readers(recording, found["attachments"], walk)
+    names = {key.public_key: key.name for key in trust.trusted_keys()}
+    not_covered = tuple(
+        sorted(recording.attachments.keys() - {*signed.manifest["attachments"], SIGNATURE_NAME})
+    )
+    return Signature(
+        signed.public_key, fingerprint, names.get(signed.public_key), found["environment"], not_covered
+    )
+
+
+def manifest(recording: Recording) -> dict[str, Any]:
+    """What a signature covers, as it is in the file now."""
+    carried = "benchmark.json" in recording.attachments
+    return {
+        "format": "tupli_mcap.manifest",
+        "version": 1,
+        **manifest_of_episodes(recording),
+        "environment": recording.benchmark.record.digest if carried else None,
+        "attachments": {
+            name: sha256(recording.read_attachment(name))
+            for name in sorted(recording.attachments)
+            if name not in STATEMENTS
+        },
+    }
+
+
+def manifest_of_episodes(recording: Recording) -> dict[str, Any]:
+    """The part of the manifest that is about episodes."""
+    index = recording._contents.index
+    return {
+        "recording": {key: recording.metadata[key] for key in _IDENTITY if key in recording.metadata},
+        "channels": {
+            str(number): _channel(recording, number) for number in sorted(recording._contents.channels)
+        },
+        "episodes": {
+            "count": len(index.episodes),
+            "sha256": sha256(index.episodes.tobytes() + index.metadata),
+        },
+    }
+
+
+def _channel(recording: Recording, number: int) -> dict[str, Any]:
+    """Of a channel: its topic, and the digest of its definition and of all its message records, in order."""
+    channel = recording._contents.channels[number]
+    schema = recording._contents.schemas.get(channel.schema_id)
+    definition = {
+        "topic": channel.topic,
+        "encoding": channel.message_encoding,
+        "metadata": {key: value for key, value in channel.metadata.items() if key != "crc"},
+        "schema": None if schema is None else [schema.name, schema.encoding, sha256(schema.data)],
+    }
+    digest = hashlib.sha256(canonical_json(definition))
+    store = recording._store
+    for chunk in store.chunks(number):
+        digest.update(store.load(chunk, keep=False))
+    return {"topic": channel.topic, "messages": store.count(number), "sha256": digest.hexdigest()}
+
+
+def check_readers(recording: Recording, covered: Container[str], walk: Structure | None) -> None:
+    """Other readers go by the definitions in the chunks, by the summary's indexes, or by the order of the file: what
+    they see must be what was hashed, so all of it must agree, and nothing `covered` may be there twice."""
+    if walk is None:
+        source = recording._source
+        walk = Structure(source, read_tail(source), Findings(VerifyReport(recording.name)))
+        walk.run()
+    wrong = [problem.message + f" ({problem.place})" * bool(problem.place) for problem in walk.report.errors]
+    wrong += [
+        f"{name!r:.100} is in it twice"
+        for name in sorted(walk.repeated)
+        if name in covered or is_covered_kind(name) or name in (INDEX_NAME, RECORDING_METADATA)
+    ]
+    if wrong:
+        raise SignatureError(
+            f"{recording.name}: other readers may see something else in it than what is signed: {wrong[0]}; "
+            "ask its signer for another copy, or write it anew with tupli-mcap bundle"
+        )
+
+
+def _compare(signed: Mapping[str, Any], found: Mapping[str, Any], where: str) -> None:
+    """Raises SignatureError at the first difference; new attachments that nothing is rebuilt from are none."""
+    for part in ("format", "version", "recording", "environment"):
+        if signed.get(part) != found[part]:
+            raise SignatureError(
+                f"{where}: its {part} was changed: expected {signed.get(part)!r:.100}, found {found[part]!r:.100}"
+            )
+    for part, noun in (("attachments", "attachment"), ("channels", "channel")):
+        expected = signed.get(part)
+        if not isinstance(expected, dict):
+            raise FormatError(f"{where}: the manifest lists no {part}")
+        for name, value in expected.items():
+            if name not in found[part]:
+                raise SignatureError(f"{where}: the {noun} {name!r:.100} that was signed is missing")
+            if found[part][name] != value:
+                raise SignatureError(
+                    f"{where}: the {noun} {_named(found[part][name], name)} was changed after signing"
+                )
+        for name in found[part].keys() - expected.keys():
+            if part == "channels" or is_covered_kind(name):
+                raise SignatureError(
+                    f"{where}: the {noun} {_named(found[part][name], name)} was added after signing"
+                )
+    if signed.get("episodes") != found["episodes"]:
+        raise SignatureError(f"{where}: the episode index was changed after signing")
+
+
+def _named(value: Any, name: str) -> str:
+    return repr(value["topic"] if isinstance(value, dict) else name)[:100]
