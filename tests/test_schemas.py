@@ -26,7 +26,7 @@ from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, PROFILE
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.frames import FRAME_LAYOUT, encode_pair
-from tupli_mcap.messages.infos import InfoRecorder
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.contents import RECORDING_METADATA
@@ -146,12 +146,12 @@ class TestTables:
         assert values == ", ".join(f"{i} {name}" for i, name in enumerate(END_NAMES))
 
     def test_info(self) -> None:
-        recorder = InfoRecorder(["score", "other"])
-        body = recorder.encode(1, 2, {"score": 0.25})
+        codec = InfoCodec(["score", "other"])
+        body = codec.encode(1, 2, {"score": 0.25})
         for k, (value, here) in enumerate([(0.25, True), (0.0, False)]):
             found = read_by_table("info-field", body[8 + 16 * k :])
             assert found == {"<name>": value, "has_<name>": here, "pad_<name>": bytes(7)}
-        text, metadata = recorder.schema()
+        text, metadata = codec.schema()
         assert text.splitlines()[2:5] == ["float64 score", "bool has_score", "uint8[7] pad_score"]
         assert json.loads(metadata["fields"]) == ["score", "other"]
 

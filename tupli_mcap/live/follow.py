@@ -19,7 +19,7 @@ from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.frames import EncodedFrame, decode_frame
-from tupli_mcap.messages.infos import InfoDecoder
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import EPISODE_ROWS
 from tupli_mcap.recording.write.episodes import Foretold
@@ -221,7 +221,7 @@ class Watcher:
             else:  # of another sub-environment, or of steps that have not been looked at yet
                 waiting.append((time_ns, message))
         self._infos = waiting[-most:]
-        decoder = InfoDecoder(self._writer.container.channels[channel].metadata)
+        decoder = InfoCodec.from_metadata(self._writer.container.channels[channel].metadata)
         return [
             NewInfo(row, time_ns, decoder.decode(memoryview(message)[BODY - _HEADER :])[2])
             for row, time_ns, message in found[-most:]

@@ -1,4 +1,15 @@
-"""One recording, one `.mcap` file: written, appended to, read, recovered, rewritten."""
+"""One recording, one `.mcap` file: written, appended to, read, recovered, rewritten.
+
+recording, episode, frames    `Recording`, and what it gives
+open, contents                opening a file: everything that is known of it then
+index, limits                 the episode index, and whether it can be true
+topics, file_series           names of topics, and of files
+description, series, which    what `info` shows; which episodes a word means
+blocks                        whole episodes in bounded memory
+signature_file                the attachment that a signature is
+columns/, recover/            from rows to columns; from remains to episodes
+write/, edit/, check/, sign/  new recordings; out of others; whether they are right; who vouches for them
+"""
 
 from __future__ import annotations
 
@@ -19,18 +30,18 @@ if TYPE_CHECKING:
 
 # Imported on first use: who records or reads needs none of them.
 _HOMES = {
-    "EpisodeData": "handmade",
-    "MergeReport": "merge",
-    "Part": "merge",
-    "Problem": "verify",
-    "RecoveryReport": "repair",
-    "VerifyReport": "verify",
-    "merge_recordings": "merge",
-    "recover_recording": "repair",
-    "rewrite_recording": "rewrite",
-    "split_recording": "merge",
-    "verify_recording": "verify",
-    "write_recording": "handmade",
+    "EpisodeData": "write.from_values",
+    "MergeReport": "edit.merge",
+    "Part": "edit.merge",
+    "Problem": "check.verify",
+    "RecoveryReport": "edit.repair",
+    "VerifyReport": "check.verify",
+    "merge_recordings": "edit.merge",
+    "recover_recording": "edit.repair",
+    "rewrite_recording": "edit.rewrite",
+    "split_recording": "edit.merge",
+    "verify_recording": "check.verify",
+    "write_recording": "write.from_values",
 }
 
 __all__ = [

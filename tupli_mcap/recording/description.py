@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
+from tupli_mcap import signing
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.signature_file import claimed_signer
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording.recording import Recording
 
 __all__ = [
     "ChannelFacts",
     "RecordingDescription",
     "Spread",
+    "claimed_signer",
     "describe",
     "describe_space",
     "nan_text",
@@ -184,3 +189,15 @@ def _channels(recording: Recording) -> list[ChannelFacts]:
         stored = int(chunks["length"][chunks["offset"] < IN_MEMORY].sum())
         facts.append(ChannelFacts(channel.topic, "" if schema is None else schema.name, rows, size, stored))
     return facts
+
+
+def claimed_signer(recording: Recording) -> str | None:
+    """The fingerprint of the key that a recording says has signed it, unchecked; None if it is not signed.
+
+    Raises:
+        FormatError: its signature is no signature.
+    """
+    if SIGNATURE_NAME not in recording.attachments:
+        return None
+    signed = Signed.decode(recording.read_attachment(SIGNATURE_NAME), recording.name)
+    return signing.fingerprint(signed.public_key)

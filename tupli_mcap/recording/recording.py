@@ -21,7 +21,7 @@ from tupli_mcap.mcap.source import open_source
 from tupli_mcap.mcap.summary import read_attachment
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA, EpisodeStart
 from tupli_mcap.messages.images.codecs import image_codecs
-from tupli_mcap.messages.infos import InfoDecoder
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.read import FIELDS, ColumnReader, Columns
@@ -400,7 +400,7 @@ class Recording:
         if channel is None:
             return None
         if self._infos is None:
-            decoder = InfoDecoder(self._contents.channels[channel].metadata)
+            decoder = InfoCodec.from_metadata(self._contents.channels[channel].metadata)
             found: dict[int, dict[int, dict[str, Any]]] = {}
             for body in self._store.bodies(channel, 0, self._store.count(channel)):
                 episode, step, info = decoder.decode(body)

@@ -13,14 +13,13 @@ from tupli_mcap.environment import canonical_json
 from tupli_mcap.errors import FormatError
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.recording import Recording
+    pass
 
 __all__ = [
     "SIGNATURE_MEDIA_TYPE",
     "SIGNATURE_NAME",
     "STATEMENTS",
     "Signed",
-    "claimed_signer",
     "is_covered_kind",
     "stays_signed",
     "voucher",
@@ -110,18 +109,6 @@ def voucher(signature: bytes, digest: str, where: str) -> trust.TrustedKey | Non
     if signed.public_key not in known or signed.manifest.get("environment") != digest:
         return None
     return known[signed.public_key] if signed.fits() else None
-
-
-def claimed_signer(recording: Recording) -> str | None:
-    """The fingerprint of the key that a recording says has signed it, unchecked; None if it is not signed.
-
-    Raises:
-        FormatError: its signature is no signature.
-    """
-    if SIGNATURE_NAME not in recording.attachments:
-        return None
-    signed = Signed.decode(recording.read_attachment(SIGNATURE_NAME), recording.name)
-    return signing.fingerprint(signed.public_key)
 
 
 def is_covered_kind(name: str) -> bool:

@@ -16,10 +16,10 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.journal.seals import Durability
-from tupli_mcap.messages.infos import RecordInfo
 from tupli_mcap.recording.description import spread_of
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.frames import RENDER_MODE
+from tupli_mcap.recording.write.infos import RecordInfo
 from tupli_mcap.recording.write.options import Mode
 from tupli_mcap.wrappers.benchmark import CaptureEnv
 from tupli_mcap.wrappers.single import RecordEpisodes

@@ -19,11 +19,11 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
-from tupli_mcap.messages.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.frames import CAMERA, VectorFrames, check_every, check_render_mode
+from tupli_mcap.recording.write.infos import InfoRecorder, RecordInfo, entries_of
 from tupli_mcap.recording.write.options import Mode, WriterOptions
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.vector import VectorRecorder

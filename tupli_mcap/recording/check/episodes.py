@@ -15,7 +15,7 @@ from tupli_mcap.mcap.chunk_records import message_headers
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
-from tupli_mcap.messages.infos import InfoDecoder
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
@@ -306,7 +306,7 @@ class _Checker:
         channel = self._topics.get("/info")
         if channel is None:
             return
-        decoder = InfoDecoder(self._recording._contents.channels[channel].metadata)
+        decoder = InfoCodec.from_metadata(self._recording._contents.channels[channel].metadata)
         last: dict[int, int] = {}
         for row, _, body in self._messages("/info"):
             place: dict[str, Any] = {"channel": "/info"}

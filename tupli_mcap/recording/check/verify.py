@@ -16,7 +16,7 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.messages.images.codecs import png_leaves
-from tupli_mcap.messages.infos import info_schema
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.recording.check.episodes import verify_episodes
 from tupli_mcap.recording.check.frames import verify_frames
 from tupli_mcap.recording.check.report import Findings, Problem, VerifyReport
@@ -28,7 +28,7 @@ from tupli_mcap.recording.recover.evidence import may_be_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.prefix import head
 from tupli_mcap.recording.recover.unfinished import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
-from tupli_mcap.recording.sign.sign import SIGNATURE_NAME
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["Problem", "VerifyReport", "verify_recording"]
@@ -163,7 +163,7 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
     wanted = Container(-1, recording.name, "none")
     vector = None if "/step" in topics else recording.num_envs
     try:
-        infos = None if info is None else (info_schema(info.metadata), info.metadata)
+        infos = None if info is None else (InfoCodec.from_metadata(info.metadata).schema()[0], info.metadata)
         png = png_leaves(recording._contents.channels)
         register_channels(wanted, recording.name, recording.layout, vector, infos, recording.cameras, png)
     except FormatError as err:

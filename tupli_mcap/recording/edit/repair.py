@@ -28,7 +28,7 @@ from tupli_mcap.recording.recover.evidence import Gathered, gather, is_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.plan import Plan, make_plan
 from tupli_mcap.recording.recover.segments import Channels
-from tupli_mcap.recording.sign.sign import SIGNATURE_NAME
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
 __all__ = ["CutEpisode", "DamagedPlace", "LostSteps", "RecoveryReport", "recover_recording", "recovered_path"]
 

@@ -14,9 +14,9 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.frames import EncodedFrame
-from tupli_mcap.messages.infos import InfoRecorder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.frames import CAMERA, put_frame
+from tupli_mcap.recording.write.infos import InfoRecorder
 from tupli_mcap.recording.write.options import Mode, WriterOptions
 from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work

@@ -9,9 +9,9 @@ from typing import Any
 
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd
-from tupli_mcap.messages.infos import InfoRecorder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.variable.widening import variable_dtypes
+from tupli_mcap.recording.write.infos import InfoRecorder
 from tupli_mcap.recording.write.single_rows import SingleRows
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
 from tupli_mcap.spaces.exact import check_structure, decide_dtype, exact_array, leaf_value
@@ -244,7 +244,7 @@ class SingleRecorder:
             raise StepError("expected a reset before the first step; call env.reset()")
         first, facts = self._reset
         layout = decide_layout(self._spaces, [first, state], [action], [reward], self._writer.layout)
-        schema = None if self._infos is None else self._infos.schema()
+        schema = None if self._infos is None else self._infos.codec.schema()
         writer = self._writer
         writer.begin(layout, 1, vector=False, info_schema=schema)
         self._reset = None

@@ -14,9 +14,9 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
-from tupli_mcap.messages.infos import InfoRecorder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.autoreset import Autoreset
+from tupli_mcap.recording.write.infos import InfoRecorder
 from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.variable_rows import Encoder, StepLog, leaf_encoders
 from tupli_mcap.recording.write.vector_infos import check_infos, final_states, info_of, reset_info_of
@@ -285,7 +285,7 @@ class VectorRecorder:
                 list(rewards),
                 self._writer.layout,
             )
-        schema = None if self._infos is None else self._infos.schema()
+        schema = None if self._infos is None else self._infos.codec.schema()
         self._writer.begin(layout, self._n, vector=True, info_schema=schema)
         self._put_states(self._first, None)
         self._first = None
