@@ -56,8 +56,9 @@ class RerunView:
         sketch: Callable[[str], Callable[[Watcher], Picture | None]],
         warn: Callable[[str], None],
     ) -> None:
-        # a layer above this one has the error that names the extra
-        rerun = importlib.import_module("tupli_mcap.viewer.sdk").rerun_sdk()
+        from tupli_mcap.viewer.sdk import rerun_sdk
+
+        rerun = rerun_sdk()
         importlib.import_module("rerun.blueprint")
         rerun.Scalars.columns(scalars=[0.0])  # imports now what would hold the rollout up later
         self._sdk = rerun

@@ -8,7 +8,6 @@ Whatever happens here, the rollout goes on; what went wrong is said once, as a w
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import threading
 import time
@@ -156,10 +155,9 @@ def open_session(writer: RecordingWriter, live: str, title: str) -> LiveSession 
     try:
         if target.kind == "rerun":
             from tupli_mcap.live.rerun_view import RerunView
+            from tupli_mcap.viewer.live import Sketch
 
-            # a layer above this one: it shows recordings in the same panels
-            sketch = importlib.import_module("tupli_mcap.viewer.live").Sketch
-            view = RerunView(target, title, sketch, _warn)
+            view = RerunView(target, title, Sketch, _warn)
         else:
             from tupli_mcap.live.foxglove_view import FoxgloveView
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, overload
@@ -164,9 +163,8 @@ class Episode:
         Raises:
             MissingExtraError: rerun-sdk is not installed.
         """
-        viewer = importlib.import_module(
-            "tupli_mcap.viewer"
-        )  # a layer above, which this one is not to depend on
+        from tupli_mcap import viewer
+
         return viewer.send(self._recording, stream, [self.number])
 
     @cached_property

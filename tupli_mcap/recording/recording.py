@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -564,9 +563,8 @@ class Recording:
         Raises:
             MissingExtraError: rerun-sdk is not installed.
         """
-        viewer = importlib.import_module(
-            "tupli_mcap.viewer"
-        )  # a layer above, which this one is not to depend on
+        from tupli_mcap import viewer
+
         if save is not None:
             return viewer.save(self, save, episodes, **options)
         if viewer.in_notebook():
@@ -581,8 +579,9 @@ class Recording:
         Raises:
             MissingExtraError: matplotlib (the extra `plot`) is not installed.
         """
-        # that package lies above this one, and is needed here only
-        return importlib.import_module("tupli_mcap.plots").report(self, **options)
+        from tupli_mcap import plots
+
+        return plots.report(self, **options)
 
     def close(self) -> None:
         """Closes the file; what was read stays valid."""

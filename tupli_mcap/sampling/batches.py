@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping, Sized
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.sampling.draws import Numbers
-from tupli_mcap.sampling.items import Items, checked_count
-from tupli_mcap.sampling.steps import SamplingError
+from tupli_mcap.sampling.steps import SamplingError, checked_count
+
+if TYPE_CHECKING:
+    from tupli_mcap.sampling.items import Items
 
 __all__ = ["Batches"]
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling.items import Items, checked_count, checked_numbers
 from tupli_mcap.sampling.shuffling import through_buffer
-from tupli_mcap.sampling.steps import SamplingError
+from tupli_mcap.sampling.steps import SamplingError, checked_count, checked_numbers
 from tupli_mcap.sampling.sumtree import SumTree
 from tupli_mcap.schema import BaseFilter, F
+
+if TYPE_CHECKING:
+    from tupli_mcap.sampling.items import Items
 
 __all__ = ["Numbers", "Order", "Sampler", "Shuffle", "Weights"]
 

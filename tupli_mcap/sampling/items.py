@@ -6,23 +6,24 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling.steps import SamplingError, Steps
+from tupli_mcap.sampling.batches import Batches
+from tupli_mcap.sampling.draws import Numbers, Order, Sampler, Shuffle, Weights
+from tupli_mcap.sampling.steps import SamplingError, Steps, checked_numbers
 from tupli_mcap.schema import BaseFilter, F
 
-if TYPE_CHECKING:
-    from tupli_mcap.sampling.batches import Batches
-    from tupli_mcap.sampling.draws import Numbers, Order, Sampler, Shuffle, Weights
-
-__all__ = ["Items", "Parts", "StepItems", "checked_count", "checked_numbers"]
+__all__ = [
+    "Items",
+    "Parts",
+    "StepItems",
+]
 
 T = TypeVar("T")
 _MANY = 1 << 20  # items that are looked at together
-_MOST = 1 << 48  # of what can be counted here; sums of a few such numbers are integers of 64 bits
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,6 @@ class Items(ABC, Generic[T]):
         seed: int | None = None,
     ) -> Sampler:
         """A `Sampler` of these items: draws batches of their numbers without end."""
-        from tupli_mcap.sampling.draws import Sampler  # which builds on this module
-
         return Sampler(self, batch_size, by=by, weights=weights, seed=seed)
 
     def order(
@@ -117,8 +116,6 @@ class Items(ABC, Generic[T]):
         buffer: int | None = None,
     ) -> Order:
         """An `Order` of these items: the number of each once an epoch, in batches."""
-        from tupli_mcap.sampling.draws import Order
-
         return Order(self, batch_size, shuffle=shuffle, seed=seed, drop_last=drop_last, buffer=buffer)
 
     def batches(self, numbers: Numbers | int, *, read_ahead: int = 0) -> Batches[T]:
@@ -126,8 +123,6 @@ class Items(ABC, Generic[T]):
 
         See `Batches`, also for reading ahead.
         """
-        from tupli_mcap.sampling.batches import Batches
-
         if isinstance(numbers, int | np.integer):
             numbers = self.order(numbers)
         return Batches(self, numbers, read_ahead=read_ahead)
@@ -188,35 +183,3 @@ class StepItems(Items[T]):
     def _episodes(self, steps: Array) -> Array:
         """The places of the steps' episodes in the query."""
         return self._episode_ends.searchsorted(steps, side="right")
-
-
-def checked_count(value: object, least: int, what: str, most: int = _MOST) -> int:
-    """The value, if it is an integer from `least` to `most`.
-
-    Raises:
-        SamplingError: it is something else.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise SamplingError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
-    if value > most:
-        raise SamplingError(f"expected {what} of at most {most}, found {value!r:.80}")
-    return int(value)
-
-
-def checked_numbers(value: Any, what: str) -> Array:
-    """The value as int64, if it is integers in one dimension.
-
-    Raises:
-        SamplingError: it is something else.
-    """
-    try:
-        found = np.asarray(value)
-    except (TypeError, ValueError, OverflowError):  # lists of different lengths, for example
-        found = np.empty(())
-    if found.ndim != 1 or (found.dtype.kind not in "iu" and len(found)):
-        raise SamplingError(f"expected {what} in one dimension, found {value!r:.80}")
-    if found.dtype == np.uint64:
-        found = np.minimum(
-            found, np.uint64(_MOST)
-        )  # which is beyond everything, and does not become negative
-    return found.astype(np.int64)

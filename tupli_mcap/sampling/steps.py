@@ -16,7 +16,9 @@ __all__ = [
     "MemorySteps",
     "SamplingError",
     "Steps",
+    "checked_count",
     "checked_fields",
+    "checked_numbers",
     "following",
     "map_arrays",
     "pick",
@@ -197,3 +199,38 @@ def map_arrays(
     if isinstance(column, tuple):
         return tuple(map_arrays(function, part, of_list) for part in column)
     return of_list(column) if isinstance(column, list) else function(column)
+
+
+_MOST = 1 << 48  # of what can be counted here; sums of a few such numbers are integers of 64 bits
+
+
+def checked_count(value: object, least: int, what: str, most: int = _MOST) -> int:
+    """The value, if it is an integer from `least` to `most`.
+
+    Raises:
+        SamplingError: it is something else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise SamplingError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
+    if value > most:
+        raise SamplingError(f"expected {what} of at most {most}, found {value!r:.80}")
+    return int(value)
+
+
+def checked_numbers(value: Any, what: str) -> Array:
+    """The value as int64, if it is integers in one dimension.
+
+    Raises:
+        SamplingError: it is something else.
+    """
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError, OverflowError):  # lists of different lengths, for example
+        found = np.empty(())
+    if found.ndim != 1 or (found.dtype.kind not in "iu" and len(found)):
+        raise SamplingError(f"expected {what} in one dimension, found {value!r:.80}")
+    if found.dtype == np.uint64:
+        found = np.minimum(
+            found, np.uint64(_MOST)
+        )  # which is beyond everything, and does not become negative
+    return found.astype(np.int64)
