@@ -9,7 +9,7 @@ from typing import Any
 from tupli_mcap.journal import logs
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.encode_rows import COMMIT, SEQUENCE_OFFSET
-from tupli_mcap.recording.write import single_rows as rows
+from tupli_mcap.recording.write.rows import single as rows
 
 __all__ = ["BREAKAGES"]
 

@@ -23,9 +23,9 @@ from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import EPISODE_ROWS
 from tupli_mcap.recording.write.episodes import Foretold
-from tupli_mcap.recording.write.single_rows import SingleRows
-from tupli_mcap.recording.write.variable_rows import StepLog
-from tupli_mcap.recording.write.vector_rows import VectorRows
+from tupli_mcap.recording.write.rows.single import SingleRows
+from tupli_mcap.recording.write.rows.variable import StepLog
+from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
 

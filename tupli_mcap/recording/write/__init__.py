@@ -1,7 +1,7 @@
 """Recording: from `reset` and `step` to the journal and the file.
 
 single, vector                               record the episodes of one environment, and of many
-single_rows, vector_rows, variable_rows      keep the rows that are not in the file; stores has one a channel
+rows/                                        the rows that are not in the file, a store for each channel
 episodes, infos, vector_infos, frames        put what else is recorded into the journal
 writer, areas                                the file and its journal; the journal's areas
 resume                                       goes on in a recording that exists

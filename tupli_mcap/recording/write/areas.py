@@ -5,7 +5,7 @@ from __future__ import annotations
 from tupli_mcap.journal.file import FRAMES_AREA, Area, LogArea, RowArea
 from tupli_mcap.journal.rows import rows_per_half
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.write.single_rows import CHUNKS_PER_HALF
+from tupli_mcap.recording.write.rows.single import CHUNKS_PER_HALF
 
 __all__ = [
     "plan_areas",

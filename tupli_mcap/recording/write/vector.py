@@ -17,10 +17,10 @@ from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.infos import InfoRecorder
+from tupli_mcap.recording.write.rows.variable import Encoder, StepLog, leaf_encoders
+from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.recording.write.single import decide_layout
-from tupli_mcap.recording.write.variable_rows import Encoder, StepLog, leaf_encoders
 from tupli_mcap.recording.write.vector_infos import check_infos, final_states, info_of, reset_info_of
-from tupli_mcap.recording.write.vector_rows import VectorRows
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
 from tupli_mcap.spaces.exact import decide_dtype, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf

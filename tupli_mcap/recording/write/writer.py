@@ -43,10 +43,11 @@ from tupli_mcap.recording.write.areas import plan_areas
 from tupli_mcap.recording.write.compressing import ChunkWorker
 from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.write.options import WriterOptions, check_options
-from tupli_mcap.recording.write.single_rows import ImageRows, SingleRows
-from tupli_mcap.recording.write.stores import Stores
-from tupli_mcap.recording.write.variable_rows import StepLog
-from tupli_mcap.recording.write.vector_rows import VectorRows
+from tupli_mcap.recording.write.rows.images import ImageRows
+from tupli_mcap.recording.write.rows.single import SingleRows
+from tupli_mcap.recording.write.rows.stores import Stores
+from tupli_mcap.recording.write.rows.variable import StepLog
+from tupli_mcap.recording.write.rows.vector import VectorRows
 
 __all__ = [
     "EPISODE_AND_ENV",

@@ -22,7 +22,7 @@ from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog, Foretold
-from tupli_mcap.recording.write.single_rows import StartChunks
+from tupli_mcap.recording.write.rows.single import StartChunks
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.spaces.leaves import Leaf
 

@@ -14,9 +14,10 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.topics import Channels
 from tupli_mcap.recording.write.episodes import EpisodeLog
-from tupli_mcap.recording.write.single_rows import ImageRows, SingleRows
-from tupli_mcap.recording.write.variable_rows import StepLog
-from tupli_mcap.recording.write.vector_rows import VectorRows
+from tupli_mcap.recording.write.rows.images import ImageRows
+from tupli_mcap.recording.write.rows.single import SingleRows
+from tupli_mcap.recording.write.rows.variable import StepLog
+from tupli_mcap.recording.write.rows.vector import VectorRows
 
 __all__ = ["Stores"]
 

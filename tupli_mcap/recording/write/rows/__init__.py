@@ -1,0 +1,7 @@
+"""Rows that are not in the file yet, a class for each kind of channel; they commit, and hand over full chunks.
+
+single, vector    steps of constant size, of one environment and of many
+variable          steps of variable size
+images            the images of a leaf
+stores            one of these for each channel of a recording
+"""
