@@ -40,7 +40,7 @@ from tupli_mcap.schema import (
     split_key,
 )
 from tupli_mcap.schema.times import local_text, span_of, time_ns
-from tupli_mcap.storage.catalog import Catalog, EpisodeRow, RecordingStamp
+from tupli_mcap.storage.catalog.catalog import Catalog, EpisodeRow, RecordingStamp
 
 STAMP = RecordingStamp(1, 2, 3)
 UUID = "0123456789abcdef0123456789abcdef"

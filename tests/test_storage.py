@@ -47,8 +47,9 @@ from tupli_mcap.schema import (
     FilterIN,
     RLTuple,
 )
-from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, database, recordings
-from tupli_mcap.storage.catalog import Catalog
+from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, recordings
+from tupli_mcap.storage.catalog import database
+from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.document import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
 from tupli_mcap.storage.handmade import conform, infer_space
 from tupli_mcap.storage.listing import list_recordings

@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
-from tupli_mcap.storage.entries import catalog_rows
-from tupli_mcap.storage.rows import RecordingStamp, store_row
+from tupli_mcap.storage.catalog.entries import catalog_rows
+from tupli_mcap.storage.catalog.rows import RecordingStamp, store_row
 from tupli_mcap.storage.scan import stamp_of
 from tupli_mcap.storage.sidecar import Notes
 

@@ -23,15 +23,15 @@ from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.storage.ahead import Ahead, ReadRecording
 from tupli_mcap.storage.atomic import Lock, os_errors
-from tupli_mcap.storage.catalog import (
+from tupli_mcap.storage.catalog.catalog import (
     Catalog,
     CatalogDamagedError,
     CatalogMovedError,
     CatalogUnusableError,
     RecordingStamp,
 )
+from tupli_mcap.storage.catalog.entries import catalog_rows
 from tupli_mcap.storage.common import LOCAL_USER, published_in
-from tupli_mcap.storage.entries import catalog_rows
 from tupli_mcap.storage.place import cache_dir, catalog_path
 from tupli_mcap.storage.scan import scan, stamp_of
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path

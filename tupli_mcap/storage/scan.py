@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap.journal.file import journal_name
-from tupli_mcap.storage.rows import RecordingStamp
+from tupli_mcap.storage.catalog.rows import RecordingStamp
 from tupli_mcap.storage.sidecar import DELETING, Deletion, sidecar_path
 
 __all__ = ["FoundRecording", "scan", "stamp_of"]

@@ -6,8 +6,8 @@ import json
 from collections.abc import Iterator, Sequence
 
 from tupli_mcap.recording import Recording
+from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.common import LOCAL_USER
-from tupli_mcap.storage.rows import EpisodeRow
 from tupli_mcap.storage.sidecar import Sidecar
 
 __all__ = ["catalog_rows"]

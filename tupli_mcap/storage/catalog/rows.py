@@ -15,7 +15,7 @@ from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.schema.values import classify, tag_float
-from tupli_mcap.storage.tables import EPISODE_BITS
+from tupli_mcap.storage.catalog.tables import EPISODE_BITS
 
 INT64_MIN: Final = -(2**63)
 INT64_MAX: Final = 2**63 - 1

@@ -27,9 +27,9 @@ from sqlalchemy.sql.elements import ColumnElement
 from tupli_mcap.schema import BaseFilter, FilterIN, FilterType, compile_predicate, join_key, split_key
 from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import FLOAT_TAG, Scalar, against_floats, classify
-from tupli_mcap.storage.rows import escape_text, load_metadata, load_number
-from tupli_mcap.storage.sql import Condition, Operand, ScalarOperand, apply, bindable, whole_numbers
-from tupli_mcap.storage.tables import (
+from tupli_mcap.storage.catalog.rows import escape_text, load_metadata, load_number
+from tupli_mcap.storage.catalog.sql import Condition, Operand, ScalarOperand, apply, bindable, whole_numbers
+from tupli_mcap.storage.catalog.tables import (
     EPISODE,
     EPISODE_BITS,
     METADATA,

@@ -15,14 +15,14 @@ from sqlalchemy import Connection, Select, delete, func, insert, select
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, filter_keys, split_key
 from tupli_mcap.schema.facts import check_key
-from tupli_mcap.storage.database import (
+from tupli_mcap.storage.catalog.database import (
     CatalogDamagedError,
     CatalogMovedError,
     CatalogUnusableError,
     Database,
     MemoryDatabase,
 )
-from tupli_mcap.storage.rows import (
+from tupli_mcap.storage.catalog.rows import (
     EpisodeRow,
     RecordingStamp,
     StoredRow,
@@ -31,9 +31,9 @@ from tupli_mcap.storage.rows import (
     store_row,
     unescape_text,
 )
-from tupli_mcap.storage.sql import compile_filter
-from tupli_mcap.storage.sqlite import SqliteDialect, is_searchable, key_statements
-from tupli_mcap.storage.tables import (
+from tupli_mcap.storage.catalog.sql import compile_filter
+from tupli_mcap.storage.catalog.sqlite import SqliteDialect, is_searchable, key_statements
+from tupli_mcap.storage.catalog.tables import (
     DECLARED,
     EPISODE,
     EPISODE_BITS,
