@@ -23,7 +23,7 @@ from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR
 from tupli_mcap.storage import FileStorage, place
 from tupli_mcap.storage.catalog.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
-from tupli_mcap.storage.catalog.rows import escape_text, unescape_text
+from tupli_mcap.storage.common import escape_text, unescape_text
 from tupli_mcap.storage.place import cache_dir, catalog_path
 
 CREATED_NS = 1_795_251_600_000_001_999

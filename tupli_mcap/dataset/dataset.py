@@ -19,7 +19,7 @@ from tupli_mcap.dataset.selection import TupleFilter
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
 from tupli_mcap.dataset.tuples import Tuples
 from tupli_mcap.sampling import Steps
-from tupli_mcap.sampling.items import checked_count
+from tupli_mcap.sampling.steps import checked_count
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.tuples import anew

@@ -17,7 +17,10 @@ __all__ = [
     "iter_records",
 ]
 
-
+MAX_CHUNK = 1 << 31  # bytes, uncompressed
+MAX_ROWS_A_BYTE = 16
+"""Messages that a byte of a compressed chunk may stand for at most: each has a number of its own (`sequence`), so that
+no compressor gets far below a byte a message."""
 CDR_HEADER = b"\x00\x01\x00\x00"
 # opcode, record length, channel, sequence, log_time, publish_time; then the CDR header
 RECORD_HEADER = struct.Struct("<BQHIQQ")
@@ -51,9 +54,3 @@ def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, i
             )
         yield start, end, channel, sequence, log_time
         start = end
-
-
-MAX_CHUNK = 1 << 31
-MAX_ROWS_A_BYTE = 16
-"""Messages that a byte of a compressed chunk may stand for at most: each has a number of its own (`sequence`), so that
-no compressor gets far below a byte a message."""

@@ -1,19 +1,23 @@
-"""Small things that the files of a storage have in common: ids, groups, JSON."""
+"""Small things that the files of a storage have in common: ids, groups, JSON, texts."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from pydantic import ValidationError
 
 from tupli_mcap.errors import StorageError
 
-__all__ = ["LOCAL_USER", "first_defect", "is_hash", "published_in", "to_json"]
+__all__ = ["LOCAL_USER", "escape_text", "first_defect", "is_hash", "published_in", "to_json", "unescape_text"]
 
 LOCAL_USER = "local_storage"
 """Who creates what is in a directory; also the name of the only group that sees it."""
+_TO_ESCAPE: Final = re.compile("[\x00\x01\ud7ff\ud800-\udfff]")
+_ESCAPED: Final = re.compile("\x01[\x01\x02]|\ud7ff[\x01\u0100-\u08ff]")
+_SURROGATES_AT: Final = 0x100
 
 
 def is_hash(value: object) -> bool:
@@ -41,3 +45,27 @@ def first_defect(err: ValidationError) -> str:
     """Where data is wrong, and what is."""
     first = err.errors(include_url=False, include_input=False)[0]
     return f"{'.'.join(str(part) for part in first['loc']) or 'the whole'}: {first['msg']}"
+
+
+def escape_text(text: str) -> str:
+    """A text that SQLite can hold (no NUL, no lone surrogates) and that sorts as the original does."""
+    return text if text.isprintable() else _TO_ESCAPE.sub(_escape, text)
+
+
+def unescape_text(text: str) -> str:
+    """The inverse of `escape_text`."""
+    return _ESCAPED.sub(_unescape, text) if "\x01" in text or "\ud7ff" in text else text
+
+
+def _escape(match: re.Match[str]) -> str:
+    character = match[0]
+    if character <= "\x01":
+        return "\x01\x01" if character == "\x00" else "\x01\x02"
+    return "\ud7ff\x01" if character == "\ud7ff" else "\ud7ff" + chr(_SURROGATES_AT + ord(character) - 0xD800)
+
+
+def _unescape(match: re.Match[str]) -> str:
+    lead, code = match[0][0], match[0][1]
+    if lead == "\x01":
+        return "\x00" if code == "\x01" else "\x01"
+    return "\ud7ff" if code == "\x01" else chr(0xD800 + ord(code) - _SURROGATES_AT)

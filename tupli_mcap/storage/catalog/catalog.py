@@ -22,15 +22,7 @@ from tupli_mcap.storage.catalog.database import (
     Database,
     MemoryDatabase,
 )
-from tupli_mcap.storage.catalog.rows import (
-    EpisodeRow,
-    RecordingStamp,
-    StoredRow,
-    escape_text,
-    header,
-    store_row,
-    unescape_text,
-)
+from tupli_mcap.storage.catalog.rows import EpisodeRow, RecordingStamp, StoredRow, header, store_row
 from tupli_mcap.storage.catalog.sql import compile_filter
 from tupli_mcap.storage.catalog.sqlite import SqliteDialect, is_searchable, key_statements
 from tupli_mcap.storage.catalog.tables import (
@@ -41,6 +33,7 @@ from tupli_mcap.storage.catalog.tables import (
     in_order,
     of_one_recording,
 )
+from tupli_mcap.storage.common import escape_text, unescape_text
 
 __all__ = [
     "Catalog",

@@ -16,6 +16,7 @@ from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.schema.values import classify, tag_float
 from tupli_mcap.storage.catalog.tables import EPISODE_BITS
+from tupli_mcap.storage.common import _TO_ESCAPE, escape_text, unescape_text
 
 INT64_MIN: Final = -(2**63)
 INT64_MAX: Final = 2**63 - 1
@@ -23,9 +24,6 @@ INT64_MAX: Final = 2**63 - 1
 # What SQLite's JSON functions or its text would see differently from Python: escapes (in keys, of NUL, of
 # surrogates), tags, and the characters that `escape_text` itself uses.
 _UNUSUAL: Final = re.compile('[\\\\\x01\ud7ff\ud800-\udfff]|"\\$')
-_TO_ESCAPE: Final = re.compile("[\x00\x01\ud7ff\ud800-\udfff]")
-_ESCAPED: Final = re.compile("\x01[\x01\x02]|\ud7ff[\x01\u0100-\u08ff]")
-_SURROGATES_AT: Final = 0x100
 
 
 class RecordingStamp(NamedTuple):
@@ -159,34 +157,10 @@ def load_number(value: float | str | None) -> Any:
     return math.nan if value == "nan" else int(value)
 
 
-def escape_text(text: str) -> str:
-    """A text that SQLite can hold (no NUL, no lone surrogates) and that sorts as the original does."""
-    return text if text.isprintable() else _TO_ESCAPE.sub(_escape, text)
-
-
-def unescape_text(text: str) -> str:
-    """The inverse of `escape_text`."""
-    return _ESCAPED.sub(_unescape, text) if "\x01" in text or "\ud7ff" in text else text
-
-
 def _is_unusual(text: str) -> bool:
     if text.isascii():  # the usual case, and several times faster than the expression
         return "\\" in text or '"$' in text
     return _UNUSUAL.search(text) is not None
-
-
-def _escape(match: re.Match[str]) -> str:
-    character = match[0]
-    if character <= "\x01":
-        return "\x01\x01" if character == "\x00" else "\x01\x02"
-    return "\ud7ff\x01" if character == "\ud7ff" else "\ud7ff" + chr(_SURROGATES_AT + ord(character) - 0xD800)
-
-
-def _unescape(match: re.Match[str]) -> str:
-    lead, code = match[0][0], match[0][1]
-    if lead == "\x01":
-        return "\x00" if code == "\x01" else "\x01"
-    return "\ud7ff" if code == "\x01" else chr(0xD800 + ord(code) - _SURROGATES_AT)
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

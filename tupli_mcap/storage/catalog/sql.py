@@ -21,8 +21,8 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterIN, FilterType, b
 from tupli_mcap.schema.facts import comparisons
 from tupli_mcap.schema.filters import COMBINING, path_of
 from tupli_mcap.schema.values import Scalar, classify
-from tupli_mcap.storage.catalog.rows import escape_text
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING
+from tupli_mcap.storage.common import escape_text
 
 Condition = ColumnElement[bool]
 

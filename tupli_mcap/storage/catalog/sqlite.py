@@ -27,7 +27,7 @@ from sqlalchemy.sql.elements import ColumnElement
 from tupli_mcap.schema import BaseFilter, FilterIN, FilterType, compile_predicate, join_key, split_key
 from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import FLOAT_TAG, Scalar, against_floats, classify
-from tupli_mcap.storage.catalog.rows import escape_text, load_metadata, load_number
+from tupli_mcap.storage.catalog.rows import load_metadata, load_number
 from tupli_mcap.storage.catalog.sql import Condition, Operand, ScalarOperand, apply, bindable, whole_numbers
 from tupli_mcap.storage.catalog.tables import (
     EPISODE,
@@ -38,6 +38,7 @@ from tupli_mcap.storage.catalog.tables import (
     declared_columns,
     declared_index,
 )
+from tupli_mcap.storage.common import escape_text
 
 _SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
 _FEW: Final = 16  # so many numbers of an IN are looked up one by one
