@@ -35,12 +35,11 @@ from tupli_mcap import (
 from tupli_mcap.cli import app
 from tupli_mcap.cli.sparklines import PLAIN, sparkline
 from tupli_mcap.errors import install_line
-from tupli_mcap.plots import Report, gather, report
-from tupli_mcap.plots.draw_coverage import most_varying
+from tupli_mcap.plots import Measured, Report, report
 from tupli_mcap.plots.draw_trace import by_scale
-from tupli_mcap.plots.draw_values import LEVELS, quantiles
-from tupli_mcap.plots.gather import measure
-from tupli_mcap.plots.series import bands, bin_count, bin_edges, running_mean
+from tupli_mcap.plots.draw_values import LEVELS, most_varying, quantiles
+from tupli_mcap.plots.measure import measure
+from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, running_mean
 from tupli_mcap.recording.series import sketch
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
@@ -71,7 +70,7 @@ def tiny(tmp_path: Path) -> Path:
     return scripted(tmp_path / "tiny.mcap", lambda n: np.float32([n]), space, 55, length=10)
 
 
-def measured(path: Path) -> gather.Measured:
+def measured(path: Path) -> Measured:
     with Recording(path) as recording:
         return measure(recording, np.arange(len(recording)))
 
@@ -100,10 +99,10 @@ def test_values_are_those_of_the_whole_data(
     np.testing.assert_allclose(state.std, states.std(axis=0), rtol=1e-9)
     np.testing.assert_array_equal(state.least, states.min(axis=0))
     np.testing.assert_array_equal(state.most, states.max(axis=0))
-    np.testing.assert_array_equal(state.sample, states)
+    np.testing.assert_array_equal(state.values.T, states)
     np.testing.assert_array_equal(action.counts[0], np.bincount(columns.actions, minlength=2))
     np.testing.assert_array_equal(quantiles([state], 2), np.percentile(states[:, 2], LEVELS))
-    assert (reward.mean[0], reward.std[0], reward.finite[0]) == (1.0, 0.0, 400)
+    assert (reward.mean[0], reward.std[0], reward.values.shape) == (1.0, 0.0, (1, 400))
     assert found.read_steps == found.steps == 400
     assert found.notes() == []
     assert state.names == ("Cart Position", "Cart Velocity", "Pole Angle", "Pole Angular Velocity")
@@ -140,24 +139,31 @@ def test_the_largest_numbers_are_drawn_or_said_not_to_be(tmp_path: Path) -> None
         assert any("values beyond 1e+150 are not drawn" in note for note in made.notes) == (k == 1)
 
 
-def test_long_recordings_are_sampled_and_say_so(cartpole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_long_recordings_some_episodes_are_read(cartpole: Path) -> None:
     with Recording(cartpole) as recording:
-        states = recording.read().states
-    monkeypatch.setattr(gather, "SAMPLE_STEPS", 50)
-    found = measured(cartpole)
-    sample = found.states[0].sample
-    assert sample.shape == (50, 4)
-    assert {row.tobytes() for row in sample} <= {row.tobytes() for row in states}
-    assert found.actions[0].counts[0].sum() == 400  # counts are exact all the same
+        rows, states = recording.index, recording.read().states
+        found, again = (measure(recording, np.arange(len(recording)), 8000) for _ in range(2))
+        first = measure(recording, np.array([2]), 1)  # one episode is read at least
+    assert 0 < found.read_steps < 200
+    kept = found.states[0].values.T
+    assert kept.shape == (found.read_steps, 4)
+    assert {row.tobytes() for row in kept} <= {row.tobytes() for row in states}
+    assert found.actions[0].counts[0].sum() == found.read_steps
+    np.testing.assert_array_equal(kept, again.states[0].values.T)
     assert found.notes() == [
-        "Histograms of numbers show 50 randomly chosen steps; counts of choices, means and ranges are exact."
+        f"Values are those of {found.read_episodes} randomly chosen episodes ({found.read_steps} steps)."
     ]
-    monkeypatch.setattr(gather, "READ_BYTES", 8000)
-    again = [measured(cartpole) for _ in range(2)]
-    assert 0 < again[0].read_steps < 200
-    assert again[0].actions[0].counts[0].sum() == again[0].read_steps
-    np.testing.assert_array_equal(again[0].states[0].sample, again[1].states[0].sample)
-    assert "randomly chosen episodes" in again[0].notes()[0]
+    assert (first.read_episodes, first.read_steps) == (1, rows["length"][2])
+
+
+def test_several_recordings_share_what_is_read(cartpole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        sys.modules["tupli_mcap.plots.report"], "READ_BYTES", 60_000
+    )  # of 400 steps of 77 bytes
+    assert report(cartpole).notes == []
+    made = report([cartpole] * 4)
+    assert [one.read_steps < 400 for one in made.measured] == [True] * 4
+    assert len({one.name for one in made.measured}) == 1 and len(made.notes) == 1
 
 
 def test_images_are_not_read_for_histograms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,23 +183,25 @@ def test_running_means_and_bands() -> None:
     values = np.array([1.0, 3.0, np.nan, 5.0, np.inf, 7.0])
     np.testing.assert_array_equal(running_mean(values, 2), [1, 2, 3, 5, 5, 7])
     np.testing.assert_array_equal(running_mean(np.array([np.nan, 2.0]), 1), [np.nan, 2])
-    found = bands(np.arange(1000.0), 10)
-    np.testing.assert_allclose(found.mean, np.arange(10) * 100 + 49.5)
+    at, mean, low, tenth, _, high = bands(np.arange(1000.0), 10)
+    np.testing.assert_allclose(mean, np.arange(10) * 100 + 49.5)
+    np.testing.assert_allclose(at, mean)
     np.testing.assert_allclose(
-        found.tenth, [np.quantile(np.arange(k * 100, k * 100 + 100), 0.1) for k in range(10)]
+        tenth, [np.quantile(np.arange(k * 100, k * 100 + 100), 0.1) for k in range(10)]
     )
-    assert (found.low.tolist()[3], found.high.tolist()[3]) == (300, 399)
+    assert (low.tolist()[3], high.tolist()[3]) == (300, 399)
+    assert np.isnan(bands(np.array([np.nan, 1, np.nan, np.inf]), 2)[1:]).any(axis=0).tolist() == [False, True]
 
 
 @pytest.mark.parametrize(
     "values",
     [
-        [], [np.nan, np.inf], [3.5], [0.0, 0.0], [1e300, -1e300], [1e-310, 2e-310], [1.0, 1.0 + 2**-52], [5, 6, 9],
+        [], [np.nan, np.inf], [3.5], [0.0, 0.0], [1e149, -1e149], [1e-310, 2e-310], [1.0, 1.0 + 2**-52], [5, 6, 9],
         [-1e18, 1e18], [0.1] * 500 + [1e9], list(range(1000)), [1e308, 1.7e308], [-1.7e308, 1.7e308], [2.0**60] * 3,
     ],
 )  # fmt: skip
 def test_bins_hold_the_values_or_say_how_many_they_do_not(values: list[float]) -> None:
-    array = np.array(values, np.float64)
+    array = drawable_numbers(np.array(values, np.float64))
     edges, beyond = bin_edges(array, 30)
     finite = array[np.isfinite(array)]
     assert np.isfinite(edges).all()
@@ -208,7 +216,15 @@ def test_a_far_value_does_not_squeeze_the_others_into_one_bin() -> None:
     assert beyond == 1
     assert (np.histogram(values, edges)[0] > 0).sum() > 10
     assert bin_edges(np.array([2, 3, 3, 5]), 40)[0].tolist() == [1.5, 2.5, 3.5, 4.5, 5.5]  # whole numbers
-    assert [bin_count(n, 40) for n in (1, 20, 10_000)] == [8, 10, 40]
+    assert [len(bin_edges(np.linspace(0.1, 0.9, n), 40)[0]) - 1 for n in (2, 20, 10_000)] == [8, 10, 40]
+
+
+def test_one_value_is_a_bar_in_the_middle() -> None:
+    for values, width in (([20.0] * 3, 1), ([0.3], 1), ([1e9 + 0.3], 1e9 + 0.3), ([], 1)):
+        edges, beyond = bin_edges(np.array(values), 40)
+        np.testing.assert_allclose(np.diff(edges), width)
+        assert len(edges) == 10 and beyond == 0
+        assert np.histogram(values, edges)[0].tolist() == [0, 0, 0, 0, len(values), 0, 0, 0, 0]
 
 
 def test_the_two_dimensions_that_vary_most(tmp_path: Path) -> None:
@@ -217,8 +233,8 @@ def test_the_two_dimensions_that_vary_most(tmp_path: Path) -> None:
         lambda n: np.array([n % 2, 9.0, 5 * n, 30 * np.sin(n)]),
         spaces.Box(-99, 99, (4,), np.float64),
     )
-    assert most_varying(measured(path), 2) == [(0, 3), (0, 2)]
-    assert most_varying(measured(path)) == [(0, 3), (0, 2), (0, 0)]  # the constant one is none
+    states = [[leaf] for leaf in measured(path).states]
+    assert most_varying(states) == [3, 2, 0]  # the constant one is none
 
 
 def test_numbers_on_an_axis_stand_apart(tmp_path: Path) -> None:
@@ -258,7 +274,7 @@ def test_an_episode_step_by_step(cartpole: Path) -> None:
 
 
 def test_a_long_episode_keeps_its_extremes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tupli_mcap.plots.trace.MAX_POINTS", 20)
+    monkeypatch.setattr("tupli_mcap.plots.measure.MAX_POINTS", 20)
     monkeypatch.setattr("tupli_mcap.recording.blocks.BLOCK_BYTES", 2000)
     rng = np.random.default_rng(0)
     values = rng.normal(size=400)
@@ -287,10 +303,12 @@ def test_pictures_of_an_episode(tmp_path: Path) -> None:
     path = scripted(tmp_path / "r.mcap", frame, spaces.Box(0, 255, (4, 5, 3), np.uint8), 10, length=10)
     ((_, trace),) = report(path).traces
     (pictures,) = trace.pictures
-    assert pictures.steps == [0, 1, 3, 5, 7, 9]
-    assert [int(one[0, 0, 0]) for one in pictures.frames] == [0, 5, 15, 25, 35, 45]
-    assert pictures.mean.shape == (4, 5, 3) and int(pictures.mean[0, 0, 0]) == 22  # of 0, 5, ..., 45
-    assert pictures.averaged == 10
+    shown = {title: int(picture[0, 0, 0]) for title, picture in pictures}
+    assert shown == {
+        "step 0": 0, "step 1": 5, "step 3": 15, "step 5": 25, "step 7": 35, "step 9": 45,
+        "mean of 10": 22,  # of 0, 5, ..., 45
+    }  # fmt: skip
+    assert {picture.shape for _, picture in pictures} == {(4, 5, 3)}
 
 
 @pytest.mark.parametrize("axis", [0, -1])
@@ -305,7 +323,7 @@ def test_the_newest_frame_of_a_stack_is_shown(tmp_path: Path, shape: tuple[int, 
     moved = gym.wrappers.TransformObservation(stack, lambda frames: np.moveaxis(frames, 0, axis), space)
     ((_, trace),) = report(record(tmp_path / "r.mcap", moved, 10)).traces
     (pictures,) = trace.pictures
-    assert [(one.shape, int(one.flat[0])) for one in pictures.frames] == [
+    assert [(one.shape, int(one.flat[0])) for _, one in pictures[:-1]] == [
         (shape, n) for n in (0, 5, 15, 25, 35, 45)
     ]
 
@@ -414,7 +432,7 @@ def test_vector_recordings(tmp_path: Path) -> None:
     found = measured(path)
     with Recording(path) as recording:
         columns = recording.read()
-    np.testing.assert_array_equal(np.sort(found.states[0].sample, axis=0), np.sort(columns.states, axis=0))
+    np.testing.assert_array_equal(np.sort(found.states[0].values.T, axis=0), np.sort(columns.states, axis=0))
     made = report(path)
     assert "3 sub-environments" in dict(made.facts)["environment"]
     assert made.png()
@@ -543,8 +561,8 @@ def test_what_lines_of_compared_recordings_are_is_said(tmp_path: Path) -> None:
         return {text for text in texts(made) if text.startswith("episode;")}
 
     assert told("short", "middle") == {"episode; lines are means of 2 to 5 episodes"}
-    assert told("short", "long") == {"episode; lines are means of 2 to 14 episodes"}
-    assert told("long", "long") == {"episode; lines are means of 14 episodes"}
+    assert told("short", "long") == {"episode; lines are means of 2 to 100 episodes"}
+    assert told("long", "long") == {"episode; lines are means of 100 episodes"}
 
 
 def test_so_many_recordings_that_not_all_are_named(tmp_path: Path) -> None:

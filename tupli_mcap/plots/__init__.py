@@ -1,6 +1,12 @@
-"""Pictures of recordings without a viewer: `report` makes one page, as PNG, SVG or HTML. Needs the extra `plot`."""
+"""Recordings as one page of pictures, without a viewer; needs the extra `plot`.
 
-from tupli_mcap.plots.gather import Measured
+- `report` makes the page, a `Report`, and saves it as PNG, SVG or HTML.
+- `measure` reads what it shows: values of all steps, and chosen episodes step by step. `statistics` sums them up.
+- `draw_episodes`, `draw_values` and `draw_trace` draw its panels; `texts` writes its head, its notes and the HTML.
+- `style` holds colours, fonts and the layout of all of them.
+"""
+
+from tupli_mcap.plots.measure import Measured
 from tupli_mcap.plots.report import FORMATS, Report, check_goal, report
 
 __all__ = ["FORMATS", "Measured", "Report", "check_goal", "report"]

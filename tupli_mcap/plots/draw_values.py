@@ -1,281 +1,222 @@
-"""Panels of values: histograms of numbers, bars of choices, one heat map where there are too many dimensions."""
+"""Panels of values: histograms, bars of choices, heat maps of many dimensions, and maps of where the states lie."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.arrays import Array
-from tupli_mcap.plots.page import LEFT, Cell, Page
-from tupli_mcap.plots.series import bin_count, bin_edges
-from tupli_mcap.plots.style import GREY, VERMILION, colours, cut, number_text, show_alone
-from tupli_mcap.plots.values import LeafValues
+from tupli_mcap.plots import style
+from tupli_mcap.plots.statistics import LARGEST, LeafValues, bin_edges, drawable_numbers
+from tupli_mcap.plots.style import COLUMNS, LEFT, SMALL, Cell, Page, cut, number_text
+from tupli_mcap.recording.blocks import Array
 from tupli_mcap.spaces.element_names import short_path
 
-__all__ = ["LEVELS", "Dimension", "add_values", "colour_bar", "quantiles", "value_names"]
+__all__ = ["LEVELS", "add_coverage", "add_values", "most_varying", "quantiles"]
 
-MOST_PANELS = 16
-LEVELS = (0, 1, 5, 10, 25, 50, 75, 90, 95, 99, 100)
-"""Percents of the quantiles in a heat map."""
-_COLUMNS = 4
-_BINS = 40
-_NAMED_BARS = 12
-_BARS = 40
-_TICKS = 24
-_HEIGHT = 1.15
+Leaves = Sequence[LeafValues]  # the same leaf of each recording
+Dimension = tuple[Leaves, int]  # one of its elements
+
+LEVELS = (0, 1, 5, 10, 25, 50, 75, 90, 95, 99, 100)  # percents of the quantiles in a heat map
+_MOST_PANELS = 16
+_HEIGHT, _MAP_HEIGHT, _TABLE_HEIGHT = 1.15, 2.1, 1.7
+_BINS, _MAP_BINS, _MOST_MAPS = 40, 60, 4
+_NAMED_BARS, _BARS, _TICKS = 12, 40, 24  # of more, the values are not named, an outline, not all numbered
 _SCALES = 10  # how much the sizes of dimensions in one heat map may differ for a linear scale
 
 
-class Dimension(NamedTuple):
-    """Element `i` of a leaf, of one recording or of several."""
-
-    leaves: Sequence[LeafValues]
-    i: int
-
-    @property
-    def name(self) -> str:
-        return self.leaves[0].names[self.i]
-
-
-Leaves = Sequence[Sequence[LeafValues]]
-"""Some leaves, each as the same leaf of every recording."""
-
-
-def add_values(page: Page, heading: str, *groups: Leaves) -> None:
-    """Panels of some leaves; the dimensions of a group that has too many become one heat map."""
-    groups = tuple([leaf for leaf in group if leaf[0].kind in ("numbers", "choices")] for group in groups)
-    if not any(groups):
-        return
-    page.heading(heading)
-    cells: list[tuple[float, Cell]] = []
+def add_values(page: Page, heading: str, *groups: Sequence[Leaves]) -> None:
+    """Panels of some leaves; the numbers of a group that has too many dimensions become one heat map."""
+    if any(_dimensions(group) for group in groups):
+        page.heading(heading)
+    cells: list[Cell] = []
     for group in groups:
-        numbers = [leaf for leaf in group if leaf[0].kind == "numbers"]
-        dimensions = [Dimension(leaf, i) for leaf in numbers for i in range(len(leaf[0].elements))]
-        if len(dimensions) > MOST_PANELS:
-            page.row(1.7, [Cell(partial(_draw_quantiles, dimensions=dimensions), right=0.9)])
-        for leaf in group:
-            if leaf[0].kind == "choices":
-                cells += _cells_of_choices(leaf)
-            elif len(dimensions) <= MOST_PANELS:
-                cells += [
-                    (_HEIGHT, Cell(partial(_draw_histogram, dimension=Dimension(leaf, i))))
-                    for i in range(len(leaf[0].elements))
-                ]
-    page.pack(cells, _COLUMNS)
+        numbers = _dimensions([leaves for leaves in group if leaves[0].kind == "numbers"])
+        if len(numbers) > _MOST_PANELS:
+            page.add([Cell(partial(_draw_quantiles, numbers), _TABLE_HEIGHT, COLUMNS, right=0.9)])
+        for leaves in group:
+            if leaves[0].kind == "choices":
+                cells += _cells_of_choices(leaves)
+            elif len(numbers) <= _MOST_PANELS:
+                cells += [Cell(partial(_draw_histogram, *of), _HEIGHT) for of in _dimensions([leaves])]
+    page.add(cells)
 
 
-def _cells_of_choices(leaf: Sequence[LeafValues]) -> list[tuple[float, Cell]]:
-    first = leaf[0]
-    names = value_names(first, 0)
-    if len(first.counts) == 1 and first.value_names and len(names) <= _NAMED_BARS:
-        left = max(LEFT, min(2.2, 0.2 + 0.075 * max(map(len, names))))
-        return [
-            (max(0.45, 0.2 * len(names)), Cell(partial(_draw_named, leaf=leaf, names=names), 2, left=left))
-        ]
-    if isinstance(first.leaf.space, spaces.MultiBinary):
-        return [(_HEIGHT, Cell(partial(_draw_bits, leaf=leaf), _columns_for(len(first.counts))))]
-    if len(first.counts) > MOST_PANELS:
-        return [(1.7, Cell(partial(_draw_shares, leaf=first), _COLUMNS, right=0.9))]
-    return [
-        (_HEIGHT, Cell(partial(_draw_counts, leaf=leaf, i=i), _columns_for(len(counts))))
-        for i, counts in enumerate(first.counts)
-    ]
+def _dimensions(group: Sequence[Leaves]) -> list[Dimension]:
+    return [(leaves, i) for leaves in group for i in range(len(leaves[0].elements))]
 
 
-def _columns_for(bars: int) -> int:
-    return 1 if bars <= 8 else 2 if bars <= 24 else _COLUMNS
-
-
-# --- numbers ---
-
-
-def _draw_histogram(axes: Any, dimension: Dimension) -> None:
-    leaves, i = dimension
-    axes.set_title(cut(dimension.name, 25))
+def _draw_histogram(leaves: Leaves, i: int, axes: Any) -> None:
+    """Dashed lines show where the space ends, if values come near."""
+    first, space = leaves[0], leaves[0].leaf.space
     columns = [leaf.column(i) for leaf in leaves]
     pooled = np.concatenate(columns)
-    edges, beyond = bin_edges(pooled, bin_count(len(pooled), _BINS))
-    show_alone(axes, edges)
-    shades = colours(len(leaves))
-    for column, colour in zip(columns, shades, strict=True):
-        shares = 100 * np.histogram(column, edges)[0] / max(1, len(column))
-        if len(leaves) == 1:
-            axes.stairs(shares, edges, fill=True, color=colour)
-        else:
-            axes.stairs(shares, edges, color=colour, linewidth=1.2)
-    axes.set_ylim(bottom=0)
-    axes.set_ylabel("% of steps", color=GREY, fontsize=7.5)
-    _draw_bounds(axes, leaves[0], i, edges)
+    edges, beyond = bin_edges(pooled, _BINS)
+    style.draw_histograms(axes, [100 * np.histogram(v, edges)[0] / max(1, len(v)) for v in columns], edges)
+    axes.set(title=cut(first.names[i], 25), ylim=(0, None))
+    axes.set_ylabel("% of steps", **SMALL)
+    margin = 0.1 * (edges[-1] - edges[0])
+    for bounds in (space.low, space.high) if isinstance(space, spaces.Box) else ():
+        bound = float(bounds.flat[first.elements[i]])
+        if np.isfinite(bound) and edges[0] - margin <= bound <= edges[-1] + margin:
+            axes.axvline(bound, color=style.GREY, linewidth=0.8, linestyle=(0, (3, 2)))
     if len(leaves) == 1:
-        mean, std = float(leaves[0].mean[i]), float(leaves[0].std[i])
-        text = "no finite value" if np.isnan(mean) else f"mean {number_text(mean)}, std {number_text(std)}"
-        if beyond:
-            text += f"; {beyond:,} beyond"
-        axes.set_xlabel(text, color=GREY, fontsize=7.5)
-    axes.locator_params(axis="x", nbins=4)
-    axes.locator_params(axis="y", nbins=4)
+        mean, std = number_text(first.mean[i]), number_text(first.std[i])
+        text = "no finite value" if np.isnan(first.mean[i]) else f"mean {mean}, std {std}"
+        axes.set_xlabel(f"{text}; {beyond:,} beyond" if beyond else text, **SMALL)
+    axes.locator_params(nbins=4)
 
 
-def _draw_bounds(axes: Any, leaf: LeafValues, i: int, edges: Array) -> None:
-    """Dashed lines where the space ends, if values come near."""
-    space = leaf.leaf.space
-    if not isinstance(space, spaces.Box):
-        return
-    element, width = int(leaf.elements[i]), edges[-1] - edges[0]
-    for bound in (float(space.low.reshape(-1)[element]), float(space.high.reshape(-1)[element])):
-        if np.isfinite(bound) and edges[0] - 0.1 * width <= bound <= edges[-1] + 0.1 * width:
-            axes.axvline(bound, color=GREY, linewidth=0.8, linestyle=(0, (3, 2)))
-
-
-def quantiles(leaves: Sequence[LeafValues], i: int) -> Array:
-    """The quantiles `LEVELS` of element `i` in the samples of some recordings; NaN where nothing is finite."""
+def quantiles(leaves: Leaves, i: int) -> Array:
+    """The quantiles `LEVELS` of element `i` in some recordings; NaN where nothing is finite."""
     values = np.concatenate([leaf.column(i) for leaf in leaves])
     return np.percentile(values, LEVELS) if len(values) else np.full(len(LEVELS), np.nan)
 
 
-def _draw_quantiles(axes: Any, dimensions: Sequence[Dimension]) -> None:
+def _draw_quantiles(dimensions: Sequence[Dimension], axes: Any) -> None:
     from matplotlib.colors import Normalize, SymLogNorm
 
-    table = np.array([quantiles(d.leaves, d.i) for d in dimensions])
-    # of each dimension, the larger of its 1% and 99% quantiles
-    sizes = np.abs(np.nan_to_num(table[:, [1, -2]], posinf=0, neginf=0)).max(axis=1)
-    most = float(np.abs(np.nan_to_num(table)).max()) or 1.0
-    least = float(sizes[sizes > 0].min()) if (sizes > 0).any() else most
+    table = np.array([quantiles(*dimension) for dimension in dimensions])
+    sizes = np.abs(np.nan_to_num(table))
+    most = float(sizes.max()) or 1.0
+    sizes = sizes[:, [1, -2]].max(axis=1)  # of each dimension, the larger of its 1% and 99% quantiles
+    least = float(sizes[sizes > 0].min(initial=most))
     norm: Any = Normalize(-most, most)
     if most > _SCALES * least:  # one scale would show the largest dimensions only
         norm = SymLogNorm(max(least / 2, most * 1e-4), vmin=-most, vmax=most)
-    image = axes.imshow(
-        table.T, aspect="auto", cmap="RdBu_r", norm=norm, interpolation="nearest", origin="lower",
-        extent=(-0.5, len(table) - 0.5, -0.5, len(LEVELS) - 0.5),
-    )  # fmt: skip
-    axes.grid(False)
+    style.heat_map(axes, table.T, "value", cmap="RdBu_r", norm=norm, origin="lower")
     axes.set_title(f"quantiles of each of the {len(dimensions)} dimensions")
     axes.set_yticks(range(len(LEVELS)), [f"{level}%" for level in LEVELS], fontsize=7.5)
-    _label_dimensions(axes, dimensions)
-    colour_bar(axes, image, "value")
-
-
-def _label_dimensions(axes: Any, dimensions: Sequence[Dimension]) -> None:
-    """Where there are several leaves, a line between them and a name below each; else numbers."""
-    starts = [at for at, d in enumerate(dimensions) if d.i == 0]
+    # Where there are several leaves, a line between them and a name below each; else numbers.
+    starts = [at for at, (_, i) in enumerate(dimensions) if i == 0]
+    names = [short_path(dimensions[start][0][0].leaf) for start in starts]
     if len(starts) == 1:
-        axes.set_xlabel(f"dimension of {cut(short_path(dimensions[0].leaves[0].leaf), 40)}")
+        axes.set_xlabel(f"dimension of {cut(names[0], 40)}")
         return
     for start in starts[1:]:
         axes.axvline(start - 0.5, color="black", linewidth=0.8)
-    stops = [*starts[1:], len(dimensions)]
-    places, names = [], []
-    for start, stop in zip(starts, stops, strict=True):
-        room = int(70 * (stop - start) / len(dimensions))
-        if room >= 4:
-            places.append((start + stop - 1) / 2)
-            names.append(cut(short_path(dimensions[start].leaves[0].leaf), room))
-    axes.set_xticks(places, names)
+    counts = np.diff([*starts, len(dimensions)])
+    rooms = 70 * counts // len(dimensions)
+    shown = [cut(name, room) if room >= 4 else "" for name, room in zip(names, rooms.tolist(), strict=True)]
+    axes.set_xticks(starts + (counts - 1) / 2, shown)
     axes.tick_params(axis="x", length=0)
 
 
-def colour_bar(axes: Any, image: Any, label: str) -> None:
-    """A bar of fixed size right of the axes."""
-    from matplotlib.ticker import FuncFormatter
-
-    inside = axes.inset_axes((1.015, 0, 0.015, 1))
-    bar = axes.figure.colorbar(image, cax=inside)
-    bar.formatter = FuncFormatter(lambda value, _: number_text(float(value)))
-    bar.set_label(label, fontsize=7.5)
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(labelsize=7.5)
-    bar.ax.minorticks_off()
-
-
-# --- choices ---
-
-
-def value_names(leaf: LeafValues, i: int) -> list[str]:
-    numbers = [str(leaf.starts[i] + k) for k in range(len(leaf.counts[i]))]
-    return [cut(name, 26) for name in leaf.value_names] if len(leaf.value_names) == len(numbers) else numbers
+def _cells_of_choices(leaves: Leaves) -> list[Cell]:
+    first = leaves[0]
+    names = [cut(name, 26) for name in first.value_names]
+    if 0 < len(names) <= _NAMED_BARS:
+        left = max(LEFT, min(2.2, 0.2 + 0.075 * max(map(len, names))))
+        return [Cell(partial(_draw_named, leaves, names), max(0.45, 0.2 * len(names)), 2, left=left)]
+    if isinstance(first.leaf.space, spaces.MultiBinary):
+        bars = [(partial(_draw_bits, leaves), len(first.counts))]
+    elif len(first.counts) > _MOST_PANELS:
+        return [Cell(partial(_draw_shares, first), _TABLE_HEIGHT, COLUMNS, right=0.9)]
+    else:
+        bars = [(partial(_draw_counts, leaves, i), len(counts)) for i, counts in enumerate(first.counts)]
+    return [Cell(draw, _HEIGHT, 1 if n <= 8 else 2 if n <= 24 else COLUMNS) for draw, n in bars]
 
 
-def _shares(leaf: LeafValues, i: int) -> Array:
-    return 100 * leaf.counts[i] / max(1, leaf.count)
-
-
-def _never(leaves: Sequence[LeafValues], i: int) -> Array:
-    """The values (positions) that occur in none of the recordings."""
-    return np.flatnonzero(sum(leaf.counts[i] for leaf in leaves) == 0)
-
-
-def _draw_named(axes: Any, leaf: Sequence[LeafValues], names: Sequence[str]) -> None:
+def _draw_named(leaves: Leaves, names: Sequence[str], axes: Any) -> None:
     """Horizontal bars with the names of the values at their left; the first on top."""
-    axes.set_title(cut(leaf[0].names[0], 40))
     at = np.arange(len(names))
-    height = 0.8 / len(leaf)
-    for k, (one, colour) in enumerate(zip(leaf, colours(len(leaf)), strict=True)):
-        axes.barh(at - 0.4 + height * (k + 0.5), _shares(one, 0), height, color=colour)
-    for value in _never(leaf, 0):
-        axes.text(0, value, " never", color=VERMILION, fontsize=8, va="center")
+    height = 0.8 / len(leaves)
+    for k, (leaf, colour) in enumerate(zip(leaves, style.colours(len(leaves)), strict=True)):
+        axes.barh(at - 0.4 + height * (k + 0.5), leaf.share(0), height, color=colour)
+    for value in np.flatnonzero(sum(leaf.counts[0] for leaf in leaves) == 0):
+        axes.text(0, value, " never", color=style.VERMILION, fontsize=8, va="center")
     axes.set_yticks(at, names)
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.set_xlim(left=0)
+    axes.set(title=cut(leaves[0].names[0], 40), ylim=(len(names) - 0.5, -0.5), xlim=(0, None))
     axes.grid(False, axis="y")
-    axes.set_xlabel("% of steps", color=GREY, fontsize=7.5)
+    axes.set_xlabel("% of steps", **SMALL)
 
 
-def _draw_counts(axes: Any, leaf: Sequence[LeafValues], i: int) -> None:
-    """Bars over the numbers of the values; an outline where there are many."""
-    axes.set_title(cut(leaf[0].names[i], 25 if len(leaf[0].counts) > 1 else 80))
-    start, count = leaf[0].starts[i], len(leaf[0].counts[i])
-    edges = start - 0.5 + np.arange(count + 1)
-    for one, colour in zip(leaf, colours(len(leaf)), strict=True):
-        if len(leaf) > 1:
-            axes.stairs(_shares(one, i), edges, color=colour, linewidth=1.2)
-        elif count > _BARS:
-            axes.stairs(_shares(one, i), edges, fill=True, color=colour)
-        else:
-            axes.bar(edges[:-1] + 0.5, _shares(one, i), 0.8, color=colour)
-    never = _never(leaf, i)
-    if len(never):
-        axes.plot(start + never, np.zeros(len(never)), "x", color=VERMILION, markersize=4, clip_on=False)
-    few = f"{len(never):,} of {count:,} never occur (×)" if len(never) else f"{count:,} values, all occur"
-    axes.set_xlabel(few, color=VERMILION if len(never) else GREY, fontsize=7.5)
+def _draw_bars(shares: Sequence[Array], start: int, axes: Any) -> None:
+    """Bars over the whole numbers from `start` on; outlines where there are many, or several recordings."""
+    edges = start - 0.5 + np.arange(len(shares[0]) + 1)
+    if len(shares) == 1 and len(shares[0]) <= _BARS:
+        axes.bar(edges[:-1] + 0.5, shares[0], 0.8, color=style.BLUE)
+    else:
+        style.draw_histograms(axes, shares, edges)
     axes.set_xlim(edges[0], edges[-1])
-    axes.set_ylim(bottom=0)
-    axes.set_ylabel("% of steps", color=GREY, fontsize=7.5)
+    axes.set_ylabel("% of steps", **SMALL)
+    axes.locator_params(axis="x", integer=True)
+
+
+def _draw_counts(leaves: Leaves, i: int, axes: Any) -> None:
+    first = leaves[0]
+    never = np.flatnonzero(sum(leaf.counts[i] for leaf in leaves) == 0)
+    start, count = first.starts[i], len(first.counts[i])
+    _draw_bars([leaf.share(i) for leaf in leaves], start, axes)
+    if len(never):
+        axes.plot(start + never, 0 * never, "x", color=style.VERMILION, markersize=4, clip_on=False)
+        axes.set_xlabel(f"{len(never):,} of {count:,} never occur (×)", **SMALL | {"color": style.VERMILION})
+    else:
+        axes.set_xlabel(f"{count:,} values, all occur", **SMALL)
+    axes.set(title=cut(first.names[i], 25 if len(first.counts) > 1 else 80), ylim=(0, None))
     if count <= _TICKS:
         axes.set_xticks(start + np.arange(count))
-    else:
-        axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(False, axis="x")
 
 
-def _draw_bits(axes: Any, leaf: Sequence[LeafValues]) -> None:
-    axes.set_title(cut(short_path(leaf[0].leaf), 60))
-    edges = np.arange(len(leaf[0].counts) + 1) - 0.5
-    for one, colour in zip(leaf, colours(len(leaf)), strict=True):
-        ones = np.array([_shares(one, i)[1] for i in range(len(one.counts))])
-        if len(leaf) == 1 and len(ones) <= _BARS:
-            axes.bar(edges[:-1] + 0.5, ones, 0.8, color=colour)
-        else:
-            axes.stairs(ones, edges, fill=len(leaf) == 1, color=colour, linewidth=1.2)
-    axes.set_ylim(0, 100)
-    axes.set_xlim(edges[0], edges[-1])
-    axes.set_ylabel("% of steps", color=GREY, fontsize=7.5)
-    axes.set_xlabel("bits that are 1", color=GREY, fontsize=7.5)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+def _draw_bits(leaves: Leaves, axes: Any) -> None:
+    _draw_bars([np.array([leaf.share(i)[1] for i in range(len(leaf.counts))]) for leaf in leaves], 0, axes)
+    axes.set(title=cut(short_path(leaves[0].leaf), 60), ylim=(0, 100))
+    axes.set_xlabel("bits that are 1", **SMALL)
 
 
-def _draw_shares(axes: Any, leaf: LeafValues) -> None:
+def _draw_shares(leaf: LeafValues, axes: Any) -> None:
     """How often each value (up) of each element (right) occurs."""
-    most = max(len(counts) for counts in leaf.counts)
-    table = np.full((most, len(leaf.counts)), np.nan)
-    for i, counts in enumerate(leaf.counts):
-        table[: len(counts), i] = _shares(leaf, i)
-    image = axes.imshow(table, aspect="auto", cmap="viridis", interpolation="nearest", origin="lower", vmin=0)
+    shares = [leaf.share(i) for i in range(len(leaf.counts))]
+    table = np.array(list(itertools.zip_longest(*shares, fillvalue=np.nan)))
+    style.heat_map(axes, table, "% of steps", origin="lower", vmin=0)
+    title = f"values of each of the {len(shares)} elements of {cut(short_path(leaf.leaf), 40)}"
+    axes.set(title=title, xlabel="element", ylabel="value")
+
+
+def most_varying(states: Sequence[Leaves]) -> list[int]:
+    """Which of the dimensions (at most four) vary most in the first recording, the largest deviation first."""
+    stds = np.array([leaves[0].std[i] for leaves, i in _dimensions(states)])
+    return [at for at in np.argsort(-stds, kind="stable").tolist() if 0 < stds[at] < LARGEST][:4]
+
+
+def add_coverage(page: Page, states: Sequence[Leaves], names: Sequence[str]) -> None:
+    """Where the states lie: of one recording over two pairs of dimensions; of several, over one pair for each."""
+    varying = most_varying(states)
+    pairs = [sorted(varying[:2])] if len(varying) > 1 else []
+    if len(varying) > 2 and len(names) == 1:
+        pairs.append(sorted(varying[2:] if len(varying) > 3 else varying[::2]))
+    cells = []
+    for pair in pairs:
+        x, y = (_dimensions(states)[at] for at in pair)
+        points = []  # of each recording, the steps that have both dimensions (n, 2)
+        for k in range(min(len(names), _MOST_MAPS)):
+            both = np.stack([drawable_numbers(leaves[k].values[i]) for leaves, i in (x, y)], axis=1)
+            points.append(both[np.isfinite(both).all(axis=1)])
+        pooled = np.concatenate(points)
+        edges = [bin_edges(column, _MAP_BINS)[0] for column in pooled.T]
+        for name, found in zip(names, points, strict=False):
+            title = f"where the states lie{f': {name}' if len(names) > 1 else ''}"
+            cells.append(Cell(partial(_draw_map, x, y, found, edges, title), _MAP_HEIGHT, 2, right=0.85))
+    page.add(cells)
+
+
+def _draw_map(x: Dimension, y: Dimension, points: Array, edges: list[Array], title: str, axes: Any) -> None:
+    from matplotlib.colors import LogNorm
+
+    counts = np.histogram2d(points[:, 0], points[:, 1], edges)[0]
+    shares = np.where(counts > 0, 100 * counts / max(1, len(points)), np.nan)
+    least, most = (np.nanmin(shares), np.nanmax(shares)) if counts.any() else (1.0, 1.0)
+    norm = LogNorm(least, max(most, least * 10))
+    mesh = axes.pcolormesh(*edges, shares.T, cmap="viridis", rasterized=True, norm=norm)
     axes.grid(False)
-    axes.set_title(f"values of each of the {len(leaf.counts)} elements of {cut(short_path(leaf.leaf), 40)}")
-    axes.set_xlabel("element")
-    axes.set_ylabel("value")
-    colour_bar(axes, image, "% of steps")
+    axes.locator_params(axis="x", nbins=6)  # numbers such as -0.175 beside each other
+    xlabel, ylabel = cut(x[0][0].names[x[1]], 40), cut(y[0][0].names[y[1]], 26)
+    axes.set(title=cut(title, 60), xlabel=xlabel, ylabel=ylabel)
+    for axis, at in zip("xy", edges, strict=True):
+        axes.locator_params(axis=axis, integer=bool(at[1] - at[0] == 1))
+    style.colour_bar(axes, mesh, "% of steps")

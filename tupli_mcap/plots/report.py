@@ -7,29 +7,28 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tupli_mcap.dataset.choose import choose_among
 from tupli_mcap.dataset.subjects import Examinable, Subject, subjects_of
 from tupli_mcap.errors import RecordingError, os_reason
-from tupli_mcap.plots.card import card, notes_of, title_of
-from tupli_mcap.plots.compose import compose
-from tupli_mcap.plots.gather import Measured, measure
-from tupli_mcap.plots.html import fragment, page
-from tupli_mcap.plots.style import styled
-from tupli_mcap.plots.trace import Trace, trace
+from tupli_mcap.plots import texts
+from tupli_mcap.plots.draw_episodes import add_episodes
+from tupli_mcap.plots.draw_trace import add_trace
+from tupli_mcap.plots.draw_values import add_coverage, add_values
+from tupli_mcap.plots.measure import READ_BYTES, Measured, Trace, measure, trace
+from tupli_mcap.plots.style import Page, styled
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.atomic import write_bytes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["FORMATS", "Report", "check_goal", "report"]
 
 FORMATS = (".png", ".svg", ".html")
 _MOST_TRACES = 4
+
+Traces = Sequence[tuple[Measured, Trace]]
 
 
 def report(
@@ -40,8 +39,8 @@ def report(
 ) -> Report:
     """Returns, lengths, states, actions, rewards and one episode of a recording, or of several compared.
 
-    Each recording is read once, a few megabytes at a time; nothing in a file is executed. Of very long recordings,
-    some episodes are read; the report says so.
+    At most 128 MiB of steps are read: of longer recordings, randomly chosen episodes; the report says so. Nothing
+    in a file is executed.
 
     Args:
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
@@ -60,13 +59,17 @@ def report(
         subjects = list(subjects_of(source, episode_filter))
         if not subjects:
             raise RecordingError("expected a recording (.mcap), found none; give a path")
-        measured = [_measured(subject) for subject in subjects]
+        measured = []
+        for subject in subjects:
+            if subject.error is not None:
+                raise subject.error
+            with subject.open() as recording:
+                measured.append(measure(recording, subject.choose(recording), READ_BYTES // len(subjects)))
         if episode_filter is not None and not any(len(one.rows) for one in measured):
             raise RecordingError(f"there is no episode that {episode_filter} is true of; use another filter")
         _shorten_names(measured)
         traces = _traces(subjects, measured, str(episode))
-        compared = _comparable(measured)
-        return Report(measured, traces, compared)
+        return Report(measured, traces, _make_comparable(measured))
 
 
 class Report:
@@ -77,19 +80,14 @@ class Report:
     notes: what is not shown, and what is a sample.
     """
 
-    def __init__(
-        self,
-        measured: Sequence[Measured],
-        traces: Sequence[tuple[Measured, Trace]],
-        notes: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, measured: Sequence[Measured], traces: Traces, notes: Sequence[str] = ()) -> None:
         self.measured = list(measured)
-        self.title = title_of(measured)
-        self.facts = card(measured)
-        self.notes = [*notes, *notes_of(measured)]
+        self.title = texts.title_of(measured)
+        self.facts = texts.facts_of(measured)
+        self.notes = [*notes, *texts.notes_of(measured)]
         self.traces = list(traces)
         with styled():
-            self.figure: Figure = compose(measured, traces, notes=self.notes)
+            self.figure: Any = _figure(measured, traces, self.notes)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write a .png, .svg or .html file, whole or not at all; the same report gives the same bytes.
@@ -98,40 +96,29 @@ class Report:
             RecordingError: another extension, the file is there already, or it cannot be written.
         """
         goal = check_goal(path, overwrite=overwrite)
-        suffix = goal.suffix.lower()
-        data = self.png() if suffix == ".png" else self.svg() if suffix == ".svg" else self.html()
+        data = {".png": self.png, ".svg": self.svg, ".html": self.html}[goal.suffix.lower()]()
         try:
             write_bytes(goal, data, replace=overwrite)
-        except FileExistsError as err:
-            raise RecordingError(f"{goal} exists; choose another name, or overwrite it") from err
         except OSError as err:
             raise RecordingError(f"{goal} cannot be written: {os_reason(err)}") from err
         return goal
 
     def png(self) -> bytes:
         """The bytes of a PNG."""
-        return self._drawn(self.figure, "png", {"Software": None})
+        return _saved(self.figure, "png")
 
     def svg(self) -> bytes:
         """The bytes of an SVG; its texts are outlines, so that it looks the same everywhere."""
-        return self._drawn(self.figure, "svg", {"Date": None, "Creator": None})
+        return _saved(self.figure, "svg")
 
     def html(self) -> bytes:
         """A page that needs nothing else: no network, no script."""
-        return page(self.title, self._fragment()).encode()
+        return texts.html_page(self.title, self._fragment()).encode()
 
     def _fragment(self) -> str:
         with styled():
-            figure = compose(self.measured, self.traces, head=False)
-        picture = self._drawn(figure, "svg", {"Date": None, "Creator": None})
-        return fragment(self.title, self.facts, self.notes, picture.decode(), self.measured)
-
-    @staticmethod
-    def _drawn(figure: Figure, format: str, metadata: dict[str, Any]) -> bytes:
-        with styled():
-            out = io.BytesIO()
-            figure.savefig(out, format=format, metadata=metadata)
-            return out.getvalue()
+            svg = _saved(_figure(self.measured, self.traces, None), "svg").decode()
+        return texts.html_fragment(self.title, self.facts, self.notes, svg, self.measured)
 
     def _repr_png_(self) -> bytes:
         return self.png()
@@ -160,11 +147,37 @@ def check_goal(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
     return goal
 
 
-def _measured(subject: Subject) -> Measured:
-    if subject.error is not None:
-        raise subject.error
-    with subject.open() as recording:
-        return measure(recording, subject.choose(recording))
+def _figure(measured: Sequence[Measured], traces: Traces, notes: Sequence[str] | None) -> Any:
+    """The whole page; without notes (None), it leaves out the head, too."""
+    page = Page()
+    if notes is not None:
+        texts.add_facts(page, measured)
+    filled = [one for one in measured if len(one.rows)]
+    if filled:
+        add_episodes(page, filled)
+    valued = [one for one in filled if one.read_steps]
+    if valued:
+        states, actions, rewards = (
+            list(zip(*leaves, strict=True))  # the same leaf of every recording together
+            for leaves in zip(*((one.states, one.actions, one.rewards) for one in valued), strict=True)
+        )
+        add_values(page, "States", states)
+        add_coverage(page, states, [one.name for one in valued])
+        add_values(page, "Actions and rewards", actions, rewards)
+    for one, shown in traces:
+        add_trace(page, one, shown, several=len(measured) > 1)
+    if notes is not None:
+        texts.add_notes(page, notes)
+    return page.draw()
+
+
+def _saved(figure: Any, format: str) -> bytes:
+    """A picture's bytes, without its date and who made it: the same report gives the same bytes."""
+    unnamed = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
+    with styled():
+        out = io.BytesIO()
+        figure.savefig(out, format=format, metadata=unnamed[format])
+        return out.getvalue()
 
 
 def _shorten_names(measured: Sequence[Measured]) -> None:
@@ -178,49 +191,35 @@ def _shorten_names(measured: Sequence[Measured]) -> None:
         one.name = name
 
 
-def _traces(
-    subjects: Sequence[Subject], measured: Sequence[Measured], episode: str
-) -> list[tuple[Measured, Trace]]:
+def _traces(subjects: Sequence[Subject], measured: Sequence[Measured], episode: str) -> Traces:
     """The chosen episodes, step by step."""
     filled = [i for i, one in enumerate(measured) if len(one.rows)]
     if not filled:
         return []
-    at = filled[0]
-    if len(filled) > 1:
-        at = _choose_recording(measured, filled, episode)
-    subject, one = subjects[at], measured[at]
-    with subject.open() as recording:
-        positions = choose_among(recording, subject.choose(recording), episode)
-        if len(positions) > _MOST_TRACES:
-            raise RecordingError(
-                f"expected at most {_MOST_TRACES} episodes to show in full, found {len(positions)}"
-            )
-        return [(one, trace(recording, int(position), one.leaves)) for position in positions]
-
-
-def _choose_recording(measured: Sequence[Measured], filled: Sequence[int], episode: str) -> int:
-    """Which of several recordings the best, worst, first or last episode is in."""
-    word = episode.strip().lower()
-    if word == "best":
-        return max(filled, key=lambda i: np.nan_to_num(measured[i].rows["return"], nan=-np.inf).max())
-    if word == "worst":
-        return min(filled, key=lambda i: np.nan_to_num(measured[i].rows["return"], nan=np.inf).min())
-    if word not in ("first", "last"):
+    word, at = episode.strip().lower(), filled[0]
+    if len(filled) > 1 and word not in ("best", "worst", "first", "last"):
         raise RecordingError(
             f"expected best, worst, first or last of {len(measured)} recordings, found {episode[:40]!r}; "
             "give one recording to choose an episode by its number"
         )
-    return filled[0] if word == "first" else filled[-1]
+    if word == "last":
+        at = filled[-1]
+    elif word in ("best", "worst"):
+        sign = 1 if word == "best" else -1
+        at = max(filled, key=lambda i: np.nan_to_num(sign * measured[i].rows["return"], nan=-np.inf).max())
+    with subjects[at].open() as recording:
+        positions = choose_among(recording, subjects[at].choose(recording), episode)
+        if len(positions) > _MOST_TRACES:
+            raise RecordingError(
+                f"expected at most {_MOST_TRACES} episodes to show in full, found {len(positions)}"
+            )
+        return [(measured[at], trace(recording, int(position), measured[at])) for position in positions]
 
 
-def _comparable(measured: Sequence[Measured]) -> list[str]:
+def _make_comparable(measured: Sequence[Measured]) -> list[str]:
     """Takes the values away where spaces differ; what to say about it."""
-    known = [one.layout for one in measured if one.layout is not None]
-    if not known or all(
-        layout.observation_space == known[0].observation_space
-        and layout.action_space == known[0].action_space
-        for layout in known
-    ):
+    spaces = [(one.layout.observation_space, one.layout.action_space) for one in measured if one.layout]
+    if all(pair == spaces[0] for pair in spaces):
         return []
     for one in measured:
         one.states, one.actions = [], []

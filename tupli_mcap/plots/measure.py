@@ -1,0 +1,203 @@
+"""What a report shows of a recording: the values in its steps, and chosen episodes step by step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from tupli_mcap.messages.episodes import END_NAMES
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.blocks import Array, blocks, step_bytes
+from tupli_mcap.recording.description import RecordingDescription, describe, nan_text
+from tupli_mcap.spaces.leaves import Leaf
+
+__all__ = ["Measured", "Trace", "measure", "trace"]
+
+READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most; their values stay in memory
+MAX_POINTS = 4000  # of a trace
+_FRAMES, _AVERAGED = 6, 48  # that are shown, that make up the mean picture
+
+
+@dataclass
+class Measured:
+    """One recording.
+
+    rows: the index rows of its chosen episodes. read_episodes, read_steps: how many of those the values are from.
+    states, actions, rewards: their leaves. seeds: of the chosen episodes, each once, ascending.
+    """
+
+    name: str
+    facts: RecordingDescription
+    rows: Array
+    all_episodes: int
+    layout: StepLayout | None
+    step_seconds: float | None = None
+    read_episodes: int = 0
+    read_steps: int = 0
+    states: list[LeafValues] = field(default_factory=list)
+    actions: list[LeafValues] = field(default_factory=list)
+    rewards: list[LeafValues] = field(default_factory=list)
+    seeds: list[int] = field(default_factory=list)
+
+    @property
+    def steps(self) -> int:
+        """Steps of the chosen episodes."""
+        return int(self.rows["length"].sum())
+
+    @property
+    def leaves(self) -> list[LeafValues]:
+        return [*self.states, *self.actions, *self.rewards]
+
+    def notes(self) -> list[str]:
+        """What the report leaves out, and what it takes a sample of; sentences."""
+        notes = []
+        if self.read_steps < self.steps:
+            notes.append(
+                f"Values are those of {self.read_episodes:,} randomly chosen episodes ({self.read_steps:,} steps)."
+            )
+        for leaf in self.leaves:
+            notes += leaf.notes()
+        odd = int(np.isnan(self.rows["return"]).sum())
+        if odd:
+            notes.append(f"return: {nan_text(odd, len(self.rows))}.")
+        if not len(self.rows):
+            notes.append("There is no episode.")
+        return notes
+
+
+def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES) -> Measured:
+    """Reads the episodes at some positions; of more bytes than that, randomly chosen ones.
+
+    Raises:
+        FormatError: the recording is damaged.
+    """
+    layout = recording.layout if recording.num_envs else None
+    rows = recording.index[positions]
+    measured = Measured(recording.name, describe(recording), rows, len(recording.index), layout)
+    if layout is None:
+        return measured
+    labels = recording.labels
+    measured.seeds, measured.step_seconds = _seeds(recording, positions), labels.step_seconds
+    most = read_bytes // step_bytes(layout, images=False)
+    chosen = _random_episodes(positions, rows["length"].astype(np.int64), most)
+    measured.read_episodes = int((recording.index["length"][chosen] > 0).sum())
+    columns, measured.read_steps = _read(recording, chosen, most)
+    measured.states, measured.actions, measured.rewards = (
+        [LeafValues(leaf, labels, columns.pop(leaf.name, None)) for leaf in leaves]
+        for leaves in (layout.state, layout.action, layout.reward)
+    )
+    return measured
+
+
+def _read(recording: Recording, positions: Array, most: int) -> tuple[dict[str, Array], int]:
+    """The steps of some episodes by leaf, (steps, size), but for images and variable size; and how many they are.
+
+    A few megabytes at a time, until there are `most`.
+    """
+    leaves = [leaf for leaf in recording.layout.leaves if leaf.kind != "variable" and not leaf.apart]
+    parts: dict[str, list[Array]] = {leaf.name: [] for leaf in leaves}
+    steps = 0
+    for block in blocks(recording, positions, images=False, finals=False):
+        for leaf in leaves:
+            column = block.leaves[leaf.name].reshape(len(block), leaf.size)
+            parts[leaf.name].append(column)
+        steps += len(block)
+        if steps >= most:
+            break
+    return {
+        leaf.name: np.concatenate(parts[leaf.name] or [np.empty((0, leaf.size))]) for leaf in leaves
+    }, steps
+
+
+def _seeds(recording: Recording, positions: Array) -> list[int]:
+    """Each seed once: those of the index, and those beyond 64 bits, which only the starts of episodes hold."""
+    rows = recording.index[positions]
+    known = rows["has_seed"] != 0
+    starts = (recording.episode_start(int(position)).seed_number for position in positions[~known])
+    return sorted({*rows["seed"][known].tolist(), *(seed for seed in starts if seed is not None)})
+
+
+def _random_episodes(positions: Array, lengths: Array, most: int) -> Array:
+    """All positions, or those of random episodes (always the same) of at most so many steps; of one at least."""
+    order = np.random.default_rng(0).permutation(len(positions))
+    fitting = max(1, int(np.searchsorted(np.cumsum(lengths[order]), most, side="right")))
+    return positions[np.sort(order[:fitting])]
+
+
+class Trace(NamedTuple):
+    """One episode, step by step; of a long one, the smallest and the largest of every `thinned` (> 1) steps.
+
+    values: leaf name -> (points, elements), float64, at the steps `at` (points); NaN for what cannot be drawn.
+    totals: the running return. pictures: of each picture leaf, some frames (H x W or H x W x 1|3|4) and their titles.
+    """
+
+    episode: int
+    env: int
+    length: int
+    total: float
+    end: str
+    seed: int | None
+    thinned: int
+    at: Array
+    values: dict[str, Array]
+    totals: Array
+    pictures: list[list[tuple[str, Array]]]
+
+
+def trace(recording: Recording, position: int, measured: Measured) -> Trace:
+    """The episode at a position of a recording that was measured; of one of more than `READ_BYTES`, the first steps.
+
+    Raises:
+        FormatError: the recording is damaged.
+    """
+    row = recording.index[position]
+    length = int(row["length"])
+    width = 1 if length <= MAX_POINTS else -(-length // (MAX_POINTS // 2))
+    most = READ_BYTES // step_bytes(recording.layout, images=False)
+    columns, steps = _read(recording, np.array([position]), most)
+    rewards = np.concatenate([columns[leaf.leaf.name] for leaf in measured.rewards], axis=1)
+    totals = drawable_numbers(rewards.astype(np.float64).sum(axis=1).cumsum())
+    values = {
+        leaf.leaf.name: _thinned(drawable_numbers(columns[leaf.leaf.name][:, leaf.elements]), width)
+        for leaf in measured.leaves
+        if len(leaf.elements)
+    }
+    return Trace(
+        int(row["episode"]), int(row["env"]), length, float(row["return"]), END_NAMES[row["end"]],
+        recording.episode_start(position).seed_number, width, _thinned(np.arange(steps)[:, None], width)[:, 0],
+        values, _thinned(totals[:, None], width)[:, 0],
+        [_pictures(recording, position, length, leaf.leaf) for leaf in measured.leaves if leaf.kind == "picture"],
+    )  # fmt: skip
+
+
+def _thinned(values: Array, width: int) -> Array:
+    """(steps, elements) to (points, elements): the smallest and the largest of every `width` steps; NaN is neither."""
+    if width == 1:
+        return values
+    starts = np.arange(0, len(values), width)
+    ends = [np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)]
+    return np.stack(ends, axis=1).reshape(-1, values.shape[1])
+
+
+def _pictures(recording: Recording, position: int, length: int, leaf: Leaf) -> list[tuple[str, Array]]:
+    """Frames of an episode at even distances, and the mean of more of them."""
+    shown, averaged = (
+        np.unique(np.linspace(0, length - 1, count).astype(np.int64)).tolist()
+        for count in (_FRAMES, _AVERAGED)
+    )
+    pictures = []
+    total: Array = np.zeros(())
+    for step in sorted({*shown, *averaged}):
+        value = leaf.get(recording.read_steps(position, step, step + 1, ("states",)).states)[0]
+        if leaf.kind == "stack":
+            value = value[..., -1] if leaf.frames_last else value[-1]
+        frame = value if value.ndim == 2 or value.shape[2] in (1, 3, 4) else value[-1]
+        if step in shown:
+            pictures.append((f"step {step}", frame))
+        if step in averaged:
+            total = total + frame
+    return [*pictures, (f"mean of {len(averaged)}", (total / len(averaged)).astype(np.uint8))]

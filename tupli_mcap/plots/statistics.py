@@ -1,0 +1,169 @@
+"""What is drawn of many numbers: the moments and counts of a leaf's values, running means, bands, and bins."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.recording.blocks import Array
+from tupli_mcap.recording.description import spread_of
+from tupli_mcap.spaces.element_names import element_names, short_path
+from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.leaves import Leaf
+
+__all__ = ["LARGEST", "LeafValues", "bands", "bin_edges", "drawable_numbers", "running_mean"]
+
+LARGEST = 1e150  # values of larger size are not drawn: their differences are too large for a float
+MAX_ELEMENTS = 256  # of a leaf that are looked at one by one; of larger leaves, so many evenly chosen ones
+_MOST_CHOICES = 1 << 12
+_SMALLEST_PICTURE = 16  # pixels
+_TAIL = 0.002  # part of the values at either end that may be cut off
+_FAR = 4  # times the range of all others that values must reach to be cut off
+
+Kind = Literal["numbers", "choices", "picture", "variable", "empty"]
+
+
+def drawable_numbers(values: Array) -> Array:
+    """As float64, with NaN for what cannot be drawn."""
+    numbers = np.asarray(values, np.float64)
+    return np.where(np.abs(numbers) <= LARGEST, numbers, np.nan)
+
+
+class LeafValues:
+    """The values of one leaf in some steps; every array has an entry for each element.
+
+    kind: "numbers" (a Box), "choices" (a Discrete, ...: `counts` are kept), "picture" (only shown in a trace),
+    "variable" or "empty" (nothing is kept). elements: which of the flattened leaf are looked at; values: theirs,
+    (elements, steps). nan, infinite: how many values are. mean, std, least, most: of the finite values (population
+    standard deviation), NaN where there is none. counts: of choices, how often each value occurs, from `starts` on;
+    outside: how many values are none of them. value_names: names of the values of a choice, or none.
+    """
+
+    def __init__(self, leaf: Leaf, labels: Labels, column: Array | None) -> None:
+        """`column` is (steps, size); None for images and leaves of variable size."""
+        self.leaf = leaf
+        choices = _choices(leaf.space)
+        self.kind: Kind = _kind(leaf, max((size for _, size in choices), default=None))
+        n = min(leaf.size, MAX_ELEMENTS) if self.kind in ("numbers", "choices") else 0
+        self.elements = np.linspace(0, leaf.size - 1, n).round().astype(np.int64)
+        self.names = element_names(leaf, labels, self.elements.tolist())
+        self.value_names = labels.values.get(leaf.path, ())
+        self.values = np.empty((0, 0)) if column is None else np.ascontiguousarray(column.T[self.elements])
+        self.nan, self.infinite = np.isnan(self.values).sum(axis=1), np.isinf(self.values).sum(axis=1)
+        spreads = [spread_of(row[np.isfinite(row)]) or [np.nan] * 5 for row in self.values]
+        self.mean, self.std, self.least, self.most, _ = np.array(spreads).reshape(n, 5).T
+        self.starts: list[int] = []
+        self.counts: list[Array] = []
+        self.outside = np.zeros(n, np.int64)
+        for i, element in enumerate(self.elements.tolist() if self.kind == "choices" else ()):
+            start, size = choices[element]
+            at = self.values[i].astype(np.int64) - start
+            inside = at[(at >= 0) & (at < size)]
+            self.starts.append(start)
+            self.counts.append(np.bincount(inside, minlength=size))
+            self.outside[i] = len(at) - len(inside)
+
+    def column(self, i: int) -> Array:
+        """The values of element `i` that can be drawn (float64)."""
+        values = drawable_numbers(self.values[i])
+        return values[np.isfinite(values)]
+
+    def share(self, i: int) -> Array:
+        """How often each value of a choice occurs, in percent of the steps."""
+        return np.asarray(100 * self.counts[i] / max(1, self.values.shape[1]))
+
+    def notes(self) -> list[str]:
+        """What is not shown of the leaf; sentences."""
+        name = short_path(self.leaf)
+        if self.kind == "variable":
+            return [f"{name} is of variable size ({type(self.leaf.space).__name__}) and not shown."]
+        if self.kind == "empty":
+            return [f"{name} has no elements (shape {self.leaf.shape})."]
+        notes = []
+        shown, size = len(self.elements), self.leaf.size
+        if 0 < shown < size:
+            notes.append(f"Of the {size:,} elements of {name}, {shown} at even distances are shown.")
+        if (np.fmax(np.abs(self.least), np.abs(self.most)) > LARGEST).any():
+            notes.append(f"{name}: values beyond {LARGEST:g} are not drawn.")
+        counted = {"NaN": self.nan, "infinite": self.infinite, "outside of the space": self.outside}
+        odd = [f"{int(counts.sum()):,} {word}" for word, counts in counted.items() if counts.any()]
+        if odd:
+            notes.append(f"{name}: {', '.join(odd)} values are left out.")
+        return notes
+
+
+def _kind(leaf: Leaf, choices: int | None) -> Kind:
+    if leaf.kind == "variable":
+        return "variable"
+    # Grey pictures, and stacks of them: (height, width) or (n, height, width).
+    grey = leaf.dtype == np.uint8 and isinstance(leaf.space, spaces.Box) and len(leaf.shape) in (2, 3)
+    if leaf.apart or (grey and leaf.size and min(leaf.shape[-2:]) >= _SMALLEST_PICTURE):
+        return "picture"
+    if not leaf.size:
+        return "empty"
+    return "choices" if choices is not None and choices <= _MOST_CHOICES else "numbers"
+
+
+def _choices(space: Any) -> list[tuple[int, int]]:
+    """The first value and the number of values of each element (C order); nothing of other spaces."""
+    if isinstance(space, spaces.Discrete):
+        return [(int(space.start), int(space.n))]
+    if isinstance(space, spaces.MultiDiscrete):
+        starts = np.asarray(space.start).reshape(-1).tolist()
+        return list(zip(starts, space.nvec.reshape(-1).tolist(), strict=True))
+    return [(0, 2)] * int(np.prod(space.shape)) if isinstance(space, spaces.MultiBinary) else []
+
+
+def running_mean(values: Array, window: int) -> Array:
+    """The mean of the finite values among each value and the `window - 1` before it; NaN where there is none."""
+    finite = np.isfinite(values)
+    sums = np.convolve(np.where(finite, values, 0.0), np.ones(window))[: len(values)]
+    counts = np.convolve(finite, np.ones(window))[: len(values)]
+    with np.errstate(invalid="ignore"):
+        mean: Array = sums / counts
+    return mean
+
+
+def bands(values: Array, groups: int) -> Array:
+    """`values` in so many consecutive groups of about equal size: an array (6, groups).
+
+    Of each group its middle position, then mean, smallest, 10% quantile, 90% quantile and largest of its finite
+    values (NaN where there is none).
+    """
+    rows = []
+    ends = np.linspace(0, len(values), groups + 1).round().astype(np.int64)
+    for positions in np.split(np.arange(len(values)), ends[1:-1]):
+        part = values[positions]
+        part = part[np.isfinite(part)] if np.isfinite(part).any() else np.array([np.nan])
+        rows.append((positions.mean(), part.mean(), *np.quantile(part, [0, 0.1, 0.9, 1])))
+    return np.array(rows).T
+
+
+def bin_edges(values: Array, most: int) -> tuple[Array, int]:
+    """Edges of equal bins over numbers that can be drawn (or NaN), and how many of those lie beyond.
+
+    Few values make few bins. A few values far away from all others would squeeze these into one bin: they are left
+    beyond. Whole numbers get bins of a whole width, centred on them.
+    """
+    values = values[np.isfinite(values)]
+    bins = int(np.clip(2 * np.ceil(np.sqrt(len(values))), 8, most))
+    values = values if len(values) else np.zeros(1)
+    low, high = float(values.min()), float(values.max())
+    inner_low, inner_high = np.quantile(values, [_TAIL, 1 - _TAIL]).tolist()
+    spread = inner_high - inner_low
+    if 0 < _FAR * spread < high - low:
+        low, high = max(low, inner_low - spread / 2), min(high, inner_high + spread / 2)
+    beyond = int(((values < low) | (values > high)).sum())
+    if high - low < 2**52 and np.array_equal(values, np.round(values)):
+        first, last = np.ceil(low), np.floor(high)
+        width = max(1, int(np.ceil((last - first + 1) / bins)))
+        edges = first - 0.5 + width * np.arange((last - first) // width + 2.0)
+    else:
+        edges = np.linspace(low, high, bins + 1)
+    if not (np.diff(edges) > 0).all():  # numbers that hardly differ, or do not
+        edges = low + max(1.0, abs(low)) * np.array([-0.5, 0.5])
+    if len(edges) == 2:  # a bar in the middle, not a wall
+        edges = edges[0] + (edges[1] - edges[0]) * np.arange(-4.0, 6.0)
+    return edges, beyond

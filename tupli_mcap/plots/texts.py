@@ -1,0 +1,215 @@
+"""What a report says: its title, facts and notes, as texts, as panels, and as HTML that stands alone."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.messages.episodes import END_NAMES
+from tupli_mcap.plots import style
+from tupli_mcap.plots.measure import Measured
+from tupli_mcap.plots.style import Cell, Page, cut
+from tupli_mcap.recording.blocks import Array
+from tupli_mcap.recording.description import nan_text, spread_of
+
+__all__ = ["add_facts", "add_notes", "facts_of", "html_fragment", "html_page", "notes_of", "title_of"]
+
+_MOST_SEEDS, _LONGEST_SEEDS = 6, 56  # that are listed; characters
+_MOST_LISTED = 12  # recordings
+_HEAD, _LINE = 0.25, 0.175  # inches
+_NOTE_COLUMNS = 150
+_STYLE = """
+.tupli-report{font:14px/1.45 system-ui,"DejaVu Sans",sans-serif;color:#222;background:#fff;max-width:1150px;
+margin:0 auto;padding:12px}
+.tupli-report h1{font-size:22px;margin:.2em 0 .5em;overflow-wrap:anywhere}
+.tupli-report table{border-collapse:collapse;margin:.5em 0}
+.tupli-report td,.tupli-report th{padding:1px 14px 1px 0;text-align:left;vertical-align:top;overflow-wrap:anywhere}
+.tupli-report th{font-weight:normal;color:#767676}
+.tupli-report .n td+td,.tupli-report .n th+th{text-align:right;font-variant-numeric:tabular-nums}
+.tupli-report svg{max-width:100%;height:auto;display:block} .tupli-report summary{cursor:pointer}
+"""
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+_MOST_ROWS = 600  # of the table of numbers
+
+
+def title_of(measured: Sequence[Measured]) -> str:
+    """The environment, and the recording or how many there are."""
+    environments = {one.facts.environment or "" for one in measured}
+    parts = [*environments] if len(environments) == 1 else []
+    parts += [f"{len(measured)} recordings"] if len(measured) > 1 else []
+    return ": ".join(filter(None, parts)) or measured[0].name
+
+
+def facts_of(measured: Sequence[Measured]) -> list[tuple[str, str]]:
+    """Labels and values: of one recording all there is to say, of several a line for each."""
+    if len(measured) > 1:
+        facts = []
+        for one in measured:
+            spread = _spread_text(one.rows["return"])
+            text = f"{_counted(len(one.rows), 'episode')}, {_counted(one.steps, 'step')}"
+            facts.append((one.name, f"{text}, return {spread}" if spread else text))
+        return facts
+    (one,) = measured
+    about, rows = one.facts, one.rows
+    chosen = "" if len(rows) == one.all_episodes else f" of {one.all_episodes:,}"
+    counts = np.bincount(rows["end"], minlength=len(END_NAMES))
+    ends = ", ".join(f"{count:,} {name}" for count, name in zip(counts, END_NAMES, strict=True) if count)
+    found = {
+        "recording": one.name + ("" if about.state == "complete" else f" ({about.state})"),
+        "environment": (about.environment or "none attached")
+        + (f", {about.num_envs} sub-environments" if about.num_envs > 1 else ""),
+        "recorded": _times_text(one),
+        "size": _bytes_text(about.size),
+        "episodes": f"{len(rows):,}{chosen}{f' ({ends})' if ends else ''}",
+        "steps": f"{one.steps:,}",
+        "return": _spread_text(rows["return"]),
+        "length": _spread_text(rows["length"]),
+        "seeds": _seeds_text(one.seeds),
+        "benchmark": about.benchmark_id[:12] or "none",
+        "observation": about.observation_space or "not known before the first step",
+        "action": about.action_space or "not known before the first step",
+    }
+    return [(label, value) for label, value in found.items() if value]
+
+
+def notes_of(measured: Sequence[Measured]) -> list[str]:
+    """Sentences, each once; of several recordings, with their names."""
+    prefixes = [f"{one.name}: " if len(measured) > 1 else "" for one in measured]
+    pairs = zip(prefixes, measured, strict=True)
+    return list(dict.fromkeys(prefix + note for prefix, one in pairs for note in one.notes()))
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def _spread_text(values: Array) -> str:
+    """Mean, standard deviation and range of the finite values; empty if they are all infinite."""
+    bounded = values[~np.isinf(values)]
+    spread = spread_of(bounded)
+    if spread is None:
+        return ""
+    if np.isnan(spread.mean):
+        return nan_text(spread.nan, len(values))
+    mean, std, least, most = map(style.number_text, spread[:4])
+    return mean if len(bounded) - spread.nan == 1 else f"{mean} ± {std}, from {least} to {most}"
+
+
+def _seeds_text(seeds: Sequence[int]) -> str:
+    listed = ", ".join(map(str, seeds))
+    if len(seeds) <= _MOST_SEEDS and len(listed) <= _LONGEST_SEEDS:
+        return listed or "none known"
+    return f"{len(seeds):,} from {style.seed_text(seeds[0])} to {style.seed_text(seeds[-1])}"
+
+
+def _times_text(one: Measured) -> str:
+    """When it was recorded, in UTC: a report says the same wherever it is made; and how long that took."""
+    start = int(one.rows["start_time"].min()) if len(one.rows) else one.facts.created_ns
+    if start <= 0:
+        return "at an unknown time"
+    text = datetime.fromtimestamp(start // 10**9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    if not len(one.rows):
+        return text
+    seconds = (int(one.rows["end_time"].max()) - start) / 1e9
+    unit, size = ("h", 3600) if seconds >= 7200 else ("min", 60) if seconds >= 120 else ("s", 1)
+    return f"{text}, {seconds / size:.1f} {unit}"
+
+
+def _bytes_text(size: int) -> str:
+    unit, scale = ("GB", 1e9) if size >= 999.5e6 else ("MB", 1e6) if size >= 999.5e3 else ("kB", 1e3)
+    return f"{size / scale:.1f} {unit}" if size >= 1000 else f"{size} B"
+
+
+def add_facts(page: Page, measured: Sequence[Measured]) -> None:
+    """The title and the facts: of one recording in two columns, of several a line for each."""
+    facts, several = facts_of(measured), len(measured) > 1
+    if several and len(facts) > _MOST_LISTED:
+        facts = [*facts[:_MOST_LISTED], ("…", f"and {len(facts) - _MOST_LISTED} more")]
+    lines = len(facts) if several else -(-len(facts) // 2)
+    height = _HEAD + _LINE * lines
+    shades = style.colours(len(measured)) if several else []
+
+    def draw(axes: Any) -> None:
+        axes.set_axis_off()
+        axes.set(xlim=(0, 9.5), ylim=(height, 0))
+        axes.text(0, 0.0, cut(title_of(measured), 80), fontsize=13, fontweight="bold", va="center")
+        for i, (label, value) in enumerate(facts):
+            x, y = 4.9 * (i // lines), 0.32 + _LINE * (i % lines)
+            if i < len(shades):
+                axes.plot([x + 0.02, x + 0.2], [y, y], color=shades[i], linewidth=2.5)
+                x += 0.28
+            axes.text(x, y, cut(label, 34), color=style.INK if several else style.GREY, va="center")
+            axes.text(x + (2.4 if several else 0.85), y, cut(value, 100 if several else 56), va="center")
+
+    page.add([Cell(draw, height, left=0, right=0)], 1, tight=True)
+
+
+def add_notes(page: Page, notes: Sequence[str]) -> None:
+    """The notes, in lines; nothing without any."""
+    lines = [line for note in notes for line in textwrap.wrap(cut(note, 600), _NOTE_COLUMNS)]
+
+    def draw(axes: Any) -> None:
+        axes.set_axis_off()
+        axes.set_ylim(len(lines), 0)
+        for i, line in enumerate(lines):
+            axes.text(0, i - 0.5, line, color="#444444", va="center", fontsize=8)
+
+    if lines:
+        page.heading("Notes")
+        page.add([Cell(draw, _LINE * len(lines), left=0, right=0)], 1, tight=True)
+
+
+def html_page(title: str, body: str) -> str:
+    """A document around a fragment. Its policy forbids scripts and everything from elsewhere."""
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{_text(title)}</title></head><body>\n{body}</body></html>\n"
+    )
+
+
+def html_fragment(
+    title: str, facts: Iterable[tuple[str, str]], notes: Sequence[str], svg: str, measured: Sequence[Measured]
+) -> str:
+    """The report without a document around it, as notebooks take it; all texts escaped. `svg` is our own drawing."""
+    # A declaration and a doctype have no place inside a page, metadata no use.
+    element = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], count=1, flags=re.DOTALL)
+    rows = "".join(f"<tr><th>{_text(label)}</th><td>{_text(value)}</td></tr>" for label, value in facts)
+    said = "".join(f"<li>{_text(note)}</li>" for note in notes)
+    return (
+        f'<div class="tupli-report"><style>{_STYLE}</style><h1>{_text(title)}</h1><table>{rows}</table>\n'
+        f"{element}\n{f'<h2>Notes</h2><ul>{said}</ul>' if said else ''}{_numbers(measured)}</div>\n"
+    )
+
+
+def _numbers(measured: Sequence[Measured]) -> str:
+    """A table of every dimension, folded."""
+    rows = []
+    for one in measured:
+        prefix = f"{one.name}: " if len(measured) > 1 else ""
+        for leaf in one.leaves:
+            for name, *numbers, nan, infinite in zip(
+                leaf.names, leaf.mean, leaf.std, leaf.least, leaf.most, leaf.nan, leaf.infinite, strict=True
+            ):
+                cells = [prefix + name, *map(style.number_text, numbers), f"{nan:,}", f"{infinite:,}"]
+                rows.append("".join(f"<td>{_text(cell)}</td>" for cell in cells))
+    if not rows:
+        return ""
+    titles = ("dimension", "mean", "std", "smallest", "largest", "NaN", "infinite")
+    rows.insert(0, "".join(f"<th>{title}</th>" for title in titles))
+    table = "".join(f"<tr>{row}</tr>" for row in rows[: _MOST_ROWS + 1])
+    left = len(rows) - 1 - _MOST_ROWS
+    more = f"<p>and {left} more</p>" if left > 0 else ""
+    return f'<details><summary>Numbers of each dimension</summary><table class="n">{table}</table>{more}</details>'
+
+
+def _text(text: str) -> str:
+    """Escaped, without characters that change what is around them (controls, directions)."""
+    return escape("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text), quote=True)
