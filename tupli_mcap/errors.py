@@ -29,6 +29,26 @@ __all__ = [
     "os_reason",
 ]
 
+_SPACE = "free some space there, or choose another disk"
+_FILES = "close some of them, or raise the limit (ulimit -n)"
+_RIGHTS = "change its permissions, or choose another place"
+_ADVICE: Final = {
+    errno.ENOSPC: _SPACE,
+    errno.EDQUOT: _SPACE,
+    errno.EFBIG: "raise the limit (ulimit -f), or choose a disk that takes larger files",
+    errno.EROFS: "choose a writable place",
+    errno.EACCES: _RIGHTS,
+    errno.EPERM: _RIGHTS,
+    errno.EMFILE: _FILES,
+    errno.ENFILE: _FILES,
+    errno.ENOMEM: "free some memory",
+    errno.EIO: "check the disk and its connection, or choose another disk",
+    errno.ENOLCK: "the file system cannot lock files: choose another disk",
+    errno.ENAMETOOLONG: "choose a shorter one",
+    errno.ENOENT: "make its directory first",
+    errno.ENOTDIR: "choose a path whose directories are directories",
+}
+
 
 class TupliError(Exception):
     """Root of every error this package raises on purpose."""
@@ -120,27 +140,6 @@ def memory_for(what: Callable[[], str]) -> Iterator[None]:
         raise RecordingError(
             f"{what()} takes more memory than there is ({err or 'out of memory'}); read fewer episodes at a time"
         ) from err
-
-
-_SPACE = "free some space there, or choose another disk"
-_FILES = "close some of them, or raise the limit (ulimit -n)"
-_RIGHTS = "change its permissions, or choose another place"
-_ADVICE: Final = {
-    errno.ENOSPC: _SPACE,
-    errno.EDQUOT: _SPACE,
-    errno.EFBIG: "raise the limit (ulimit -f), or choose a disk that takes larger files",
-    errno.EROFS: "choose a writable place",
-    errno.EACCES: _RIGHTS,
-    errno.EPERM: _RIGHTS,
-    errno.EMFILE: _FILES,
-    errno.ENFILE: _FILES,
-    errno.ENOMEM: "free some memory",
-    errno.EIO: "check the disk and its connection, or choose another disk",
-    errno.ENOLCK: "the file system cannot lock files: choose another disk",
-    errno.ENAMETOOLONG: "choose a shorter one",
-    errno.ENOENT: "make its directory first",
-    errno.ENOTDIR: "choose a path whose directories are directories",
-}
 
 
 def os_reason(err: OSError) -> str:
