@@ -184,6 +184,7 @@ def test_a_catalog_that_could_not_be_made_leaves_nothing(
 ) -> None:
     cache = tmp_path / "cache"
     monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", str(cache))
+    (tmp_path / "lab").mkdir()
     storage = FileStorage(tmp_path / "lab")
     with (
         Faults(tmp_path, 0, errno.ENOSPC, kinds=frozenset({"replace"}))(),
@@ -196,6 +197,7 @@ def test_a_catalog_that_could_not_be_made_leaves_nothing(
 
 
 def test_too_many_open_files_are_no_missing_recordings(tmp_path: Path) -> None:
+    (tmp_path / "lab").mkdir()
     storage = FileStorage(tmp_path / "lab")
     for i in range(3):
         with RecordEpisodes(sampler(), storage.root / f"{i}.mcap") as env:

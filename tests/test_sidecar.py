@@ -29,6 +29,7 @@ from tupli_mcap.wrappers import RecordEpisodes
 
 @pytest.fixture
 def storage(tmp_path: Path) -> Iterator[FileStorage]:
+    (tmp_path / "lab").mkdir()
     with FileStorage(tmp_path / "lab") as made:
         yield made
 

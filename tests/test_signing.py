@@ -720,6 +720,7 @@ def test_who_was_there_first_under_its_name_does_not_count(
     forged = with_another_step(bundle, tmp_path / "forged.mcap")
     with FileStorage(tmp_path / "lab") as storage:
         if by_hand:
+            (tmp_path / "lab").mkdir()
             shutil.copy(forged, tmp_path / "lab" / "a.mcap")
         else:
             storage.import_bundle(forged)
