@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import time
 import warnings
 from pathlib import Path
@@ -26,12 +25,44 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.recording.file_series import series
-from tupli_mcap.recording.write import rotation
+from tupli_mcap.recording.write import rotation, writer
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 Step = tuple[Any, ...]
+
+
+class Endless(gym.Env[Any, Any]):
+    """Returns the same array again and again; `ends` says after how many steps episodes end, if they do."""
+
+    observation_space, action_space = gym.spaces.Box(-9, 9, (9,)), gym.spaces.Discrete(3)
+
+    def __init__(self, ends: int = 0) -> None:
+        self._ends = ends
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self._state, self._steps = np.zeros(9, np.float32), 0
+        return self._state, {}
+
+    def step(self, action: Any) -> Any:
+        self._state[...] = self.np_random.normal(size=9)
+        self._steps += 1
+        return self._state, 0.5, bool(self._ends) and self._steps % self._ends == 0, False, {}
+
+
+class Count(EpisodeMetadataCallback):
+    """Metadata: the steps of the episode."""
+
+    steps = 0
+
+    def reset(self) -> None:
+        self.steps = 0
+
+    def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+        self.steps += 1
+        return {"steps": self.steps}
 
 
 def roll(env: Any, steps: int, *, seed: int | None = 1, ends: bool = True) -> list[Step]:
@@ -101,44 +132,28 @@ class TestSingle:
         assert np.array_equal(states, [step[0] for step in told])
         assert np.array_equal(actions, [step[1] for step in told])
 
-    def test_an_endless_episode_is_cut_and_goes_on(self, tmp_path: Path) -> None:
-        class Endless(gym.Env[Any, Any]):
-            observation_space, action_space = gym.spaces.Box(-9, 9, (9,)), gym.spaces.Discrete(3)
-
-            def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-                super().reset(seed=seed)
-                self._state = np.zeros(9, np.float32)
-                return self._state, {}
-
-            def step(self, action: Any) -> Any:
-                self._state[...] = self.np_random.normal(size=9)  # the same array again
-                return self._state, 0.5, False, False, {}
-
-        class Count(EpisodeMetadataCallback):
-            steps = 0
-
-            def reset(self) -> None:
-                self.steps = 0
-
-            def __call__(self, tuple: RLTuple) -> dict[str, Any]:
-                self.steps += 1
-                return {"steps": self.steps}
-
+    def test_an_endless_episode_goes_on_in_its_file_until_a_reset(self, tmp_path: Path) -> None:
         env = RecordEpisodes(
             Endless(), tmp_path / "run.mcap", max_bytes=8000, chunk_size=1000, metadata_callback=Count()
         )
         with env:
             told = roll(env, 800)
+            assert env.paths == [tmp_path / "run.mcap"]
+            told += roll(env, 30)
         assert same(recorded(env.paths), told)
-        assert ends_of(env.paths) == ["interrupted"] * len(env.paths)
-        pieces = [Recording(path).episodes[0] for path in env.paths]
-        assert len(pieces) > 2
-        for one, other in itertools.pairwise(pieces):
-            assert np.array_equal(one.final_state, other.states[0])
-            assert other.start.continued
-        assert not pieces[0].start.continued
-        done = np.cumsum([len(piece) for piece in pieces])
-        assert [piece.metadata["steps"] for piece in pieces] == done.tolist()
+        (first,), (second,) = (Recording(path).episodes for path in env.paths)
+        assert (first.end, len(first), first.metadata) == ("interrupted", 800, {"steps": 800})
+        assert (second.end, len(second), second.metadata) == ("interrupted", 30, {"steps": 30})
+        assert not second.start.continued
+
+    def test_steps_after_an_end_without_a_reset_go_on_in_the_next_file(self, tmp_path: Path) -> None:
+        env = RecordEpisodes(Endless(ends=50), tmp_path / "run.mcap", max_bytes=2000, chunk_size=500)
+        with env:
+            told = roll(env, 200, ends=False)
+        assert len(env.paths) == 4
+        assert same(recorded(env.paths), told)
+        episodes = [Recording(path).episodes[0] for path in env.paths]
+        assert [episode.start.continued for episode in episodes] == [False, True, True, True]
 
     def test_by_time(self, tmp_path: Path) -> None:
         env = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "run.mcap", max_seconds=0.1)
@@ -197,12 +212,28 @@ class TestSingle:
         assert (tmp_path / "r.rrd").read_bytes().count(b"run_0001") > 0
 
     def test_rows_are_limited_too(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(rotation, "_MOST_ROWS", 100)
+        monkeypatch.setattr(rotation, "_MANY_ROWS", 100)
         env = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "run.mcap", chunk_size=500)
         with env:
             told = roll(env, 400)
         assert len(env.paths) > 1
         assert same(recorded(env.paths), told)
+
+    def test_an_episode_of_more_rows_than_a_file_takes_is_refused(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(writer, "_MOST_ROWS", 300)
+        env, steps = RecordEpisodes(Endless(), tmp_path / "run.mcap", chunk_size=1000), 0
+        env.reset(seed=1)
+        with pytest.raises(RecordingError, match="at most 300 messages in a channel.* new recording"):
+            while steps < 1000:
+                env.step(0)
+                steps += 1
+        with pytest.raises(RecordingError, match="at most 300 messages in a channel"):
+            env.reset()
+        env.close()
+        assert 300 <= steps < 400
+        assert len(recorded(env.paths)) == steps + 1  # the one that was refused is in the journal
 
     def test_attachments_do_not_fill_a_file(self, tmp_path: Path) -> None:
         big = {"weights": ("application/octet-stream", bytes(50_000))}
@@ -297,6 +328,7 @@ class TestVector:
     @pytest.mark.parametrize("mode", list(AutoresetMode))
     @pytest.mark.parametrize("together", [False, True], ids=["apart", "together"])
     def test_no_step_is_lost(self, tmp_path: Path, mode: AutoresetMode, together: bool) -> None:
+        """Where episodes end at different times, a file is left at a reset of all."""
         venv = SyncVectorEnv([lambda: Wide(together)] * 3, autoreset_mode=mode)
         env = RecordVector(venv, tmp_path / "run.mcap", max_bytes=900_000, record_info=True)
         told: list[list[Step]] = [[], [], []]
@@ -307,6 +339,8 @@ class TestVector:
             for n in range(500):
                 if n % 10 == 0:
                     env.flush()  # else a thread writes the chunks, when it comes to it
+                if n % 150 == 149:
+                    (states, _), holes = env.reset(), np.zeros(3, np.bool_)
                 before, actions = np.array(states), env.action_space.sample()
                 states, rewards, terminals, timeouts, _ = env.step(actions)
                 for i in np.flatnonzero(~holes):
@@ -320,10 +354,19 @@ class TestVector:
         assert len(env.paths) > 2
         for i in range(3):
             assert same(recorded(env.paths, i), told[i])
-        ends = ends_of(env.paths[:-1])
-        assert ("interrupted" in ends) is not together
-        cut = [e.start.continued for path in env.paths[1:] for e in Recording(path).episodes]
-        assert any(cut) is not together
+        assert not any(e.start.continued for path in env.paths for e in Recording(path).episodes)
+
+    @pytest.mark.parametrize("mode", list(AutoresetMode))
+    def test_a_file_is_left_when_no_episode_is_running(self, tmp_path: Path, mode: AutoresetMode) -> None:
+        venv = SyncVectorEnv([lambda: Wide(True)] * 3, autoreset_mode=mode)
+        with RecordVector(venv, tmp_path / "run.mcap", max_bytes=300_000, chunk_size=60_000) as env:
+            env.reset(seed=1)
+            for _ in range(210):
+                _, _, terminals, _, _ = env.step(env.action_space.sample())
+                if mode == AutoresetMode.DISABLED and terminals.any():
+                    env.reset(options={"reset_mask": terminals})
+        assert len(env.paths) > 2
+        assert set(ends_of(env.paths[:-1])) == {"terminal"}
 
 
 class TestStorage:

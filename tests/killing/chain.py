@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from environments import same
 
-from killing.check import Found, check_recording, found_in, joined
+from killing.check import Found, check_recording, found_in
 from killing.child import Job, Told, record_and_die
 from killing.kinds import KINDS, open_recorder
 from killing.moments import MOMENTS
@@ -189,7 +189,7 @@ class _Chain:
 
 
 class _RotatingChain(_Chain):
-    """A recording that goes on in other files: all of them are one, and an episode that was cut is whole again."""
+    """A recording that goes on in other files: all of them are one."""
 
     def _read(self, path: Path) -> tuple[list[Found], np.ndarray]:
         found: list[Found] = []
@@ -197,7 +197,7 @@ class _RotatingChain(_Chain):
         for number, file in enumerate(_files(path)):
             new, index = super()._read(file)
             indexes.append(index)
-            found = joined(found, [replace(one, number=one.number + 1_000_000 * number) for one in new])
+            found += [replace(one, number=one.number + 1_000_000 * number) for one in new]
         return found, np.concatenate(indexes)
 
     def _finish_copy(self) -> list[str]:

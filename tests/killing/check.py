@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from environments import same
 
 from tupli_mcap import Recording
 
-__all__ = ["Found", "check_recording", "found_in", "joined", "problems_of"]
+__all__ = ["Found", "check_recording", "found_in", "problems_of"]
 
 
 @dataclass
@@ -40,33 +40,6 @@ def found_in(recording: Recording) -> list[Found]:
         )
         for e in recording.episodes
     ]  # fmt: skip
-
-
-def joined(before: Sequence[Found], following: Sequence[Found]) -> list[Found]:
-    """The episodes of a file and of the one that went on: one that was cut in two is whole again."""
-    found, seen = list(before), set()
-    for one in following:
-        places = [i for i, other in enumerate(found) if other.env == one.env and one.env not in seen]
-        seen.add(one.env)
-        last = found[places[-1]] if places else None
-        # a reset tells its info here
-        if (
-            last is None
-            or one.reset_info
-            or last.end != "interrupted"
-            or not same(last.final, one.steps[0][0])
-        ):
-            found.append(one)
-            continue
-        steps = last.steps + one.steps
-        total = 0.0
-        for step in steps:
-            total += float(np.sum(step[2], dtype=np.float64))
-        found[places[-1]] = replace(
-            last, steps=steps, total=total, end=one.end, final=one.final, metadata=one.metadata,
-            times=(last.times[0], one.times[1]),
-        )  # fmt: skip
-    return found
 
 
 @dataclass(eq=False)

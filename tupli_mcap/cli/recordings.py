@@ -122,10 +122,12 @@ def _record(
         _CaptureEnv, typer.Option(help="What the file carries of the environment.")
     ] = _CaptureEnv.spec,
     max_bytes: Annotated[
-        int | None, typer.Option(min=1, help="Go on in FILE_0001.mcap, … when so much is in a file.")
+        int | None,
+        typer.Option(min=1, help="Go on in FILE_0001.mcap, … once so much is in a file."),
     ] = None,
     max_seconds: Annotated[
-        float | None, typer.Option(min=0.001, help="Go on in another file after so many seconds.")
+        float | None,
+        typer.Option(min=0.001, help="The same after so many seconds; a running episode stays whole."),
     ] = None,
     as_json: Json = False,
 ) -> None:

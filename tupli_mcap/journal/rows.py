@@ -10,9 +10,13 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.container import Rows
 
 __all__ = [
+    "LAST_ROW",
     "RowDeriver",
+    "even_rows",
     "rows_per_half",
 ]
+
+LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
 
 
 def rows_per_half(row_size: int, chunk_size: int) -> int:
@@ -58,6 +62,3 @@ def even_rows(channel: int, first: int, data: Any, rows: Array) -> Rows:
     """`Rows` of constant size: `rows` is the structured view of `data`."""
     offsets = np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.dtype.itemsize)
     return Rows(channel, first, data, offsets, rows["#log_time"].astype(np.uint64))
-
-
-LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole

@@ -83,9 +83,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             "rerun+http://host:port/proxy" (one that is running), "foxglove" or "foxglove://127.0.0.1:8765" (a server
             to connect Foxglove to). A viewer that is missing, slow or closed changes nothing about the recording.
         max_bytes, max_seconds: goes on in another file (run_0001.mcap, run_0002.mcap, … after run.mcap) when that much
-            is in the file, or it has been open so long, as soon as an episode has ended; an episode that still runs
-            when the file is a quarter beyond that is cut in two, "interrupted" and `continued`. `path` is the file
-            that is recorded to, `paths` are all of them. With mode "a" the last one is gone on with.
+            is in the file, or it has been open so long, as soon as no episode is running: one that runs goes on in its
+            file, however long it is. `path` is the file that is recorded to, `paths` are all of them. With mode "a" the
+            last one is gone on with.
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
@@ -253,7 +253,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         return refusal
 
     def _rotate(self, state: Any) -> None:
-        """Goes on in the next file, with the environment at `state`; an episode that runs is cut in two."""
+        """Goes on in the next file, with the environment at `state`."""
         work, before, left = self._work, self._recorder, self._writer
         writer = work.ask(self.rotation.open_next, self._options)
         recorder = SingleRecorder(writer, self._spaces, self._infos, leaves_to_rows=before.leaves_to_rows)
@@ -367,9 +367,6 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             self._rotate(state)
         self._writer.flush_if_due()
         self._writer.sync_step()
-        if self.rotation.is_overdue(self._writer):
-            self._rotate(state)
-            self._start_frames()
 
     def flush(self) -> None:
         """Writes everything recorded so far into chunks; the journal already protects it."""

@@ -52,6 +52,8 @@ class RecordEpisodes(gym.vector.VectorWrapper):
     (`env.metadata["autoreset_mode"]`). Where it declares nothing, final states in its infos tell of same-step
     autoreset; without them next-step autoreset is assumed, with a warning. A batch that contradicts the mode is
     refused. With "SameStep" given, episodes whose final states are in no infos are recorded without.
+    With `max_bytes` or `max_seconds`, a full file is left when no sub-environment is within an episode; where there is
+    always one that is, at a `reset` of all.
     """
 
     def __init__(
@@ -230,15 +232,11 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         """In another file, if this one is full; and with what is to be on the disk."""
         self._writer.flush_if_due()
         self._writer.sync_step()
-        if self.rotation.is_due(self._writer):
-            running = self._recorder.is_running
-            if not running or self.rotation.is_overdue(self._writer):
-                self._rotate(result[0])
-                if running and self._frames is not None:
-                    self._frames.start(np.ones(self.num_envs, np.bool_), self.env.render)
+        if self.rotation.is_due(self._writer) and not self._recorder.is_running:
+            self._rotate(result[0])
 
     def _rotate(self, states: Any) -> None:
-        """Goes on in the next file, with the environments at `states`; episodes that run are cut in two."""
+        """Goes on in the next file, with the environments at `states`."""
         work, before, left = self._work, self._recorder, self._writer
         writer = work.ask(self.rotation.open_next, self._options)
         recorder = VectorRecorder(

@@ -20,21 +20,17 @@ from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, WriterOptions, check_local
 from tupli_mcap.recording.write.writer import RecordingWriter, finish_recording
 
-__all__ = [
-    "Rotation",
-]
+__all__ = ["Rotation"]
 
-_PATIENCE = 1.25  # a running episode is cut when the limit is exceeded by a quarter
-_MOST_ROWS = LAST_ROW - (1 << 26)
-_CUT_ROWS = LAST_ROW - (1 << 25)
+_MANY_ROWS = LAST_ROW - (1 << 27)  # of a channel: room for an episode of 60 million steps is left
 
 
 class Rotation:
     """When a recording goes on in another file, and in which one.
 
     A file is full when whole chunks of `max_bytes` are written to it (attachments left out), when it has been open for
-    `max_seconds`, or when a channel nears the most rows it may have. It is left as soon as no episode is running; where
-    one still runs when the file is a quarter beyond its limit, the episode is cut in two.
+    `max_seconds`, or when a channel nears the most rows it may have. It is left as soon as no episode is running: one
+    that runs goes on in its file.
 
     With limits, mode "a" goes on in the last file of a series, and finishes one before it that a killed process left.
 
@@ -114,29 +110,19 @@ class Rotation:
         return writer
 
     def is_due(self, writer: RecordingWriter) -> bool:
-        """Whether the file is to be left once no episode is running."""
-        if not self.limited and len(writer.container.chunk_indexes) == self._counted:
-            return self._most >= _MOST_ROWS
-        return self._is_beyond(writer, 1.0, _MOST_ROWS) and (
-            writer.journal is not None or writer.index.count > 0
-        )
-
-    def is_overdue(self, writer: RecordingWriter) -> bool:
-        """Whether the file is to be left now."""
-        return self._is_beyond(writer, _PATIENCE, _CUT_ROWS)
-
-    def _is_beyond(self, writer: RecordingWriter, share: float, most_rows: int) -> bool:
+        """Whether the file is full, and to be left once no episode is running."""
         container = writer.container
-        if self._max_bytes is not None and container.position - self._head >= share * self._max_bytes:
-            return True
-        if self._max_seconds is not None and time.monotonic() - self._opened >= share * self._max_seconds:
-            return True
         if len(container.chunk_indexes) != self._counted:
-            self._counted, self._most = (
-                len(container.chunk_indexes),
-                max(container.counts.values(), default=0),
-            )
-        return self._most >= most_rows
+            self._counted = len(container.chunk_indexes)
+            self._most = max(container.counts.values(), default=0)
+        if not self.limited:
+            return self._most >= _MANY_ROWS
+        is_full = (
+            self._most >= _MANY_ROWS
+            or (self._max_bytes is not None and container.position - self._head >= self._max_bytes)
+            or (self._max_seconds is not None and time.monotonic() - self._opened >= self._max_seconds)
+        )
+        return is_full and (writer.journal is not None or writer.index.count > 0)
 
     def open_next(self, options: WriterOptions) -> RecordingWriter:
         """A writer of the next file; the caller closes the one before.

@@ -282,10 +282,8 @@ class SingleRecorder:
         rows.put(action, state, reward, terminal, timeout)
 
     def go_on_from(self, before: SingleRecorder, state: Any) -> None:
-        """Takes over from the recorder of another file, with the environment at `state`.
-
-        An episode that runs there goes on here, `continued`; close `before` afterwards.
-        """
+        """Takes over from the recorder of the file before, between episodes, with the environment at `state`: a step
+        without a reset begins an episode there."""
         before._settle()
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = {0}

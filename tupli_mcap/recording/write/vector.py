@@ -536,17 +536,11 @@ class VectorRecorder:
         return any(episode is not None for episode in self._episodes)
 
     def go_on_from(self, before: VectorRecorder, states: Any) -> None:
-        """Takes over from the recorder of another file, with the sub-environments at `states`.
-
-        Episodes that run there go on here, `continued`; close `before` afterwards.
-        """
+        """Takes over from the recorder of the file before, between episodes, with the sub-environments at `states`."""
         before._settle()
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = set(range(self._n))
-        cut = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
-        running = [episode is not None for episode in before._episodes]
-        self._facts = [cut if runs else facts for runs, facts in zip(running, before._facts, strict=True)]
-        self._earlier = before._earlier
+        self._facts, self._earlier = before._facts, before._earlier
         self._ended, self._any_ended = before._ended, before._any_ended
         self._was_reset, self._refused = before._was_reset, before._refused
         self._fresh = True

@@ -59,6 +59,7 @@ __all__ = [
 ]
 
 RECORDING_METADATA = "tupli_mcap.recording"
+_MOST_ROWS = LAST_ROW - (1 << 26)  # of a channel in the file: those in the journal must not come to LAST_ROW
 
 
 _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
@@ -353,9 +354,10 @@ class RecordingWriter:
         return finish
 
     def _check_room(self, rows: Rows) -> None:
-        if rows.first + len(rows.offsets) > LAST_ROW:
+        if rows.first + len(rows.offsets) > _MOST_ROWS:
             raise RecordingError(
-                f"{self.path}: a channel holds at most {LAST_ROW} messages; go on in a new recording"
+                f"{self.path}: expected at most {_MOST_ROWS} messages in a channel, found more; close it (every step "
+                "is safe), and go on in a new recording"
             )
 
     def _warn_if_deleted(self) -> None:
