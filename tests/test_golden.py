@@ -27,7 +27,7 @@ from tupli_mcap.mcap.container import PROFILE
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.open import read_contents
-from tupli_mcap.recording.write.options import WriterOptions
+from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[1]
@@ -76,7 +76,7 @@ def finished(name: str, directory: Path) -> Path:
     """The same, with a summary: an unfinished one is recovered."""
     path = place(name, directory)
     if name in UNFINISHED:
-        RecordingWriter(path, WriterOptions(mode="a", compression="none")).close()
+        RecordingWriter(path, RecordOptions(mode="a", compression="none")).close()
     return path
 
 
@@ -130,7 +130,7 @@ def test_reads_those_of_earlier_writers(folder: str, name: str, tmp_path: Path) 
     with Recording(place(name, tmp_path, directory)) as recording:
         assert ("crc" in recording._contents.channels[1].metadata) == (folder != "before_crc")
         assert_same(list(as_read(recording)), expected(name, directory))
-    RecordingWriter(tmp_path / f"{name}.mcap", WriterOptions(mode="a")).close()
+    RecordingWriter(tmp_path / f"{name}.mcap", RecordOptions(mode="a")).close()
     with Recording(tmp_path / f"{name}.mcap") as recording:
         assert recording.complete
         assert_same(list(as_read(recording)), expected(name, directory))

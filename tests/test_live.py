@@ -37,7 +37,7 @@ from tupli_mcap.live import LiveSession
 from tupli_mcap.live.follow import Watcher
 from tupli_mcap.live.session import _Meter
 from tupli_mcap.live.target import parse_target
-from tupli_mcap.recording.write.options import WriterOptions
+from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 from tupli_mcap.viewer.live import Sketch
@@ -940,7 +940,7 @@ def test_targets() -> None:
 
 
 def test_a_writer_is_watched_from_its_first_step_on(tmp_path: Path) -> None:
-    writer = RecordingWriter(tmp_path / "r.mcap", WriterOptions())
+    writer = RecordingWriter(tmp_path / "r.mcap", RecordOptions())
     assert Watcher(writer).layout is None
     writer.close()
 

@@ -29,7 +29,7 @@ from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
-from tupli_mcap.recording.write.options import WriterOptions
+from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.replay.render import render
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -107,7 +107,7 @@ def test_killed_appended_rewritten_and_repaired(tmp_path: Path) -> None:
 
 def test_a_file_without_steps_keeps_its_version(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
-    RecordingWriter(path, WriterOptions(keep_empty=True)).close()
+    RecordingWriter(path, RecordOptions(), keep_empty=True).close()
     with pytest.raises(RecordingError, match="begun in format version 1, holds no step"):
         RecordEpisodes(Sampler(SPACE, spaces.Discrete(2), length=9), path, mode="a", image_format="png")
     with RecordEpisodes(Sampler(SPACE, spaces.Discrete(2), length=9), path, mode="a") as env:

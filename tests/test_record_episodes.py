@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gc
+import inspect
 import re
 import subprocess
 import sys
 import threading
 import warnings
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ from tupli_mcap import (
     verify_recording,
     write_recording,
 )
+from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
@@ -926,6 +929,14 @@ def test_options_are_checked_before_a_file_is_made(tmp_path: Path, options: Any,
     with pytest.raises(RecordingError, match=match):
         RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", **options)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("wrapper", [RecordEpisodes, RecordVectorEpisodes], ids=["single", "vector"])
+def test_the_options_are_the_arguments(wrapper: Any) -> None:
+    arguments = inspect.signature(wrapper.__init__).parameters
+    given = {name: arguments[name].default for name in arguments if name not in ("self", "env", "path")}
+    given.pop("autoreset_mode", None)
+    assert given == {field.name: field.default for field in fields(RecordOptions)}
 
 
 def test_an_image_whose_values_stray_is_an_array(tmp_path: Path) -> None:

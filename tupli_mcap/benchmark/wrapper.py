@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, Self, SupportsFloat
@@ -17,6 +18,7 @@ from tupli_mcap import trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
 from tupli_mcap.environment import Snapshot, build, capture, fingerprint
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError
+from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.common import first_defect
@@ -102,7 +104,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             raise StorageError(
                 f"storage: expected a TupliStorage, such as FileStorage('lab'), or None, found {storage!r:.80}"
             )
-        self._recording_options = recording_options
+        self._options = RecordOptions(**recording_options)
         self._storage = storage
         self.id = benchmark_id
         self.metadata_callback = metadata_callback
@@ -240,28 +242,16 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         callback = self.metadata_callback
         if callback is not None and self.rl_tuple_cls is not RLTuple:
             callback = Retyped(callback, self.rl_tuple_cls)
+        options = replace(self._options, metadata_callback=callback, benchmark_id=benchmark_id)
         if self._path is not None and self._path.exists():
+            going_on = replace(options, mode="a", attachments={})
             # Where the file cannot go on (somebody else writes to it), another one is begun.
             with contextlib.suppress(RecordingError):
-                return RecordEpisodes(
-                    self._tap,
-                    self._path,
-                    metadata_callback=callback,
-                    mode="a",
-                    benchmark_id=benchmark_id,
-                    attachments={},
-                    **self._recording_options,
-                )
+                return RecordEpisodes(self._tap, self._path, **vars(going_on))
         benchmark = self.storage.load_benchmark(benchmark_id)
         self._path = self.storage.new_recording_path(benchmark_id)
-        return RecordEpisodes(
-            self._tap,
-            self._path,
-            metadata_callback=callback,
-            benchmark_id=benchmark_id,
-            attachments=recording_attachments(benchmark.serialized),
-            **self._recording_options,
-        )
+        options = replace(options, attachments=recording_attachments(benchmark.serialized))
+        return RecordEpisodes(self._tap, self._path, **vars(options))
 
     def _finish(self) -> None:
         recorder, self._recorder = self._recorder, None

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from tupli_mcap.recording.description import RecordingDescription, Spread
+    from tupli_mcap.recording.write.options import CaptureEnv
     from tupli_mcap.schema import EpisodeHeader
-    from tupli_mcap.wrappers.benchmark import CaptureEnv
     from tupli_mcap.wrappers.rollout import RolloutSummary
 
 __all__ = ["print_episodes", "register"]
@@ -85,50 +85,63 @@ def _check_policy(value: str | None) -> str | None:
     return value
 
 
+_EnvId = Annotated[str, typer.Argument(metavar="ENV_ID", help="As gymnasium.make takes it.")]
+_Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording (.mcap).")]
+_Steps = Annotated[int, typer.Option(min=1, help="Steps to record, in total.")]
+_Seed = Annotated[int | None, typer.Option(min=0, help="Of the first reset and of random actions.")]
+_NumEnvs = Annotated[int, typer.Option(min=1, help="Sub-environments side by side.")]
+_Policy = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MODULE:FUNCTION",
+        callback=_check_policy,
+        help="Called with an observation, returns an action; random without it.",
+    ),
+]
+_ModeOption = Annotated[
+    _Mode,
+    typer.Option(help="If the file exists: x refuses, w replaces, a appends (and makes a missing one)."),
+]
+_CompressionOption = Annotated[_Compression, typer.Option(help="Of the chunks.")]
+_RecordInfo = Annotated[bool, typer.Option("--record-info", help="Record the infos of steps too.")]
+_DurabilityOption = Annotated[
+    _Durability, typer.Option(help="What a power loss leaves: step and chunk wait for the disk.")
+]
+_Live = Annotated[
+    str | None,
+    typer.Option(metavar="VIEWER", help="Show it meanwhile: rerun, foxglove, or the URL of a viewer."),
+]
+_Frames = Annotated[
+    bool, typer.Option("--frames", help="Record what the environment renders (rgb_array) too.")
+]
+_Every = Annotated[int, typer.Option(min=1, help="With --frames: of every so many steps.")]
+_CaptureEnvOption = Annotated[_CaptureEnv, typer.Option(help="What the file carries of the environment.")]
+_MaxBytes = Annotated[
+    int | None, typer.Option(min=1, help="Go on in FILE_0001.mcap, … once so much is in a file.")
+]
+_MaxSeconds = Annotated[
+    float | None,
+    typer.Option(min=0.001, help="The same after so many seconds; a running episode stays whole."),
+]
+
+
 def _record(
-    env_id: Annotated[str, typer.Argument(metavar="ENV_ID", help="As gymnasium.make takes it.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording (.mcap).")],
-    steps: Annotated[int, typer.Option(min=1, help="Steps to record, in total.")] = 1000,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the first reset and of random actions.")] = None,
-    num_envs: Annotated[int, typer.Option(min=1, help="Sub-environments side by side.")] = 1,
-    policy: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MODULE:FUNCTION",
-            callback=_check_policy,
-            help="Called with an observation, returns an action; random without it.",
-        ),
-    ] = None,
-    mode: Annotated[
-        _Mode,
-        typer.Option(help="If the file exists: x refuses, w replaces, a appends (and makes a missing one)."),
-    ] = _Mode.x,
-    compression: Annotated[_Compression, typer.Option(help="Of the chunks.")] = _Compression.zstd,
-    record_info: Annotated[
-        bool, typer.Option("--record-info", help="Record the infos of steps too.")
-    ] = False,
-    durability: Annotated[
-        _Durability, typer.Option(help="What a power loss leaves: step and chunk wait for the disk.")
-    ] = _Durability.os,
-    live: Annotated[
-        str | None,
-        typer.Option(metavar="VIEWER", help="Show it meanwhile: rerun, foxglove, or the URL of a viewer."),
-    ] = None,
-    frames: Annotated[
-        bool, typer.Option("--frames", help="Record what the environment renders (rgb_array) too.")
-    ] = False,
-    every: Annotated[int, typer.Option(min=1, help="With --frames: of every so many steps.")] = 1,
-    capture_env: Annotated[
-        _CaptureEnv, typer.Option(help="What the file carries of the environment.")
-    ] = _CaptureEnv.spec,
-    max_bytes: Annotated[
-        int | None,
-        typer.Option(min=1, help="Go on in FILE_0001.mcap, … once so much is in a file."),
-    ] = None,
-    max_seconds: Annotated[
-        float | None,
-        typer.Option(min=0.001, help="The same after so many seconds; a running episode stays whole."),
-    ] = None,
+    env_id: _EnvId,
+    output: _Output,
+    steps: _Steps = 1000,
+    seed: _Seed = None,
+    num_envs: _NumEnvs = 1,
+    policy: _Policy = None,
+    mode: _ModeOption = _Mode.x,
+    compression: _CompressionOption = _Compression.zstd,
+    record_info: _RecordInfo = False,
+    durability: _DurabilityOption = _Durability.os,
+    live: _Live = None,
+    frames: _Frames = False,
+    every: _Every = 1,
+    capture_env: _CaptureEnvOption = _CaptureEnv.spec,
+    max_bytes: _MaxBytes = None,
+    max_seconds: _MaxSeconds = None,
     as_json: Json = False,
 ) -> None:
     """Record rollouts of an environment.
@@ -139,10 +152,8 @@ def _record(
     """
     if every > 1 and not frames:
         raise typer.BadParameter("--every says of how many steps frames are recorded; give --frames too")
-    if frames:
-        os.environ.setdefault(
-            "SDL_VIDEODRIVER", "dummy"
-        )  # no window is opened: pygame need not look for a screen
+    if frames:  # no window is opened: pygame need not look for a screen
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
     if policy is not None or ":" in env_id:
@@ -153,23 +164,15 @@ def _record(
         step_progress(steps) as progress,
     ):
         summary = record_rollouts(
-            env_id,
-            output,
-            steps=steps,
-            seed=seed,
-            num_envs=num_envs,
-            policy=function,
-            mode=mode.value,
-            compression=compression.value,
-            record_info=record_info,
-            durability=durability.value,
-            live=live,
-            frames=every if frames else False,
-            capture_env=capture_env.argument,
-            max_bytes=max_bytes,
-            max_seconds=max_seconds,
-            progress=progress,
-        )
+            env_id, output, steps=steps, seed=seed, num_envs=num_envs, policy=function, mode=mode.value,
+            compression=compression.value, record_info=record_info, durability=durability.value, live=live,
+            frames=every if frames else False, capture_env=capture_env.argument, max_bytes=max_bytes,
+            max_seconds=max_seconds, progress=progress,
+        )  # fmt: skip
+    _print_rollout(summary, as_json=as_json)
+
+
+def _print_rollout(summary: RolloutSummary, *, as_json: bool) -> None:
     if as_json:
         paths = [str(path) for path in summary.paths]
         print_json({**summary._asdict(), "path": str(summary.path), "paths": paths})

@@ -17,7 +17,7 @@ from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
-from tupli_mcap.recording.write.frames import CAMERA, RENDER_MODE
+from tupli_mcap.recording.write.options import CAMERA, RENDER_MODE
 from tupli_mcap.replay.attempt import Watch
 from tupli_mcap.replay.certificate import Divergence, SkipKind, Skipped
 from tupli_mcap.replay.certify import Certifier

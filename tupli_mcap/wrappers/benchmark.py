@@ -5,18 +5,17 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 
 from tupli_mcap import trust
 from tupli_mcap.environment import capture, note
 from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.recording.write.options import CaptureEnv
 from tupli_mcap.recording.write.writer import RecordingWriter
 
-__all__ = ["CaptureEnv", "Captured"]
-
-CaptureEnv = Literal["spec", "pickle"] | None
+__all__ = ["Captured"]
 
 _PICKLE = "env.cloudpickle"
 _MAX_PICKLE = 16 << 20
@@ -30,7 +29,7 @@ class Captured:
         documented: whether the recording may say what the environment's documentation says.
 
     Raises:
-        RecordingError: `capture_env` is something else, or the environment is no pickle of up to 16 MiB.
+        RecordingError: the environment is no pickle of up to 16 MiB.
     """
 
     def __init__(
@@ -39,10 +38,6 @@ class Captured:
         capture_env: CaptureEnv,
         given: Mapping[str, tuple[str, bytes]] | None,
     ) -> None:
-        if capture_env not in ("spec", "pickle", None):
-            raise RecordingError(
-                f"capture_env: expected 'spec', 'pickle' or None (nothing), found {capture_env!r:.80}"
-            )
         self.attachments = {} if given is None else dict(given)
         self.documented = capture_env is not None or given is not None
         self._digest = ""  # of a pickle that the recording would carry

@@ -18,10 +18,7 @@ from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.recording.description import spread_of
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.write.frames import RENDER_MODE
-from tupli_mcap.recording.write.infos import RecordInfo
-from tupli_mcap.recording.write.options import Mode
-from tupli_mcap.wrappers.benchmark import CaptureEnv
+from tupli_mcap.recording.write.options import RENDER_MODE, CaptureEnv, Mode, RecordInfo, RecordOptions
 from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
@@ -91,49 +88,46 @@ def record_rollouts(
     if steps < 1 or num_envs < 1:
         raise RecordingError(f"expected at least 1 step and 1 environment, found {steps} and {num_envs}")
     began = time.perf_counter()
-    report = _every(max(1, steps // _REPORTS), progress)
-    wrapped: RecordEpisodes | RecordVectorEpisodes
-    with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if frames else None)) as made:
-        if isinstance(made, gym.vector.VectorEnv):
-            vector = RecordVectorEpisodes(
-                made,
-                path,
-                mode=mode,
-                compression=compression,
-                record_info=record_info,
-                durability=durability,
-                live=live,
-                frames=frames,
-                capture_env=capture_env,
-                max_bytes=max_bytes,
-                max_seconds=max_seconds,
-            )
-            wrapped, known = vector, vector._writer.index.count
-            with _closing(vector, mode):
-                done = _run_vector(vector, steps, seed, policy, report)
-        else:
-            single = RecordEpisodes(
-                made,
-                path,
-                mode=mode,
-                compression=compression,
-                record_info=record_info,
-                durability=durability,
-                live=live,
-                frames=frames,
-                capture_env=capture_env,
-                max_bytes=max_bytes,
-                max_seconds=max_seconds,
-            )
-            wrapped, known = single, single._writer.index.count
-            with _closing(single, mode):
-                done = _run(single, steps, seed, policy, report)
-        paths = wrapped.paths
+    options = RecordOptions(
+        mode=mode, compression=compression, record_info=record_info, durability=durability, live=live,
+        frames=frames, capture_env=capture_env, max_bytes=max_bytes, max_seconds=max_seconds,
+    )  # fmt: skip
+    rollout = _Rollout(steps, seed, policy, _every(max(1, steps // _REPORTS), progress))
+    with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if options.every else None)) as made:
+        wrapped = _wrapped(made, path, options)
+        known = wrapped._writer.index.count
+        with _closing(wrapped, mode):
+            if isinstance(wrapped, RecordEpisodes):
+                done = _run(wrapped, rollout)
+            else:
+                done = _run_vector(wrapped, rollout)
+    return _summary(wrapped.paths, known, done, time.perf_counter() - began)
+
+
+class _Rollout(NamedTuple):
+    """What is done with an environment; `report` is told of the steps so far."""
+
+    steps: int
+    seed: int | None
+    policy: Policy | None
+    report: Callable[[int], None]
+
+
+def _wrapped(
+    env: gym.Env[Any, Any] | gym.vector.SyncVectorEnv, path: str | os.PathLike[str], options: RecordOptions
+) -> RecordEpisodes | RecordVectorEpisodes:
+    if isinstance(env, gym.vector.VectorEnv):
+        return RecordVectorEpisodes(env, path, **vars(options))
+    return RecordEpisodes(env, path, **vars(options))
+
+
+def _summary(paths: list[Path], known: int, steps: int, seconds: float) -> RolloutSummary:
+    """Of the files, whose first one had `known` episodes before."""
     returns = np.concatenate([_returns(path) for path in paths])[known:]
-    seconds, size = time.perf_counter() - began, sum(path.stat().st_size for path in paths)
+    size = sum(path.stat().st_size for path in paths)
     spread = spread_of(returns)
     mean, odd = (float("nan"), 0) if spread is None else (spread.mean, spread.nan)
-    return RolloutSummary(paths[-1], paths, len(returns), done, mean, odd, seconds, size)
+    return RolloutSummary(paths[-1], paths, len(returns), steps, mean, odd, seconds, size)
 
 
 def _returns(path: Path) -> np.ndarray[Any, Any]:
@@ -187,9 +181,8 @@ def _closing(env: RecordEpisodes | RecordVectorEpisodes, mode: Mode) -> Iterator
         raise
 
 
-def _run(
-    env: RecordEpisodes, steps: int, seed: int | None, policy: Policy | None, report: Callable[[int], None]
-) -> int:
+def _run(env: RecordEpisodes, rollout: _Rollout) -> int:
+    steps, seed, policy, report = rollout
     env.action_space.seed(seed)
     ended, again = True, seed
     state: Any = None
@@ -205,13 +198,8 @@ def _run(
     return steps
 
 
-def _run_vector(
-    env: RecordVectorEpisodes,
-    steps: int,
-    seed: int | None,
-    policy: Policy | None,
-    report: Callable[[int], None],
-) -> int:
+def _run_vector(env: RecordVectorEpisodes, rollout: _Rollout) -> int:
+    steps, seed, policy, report = rollout
     env.action_space.seed(seed)
     done = 0
     with _failures(done, env.path):

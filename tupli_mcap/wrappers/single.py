@@ -6,7 +6,8 @@ import copy
 import os
 import time
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
 
@@ -17,18 +18,18 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
-from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
+from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
-from tupli_mcap.recording.write.frames import CAMERA, FrameRecorder, check_every, check_render_mode
-from tupli_mcap.recording.write.infos import InfoRecorder, RecordInfo, entries_of
-from tupli_mcap.recording.write.options import Mode, WriterOptions
+from tupli_mcap.recording.write.frames import FrameRecorder
+from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
+from tupli_mcap.recording.write.options import CaptureEnv, Mode, RecordInfo, RecordOptions, StepCallback
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
-from tupli_mcap.wrappers.benchmark import Captured, CaptureEnv
+from tupli_mcap.wrappers.benchmark import Captured
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
     from tupli_mcap.live import LiveSession
 
 __all__ = ["RecordEpisodes", "check_kind", "close_recordings", "live_session", "metadata_of"]
-
-StepCallback = Callable[[Step], Mapping[str, Any] | None]
 
 
 class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
@@ -125,51 +124,40 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         check_kind(env, vector=False)
         super().__init__(env)
         self._base = env.unwrapped
-        image_format = check_image_format(image_format)
-        every = check_every(frames)
-        if every:
-            check_render_mode(env.render_mode)
-            frame_format = check_format(frame_format)
+        options = RecordOptions(
+            metadata_callback=metadata_callback, record_info=record_info, step_callback=step_callback,
+            compression=compression, mode=mode, reward_space=reward_space, benchmark_id=benchmark_id,
+            capture_env=capture_env, attachments=attachments, labels=labels, flush_seconds=flush_seconds,
+            journal_dir=journal_dir, chunk_size=chunk_size, durability=durability, frames=frames,
+            frame_format=frame_format, image_format=image_format, stack_size=stack_size, live=live,
+            max_bytes=max_bytes, max_seconds=max_seconds,
+        )  # fmt: skip
+        options.check_rendering(env.render_mode)
         self._metadata_callback = metadata_callback
         self._step_callback = step_callback
         captured = Captured(env, capture_env, attachments)
-        wanted = record_info is not False or step_callback is not None
-        self._infos = InfoRecorder(record_info) if wanted else None
+        self._infos = InfoRecorder(record_info) if options.has_infos else None
         self._spaces = spaces = StepLayout(
             env.observation_space, env.action_space, reward_space
         )  # refused before a file is made
         self._spaces = spaces = with_stacks(env, spaces, stack_size)
         spaces.to_metadata()
-        self.rotation = Rotation(path, mode, max_bytes, max_seconds)
-        self._options = WriterOptions(
-            compression,
-            mode,
-            benchmark_id,
-            with_labels(captured, env, spaces, labels),
-            journal_dir,
-            chunk_size,
-            flush_seconds,
-            durability=durability,
-            cameras=(CAMERA,) if every else (),
-            format_version=format_version(spaces, image_format),
-            image_format=image_format,
-        )
-        self._watches = metadata_callback is not None or wanted or bool(every)
-        self._plain = (
-            not self._watches and flush_seconds is None and durability != "step" and not self.rotation.limited
-        )
+        options = replace(options, attachments=with_labels(captured, env, spaces, labels))
+        self.rotation = Rotation(path, options, format_version(spaces, image_format))
+        self._watches = options.has_callbacks or bool(options.every)
+        self._plain = options.is_plain
         self._stepped = True  # the callback may hold what another recorder has left in it
         self._state: Any = None
         self._work = work = Work()
         writer: RecordingWriter | None = None
         try:
-            self._writer = writer = self.rotation.open_first(self._options)
+            self._writer = writer = self.rotation.open_first()
             self._recorder = SingleRecorder(self._writer, spaces, self._infos, leaves_to_rows=self._plain)
             work.recorders.append(self._recorder)
             captured.trust_stored(writer)
             self._writer.check_spaces(spaces, 1, vector=False)
             self._recorder.resets_itself = _resets_itself(env)
-            self._frames = FrameRecorder(self._writer, 1, every, frame_format, work.ask) if every else None
+            self._frames = FrameRecorder(self._writer, 1, options, work.ask) if options.every else None
             self._live = live_session(self._writer, live, env)
             # must not hold the wrapper
             self._finalizer = weakref.finalize(self, close_recordings, work, self._live)
@@ -255,7 +243,7 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
     def _rotate(self, state: Any) -> None:
         """Goes on in the next file, with the environment at `state`."""
         work, before, left = self._work, self._recorder, self._writer
-        writer = work.ask(self.rotation.open_next, self._options)
+        writer = work.ask(self.rotation.open_next)
         recorder = SingleRecorder(writer, self._spaces, self._infos, leaves_to_rows=before.leaves_to_rows)
         work.recorders.append(recorder)
         recorder.go_on_from(before, state)

@@ -7,7 +7,8 @@ import os
 import time
 import warnings
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +19,26 @@ from gymnasium.vector.utils import iterate
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.journal.seals import Durability
-from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
+from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.autoreset import Autoreset
-from tupli_mcap.recording.write.frames import CAMERA, VectorFrames, check_every, check_render_mode
-from tupli_mcap.recording.write.infos import InfoRecorder, RecordInfo, entries_of
-from tupli_mcap.recording.write.options import Mode, WriterOptions
+from tupli_mcap.recording.write.frames import VectorFrames
+from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
+from tupli_mcap.recording.write.options import CaptureEnv, Mode, RecordInfo, RecordOptions, StepCallback
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.vector import VectorRecorder
 from tupli_mcap.recording.write.vector_infos import final_info_of, info_of
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
-from tupli_mcap.wrappers.benchmark import Captured, CaptureEnv
+from tupli_mcap.wrappers.benchmark import Captured
 from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.seeds import drawn_seed
 from tupli_mcap.wrappers.single import check_kind, close_recordings, live_session, metadata_of
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
 __all__ = ["RecordEpisodes"]
-
-StepCallback = Callable[[Step], Mapping[str, Any] | None]
 
 
 class RecordEpisodes(gym.vector.VectorWrapper):
@@ -86,19 +85,22 @@ class RecordEpisodes(gym.vector.VectorWrapper):
     ) -> None:
         check_kind(env, vector=True)
         super().__init__(env)
-        image_format = check_image_format(image_format)
-        every = check_every(frames)
-        if every:
-            check_render_mode(getattr(env, "render_mode", None))
-            frame_format = check_format(frame_format)
+        options = RecordOptions(
+            metadata_callback=metadata_callback, record_info=record_info, step_callback=step_callback,
+            compression=compression, mode=mode, reward_space=reward_space, benchmark_id=benchmark_id,
+            capture_env=capture_env, attachments=attachments, labels=labels, flush_seconds=flush_seconds,
+            journal_dir=journal_dir, chunk_size=chunk_size, durability=durability, frames=frames,
+            frame_format=frame_format, image_format=image_format, stack_size=stack_size, live=live,
+            max_bytes=max_bytes, max_seconds=max_seconds,
+        )  # fmt: skip
+        options.check_rendering(getattr(env, "render_mode", None))
         self._autoreset = Autoreset.of(env, autoreset_mode)
         n = env.num_envs
         self._callbacks = (
             None if metadata_callback is None else [copy.deepcopy(metadata_callback) for _ in range(n)]
         )
         self._step_callback = step_callback
-        wanted = record_info is not False or step_callback is not None
-        self._infos = InfoRecorder(record_info) if wanted else None
+        self._infos = InfoRecorder(record_info) if options.has_infos else None
         captured = Captured(env, capture_env, attachments)
         if reward_space is not None and reward_space.shape is None:
             raise SpaceError(
@@ -109,28 +111,14 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         )
         self._spaces = spaces = with_stacks(env, spaces, stack_size)
         spaces.to_metadata()
-        self.rotation = Rotation(path, mode, max_bytes, max_seconds)
-        self._options = WriterOptions(
-            compression,
-            mode,
-            benchmark_id,
-            with_labels(captured, env, spaces, labels),
-            journal_dir,
-            chunk_size,
-            flush_seconds,
-            durability=durability,
-            cameras=(CAMERA,) if every else (),
-            format_version=format_version(spaces, image_format),
-            image_format=image_format,
-        )
-        watches = wanted or metadata_callback is not None or bool(every)
-        plain = not watches and flush_seconds is None and durability != "step"
+        options = replace(options, attachments=with_labels(captured, env, spaces, labels))
+        self.rotation = Rotation(path, options, format_version(spaces, image_format))
         self._texts = ["{}"] * n
         self._states: list[Any] = []
-        self._watches = wanted or metadata_callback is not None
+        self._watches = options.has_callbacks
         parts = (
             (RecordEpisodes._watch, self._watches),
-            (RecordEpisodes._film, bool(every)),
+            (RecordEpisodes._film, bool(options.every)),
             (RecordEpisodes._end, True),
             (RecordEpisodes._go_on, True),
         )
@@ -138,15 +126,15 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         self._work = work = Work()
         writer: RecordingWriter | None = None
         try:
-            self._writer = writer = self.rotation.open_first(self._options)
+            self._writer = writer = self.rotation.open_first()
             self._recorder = VectorRecorder(
                 self._writer, spaces, n, self._autoreset, self._infos,
-                leaves_to_rows=plain and not self.rotation.limited,
+                leaves_to_rows=options.is_plain,
             )  # fmt: skip
             work.recorders.append(self._recorder)
             captured.trust_stored(writer)
             self._writer.check_spaces(spaces, n, vector=True)
-            self._frames = VectorFrames(self._writer, n, every, frame_format, work.ask) if every else None
+            self._frames = VectorFrames(self._writer, n, options, work.ask) if options.every else None
             self._live = live_session(self._writer, live, env)
             self._finalizer = weakref.finalize(self, close_recordings, work, self._live)
         except BaseException:
@@ -238,7 +226,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
     def _rotate(self, states: Any) -> None:
         """Goes on in the next file, with the environments at `states`."""
         work, before, left = self._work, self._recorder, self._writer
-        writer = work.ask(self.rotation.open_next, self._options)
+        writer = work.ask(self.rotation.open_next)
         recorder = VectorRecorder(
             writer, self._spaces, self.num_envs, self._autoreset, self._infos,
             leaves_to_rows=before.leaves_to_rows,

@@ -5,66 +5,35 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from functools import cache, partial
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
-from tupli_mcap.messages.images.pictures import FrameFormat, check_picture, encode_picture
+from tupli_mcap.messages.images.pictures import check_picture, encode_picture
+from tupli_mcap.recording.write.options import CAMERA, RecordOptions
 from tupli_mcap.recording.write.vector import VectorRecorder
 from tupli_mcap.recording.write.writer import RecordingWriter
 
-__all__ = [
-    "CAMERA",
-    "RENDER_MODE",
-    "FrameRecorder",
-    "VectorFrames",
-    "check_every",
-    "check_render_mode",
-    "put_frame",
-]
+__all__ = ["FrameRecorder", "VectorFrames", "put_frame"]
 
 Ask = Callable[..., Any]
-CAMERA: Final = "render"
-"""The camera that `env.render()` is."""
-
-RENDER_MODE: Final = "rgb_array"
-
-
-def check_every(frames: bool | int) -> int:
-    """Every how many steps a frame is recorded, 0 for never; RecordingError for other values."""
-    if isinstance(frames, bool) or (type(frames) is int and frames >= 0):
-        return int(frames)
-    raise RecordingError(
-        f"frames: expected True, False, or a number of steps from one frame to the next, found {frames!r:.60}"
-    )
-
-
-def check_render_mode(mode: Any) -> None:
-    """Raises RecordingError unless an environment renders pictures."""
-    if mode != RENDER_MODE:
-        raise RecordingError(
-            f"frames: expected an environment with render_mode={RENDER_MODE!r}, found {mode!r:.40}; "
-            f"make it so: gymnasium.make(..., render_mode={RENDER_MODE!r})"
-        )
 
 
 class FrameRecorder:
     """Puts the frames of one camera into a recording: of an episode's first state, of the state after every `every`-th
     step, and of its last one if it ends by itself.
 
-    A frame is in the journal, or in the file, when `step` returns. `ask` calls what renders (`Work.ask`).
+    A frame is in the journal, or in the file, when `step` returns. `options` have the `every` and the format of frames;
+    `ask` calls what renders (`Work.ask`).
     """
 
-    def __init__(
-        self, writer: RecordingWriter, num_envs: int, every: int, form: FrameFormat, ask: Ask
-    ) -> None:
+    def __init__(self, writer: RecordingWriter, num_envs: int, options: RecordOptions, ask: Ask) -> None:
         self._writer = writer
         self._ask = ask
-        self._every = every
-        self._form: FrameFormat = form
+        self._every, self._form = options.every, options.frame_format
         # of the state the next episode starts at: it has no number before its first step
         self._first: list[EncodedFrame | None] = [None] * num_envs
 
@@ -113,10 +82,8 @@ def put_frame(writer: RecordingWriter, env: int, episode: int, step: int, frame:
 class VectorFrames:
     """The frames of a vector environment's cameras, of which `render()` gives one a sub-environment."""
 
-    def __init__(
-        self, writer: RecordingWriter, num_envs: int, every: int, form: FrameFormat, ask: Ask
-    ) -> None:
-        self._frames = FrameRecorder(writer, num_envs, every, form, ask)
+    def __init__(self, writer: RecordingWriter, num_envs: int, options: RecordOptions, ask: Ask) -> None:
+        self._frames = FrameRecorder(writer, num_envs, options, ask)
         self._ask = ask
         self._n = num_envs
 

@@ -15,9 +15,9 @@ from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.write.frames import CAMERA, put_frame
+from tupli_mcap.recording.write.frames import put_frame
 from tupli_mcap.recording.write.infos import InfoRecorder
-from tupli_mcap.recording.write.options import Mode, WriterOptions
+from tupli_mcap.recording.write.options import Mode, RecordOptions
 from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
@@ -71,9 +71,10 @@ def write_recording(
             before its last step, or with an `end` that its last step's flags do not say.
     """
     spaces = StepLayout(observation_space, action_space, reward_space)
-    cameras = (CAMERA,) if frames else ()
-    options = WriterOptions(compression, mode, benchmark_id, attachments, keep_empty=True, cameras=cameras)
-    writer = RecordingWriter(path, options)
+    options = RecordOptions(
+        compression=compression, mode=mode, benchmark_id=benchmark_id, attachments=attachments, frames=frames
+    )
+    writer = RecordingWriter(path, options, keep_empty=True)
     recorder = SingleRecorder(writer, spaces, InfoRecorder(True))
     work = Work()
     work.recorders.append(recorder)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.infos import InfoCodec
+from tupli_mcap.recording.write.options import RecordInfo
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import shorten
 
-__all__ = ["InfoRecorder", "RecordInfo", "entries_of"]
-
-RecordInfo = bool | Sequence[str] | Callable[[dict[str, Any]], Mapping[str, Any]]
+__all__ = ["InfoRecorder", "entries_of"]
 
 
 def entries_of(given: Any, what: str) -> dict[str, Any]:

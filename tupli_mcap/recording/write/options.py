@@ -1,83 +1,171 @@
-"""How a recording is written."""
+"""What `RecordEpisodes` is given, and whether it may be: all options stand here, and are checked here."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
 from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.journal.seals import Durability, check_durability
 from tupli_mcap.mcap.records import MAX_CHUNK
-from tupli_mcap.messages.images.pictures import ImageFormat
+from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 
-__all__ = ["Mode", "WriterOptions", "check_local", "check_options"]
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from tupli_mcap.recording.episode import Step
+    from tupli_mcap.schema import EpisodeMetadataCallback
+
+__all__ = [
+    "CAMERA",
+    "RENDER_MODE",
+    "CaptureEnv",
+    "Mode",
+    "RecordInfo",
+    "RecordOptions",
+    "StepCallback",
+    "check_place",
+]
 
 Mode = Literal["x", "w", "a"]
+CaptureEnv = Literal["spec", "pickle"] | None
+RecordInfo = bool | Sequence[str] | Callable[[dict[str, Any]], Mapping[str, Any]]
+StepCallback = Callable[["Step"], Mapping[str, Any] | None]
+
+CAMERA: Final = "render"
+"""The camera that `env.render()` is."""
+
+RENDER_MODE: Final = "rgb_array"
+
 _MOST = MAX_CHUNK // 2  # a chunk may come out larger; readers refuse those beyond
 
 
-class WriterOptions(NamedTuple):
-    """How to write: `chunk_size` in bytes before compression, `flush_seconds` None flushes by size only.
+@dataclass(frozen=True)
+class RecordOptions:
+    """The arguments of `RecordEpisodes`, which says what each of them is, under the same names.
 
-    A new recording that no step came into is removed when it is closed, unless `keep_empty`.
-    `durability` says what a power loss leaves: what the system happened to write, every chunk, or every step.
-    `cameras` names the one that frames will come from, if any.
+    Raises:
+        RecordingError: one of them is something else than it may be.
+        MissingExtraError: the extra that `image_format` needs is not installed.
     """
 
+    metadata_callback: EpisodeMetadataCallback | None = None
+    record_info: RecordInfo = False
+    step_callback: StepCallback | None = None
     compression: str = "zstd"
     mode: Mode = "x"
+    reward_space: gym.Space[Any] | None = None
     benchmark_id: str = ""
+    capture_env: CaptureEnv = "spec"
     attachments: Mapping[str, tuple[str, bytes]] | None = None
+    labels: Mapping[str, Sequence[str]] | None = None
+    flush_seconds: float | None = None
     journal_dir: str | os.PathLike[str] | None = None
     chunk_size: int = 256 * 1024
-    flush_seconds: float | None = None
-    keep_empty: bool = False
     durability: Durability = "os"
-    cameras: tuple[str, ...] = ()
-    format_version: str = "1"
+    frames: bool | int = False
+    frame_format: FrameFormat = "png"
     image_format: ImageFormat = "raw"
+    stack_size: int | None = None
+    live: str | None = None
+    max_bytes: int | None = None
+    max_seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        size, seconds, frames = self.chunk_size, self.flush_seconds, self.frames
+        if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= _MOST:
+            raise RecordingError(
+                f"chunk_size: expected an integer from 1 to {_MOST} (bytes), found {size!r:.80}"
+            )
+        if seconds is not None and not (isinstance(seconds, int | float | np.number) and seconds >= 0):
+            raise RecordingError(f"flush_seconds: expected seconds from 0 on, or None, found {seconds!r:.80}")
+        for name, limit in (("max_bytes", self.max_bytes), ("max_seconds", self.max_seconds)):
+            if limit is not None and not (isinstance(limit, int | float) and limit > 0):
+                raise RecordingError(f"{name}: expected a positive number or None, found {limit!r:.40}")
+        if not (isinstance(frames, bool) or (type(frames) is int and frames >= 0)):
+            raise RecordingError(
+                f"frames: expected True, False, or a number of steps from one frame to the next, found {frames!r:.60}"
+            )
+        if self.capture_env not in ("spec", "pickle", None):
+            raise RecordingError(
+                f"capture_env: expected 'spec', 'pickle' or None (nothing), found {self.capture_env!r:.80}"
+            )
+        check_durability(self.durability)
+        check_image_format(self.image_format)
+        _check_directory(self.journal_dir)
+
+    @property
+    def every(self) -> int:
+        """Every how many steps a frame is recorded, 0 for never."""
+        return int(self.frames)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The one that frames come from, if any."""
+        return (CAMERA,) if self.every else ()
+
+    @property
+    def has_infos(self) -> bool:
+        """True if something is recorded with each step's info."""
+        return self.record_info is not False or self.step_callback is not None
+
+    @property
+    def has_callbacks(self) -> bool:
+        """True if values of each step are looked at beside its row."""
+        return self.has_infos or self.metadata_callback is not None
+
+    @property
+    def has_limits(self) -> bool:
+        """True if the recording may go on in other files before a channel is full."""
+        return self.max_bytes is not None or self.max_seconds is not None
+
+    @property
+    def is_plain(self) -> bool:
+        """True if nothing follows a step but its row."""
+        needs = self.has_callbacks or self.every or self.has_limits
+        return not needs and self.flush_seconds is None and self.durability != "step"
+
+    def check_rendering(self, mode: Any) -> None:
+        """Raises RecordingError where frames are wanted of an environment whose render mode gives none, and
+        MissingExtraError where they cannot be encoded."""
+        if not self.every:
+            return
+        if mode != RENDER_MODE:
+            raise RecordingError(
+                f"frames: expected an environment with render_mode={RENDER_MODE!r}, found {mode!r:.40}; "
+                f"make it so: gymnasium.make(..., render_mode={RENDER_MODE!r})"
+            )
+        check_format(self.frame_format)
 
 
-def check_local(path: str | os.PathLike[str]) -> None:
-    """Raises RecordingError if `path` is none, or a URL, as it was given: as a `Path` it no longer looks like one."""
+def _check_directory(place: str | os.PathLike[str] | None) -> None:
+    if place is None:
+        return
+    expected = f"journal_dir: expected a directory, found {str(place)!r}"
+    try:
+        if not Path(place).is_dir():
+            raise RecordingError(f"{expected}; make it")
+    except OSError as err:
+        raise RecordingError(f"{expected}: {os_reason(err)}") from err
+
+
+def check_place(path: str | os.PathLike[str]) -> None:
+    """Raises RecordingError unless a recording can be written at `path`, as it was given, and now: as a `Path` a URL no
+    longer looks like one."""
     if "\0" in os.fspath(path):
         raise RecordingError(f"expected a path to record to, found {os.fspath(path)!r}, which holds a NUL")
     if "://" in os.fspath(path):
         raise RecordingError(
             f"{path}: expected a local path to record to, found a URL; record to a path, and copy the file"
         )
-
-
-def _check_clock(path: str | os.PathLike[str]) -> None:
-    """Raises RecordingError if the clock is not within what rows hold: a `log_time` of 0 says that there is no row."""
     now = time.time()
-    if not 0 < now < (1 << 63) / 1e9:
+    if not 0 < now < (1 << 63) / 1e9:  # a `log_time` of 0 says that there is no row
         raise RecordingError(
             f"{path}: expected a clock between 1970 and 2262, found {now:.0f} s since 1970; set the system's clock"
         )
-
-
-def check_options(path: str | os.PathLike[str], options: WriterOptions) -> WriterOptions:
-    """The options, with a place for the journal that does not depend on the process's directory."""
-    check_local(path)
-    _check_clock(path)
-    size, seconds = options.chunk_size, options.flush_seconds
-    if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= _MOST:
-        raise RecordingError(f"chunk_size: expected an integer from 1 to {_MOST} (bytes), found {size!r:.80}")
-    if seconds is not None and not (isinstance(seconds, int | float | np.number) and seconds >= 0):
-        raise RecordingError(f"flush_seconds: expected seconds from 0 on, or None, found {seconds!r:.80}")
-    check_durability(options.durability)
-    if options.journal_dir is None:
-        return options
-    expected = f"{path}: expected a directory as journal_dir, found {str(options.journal_dir)!r}"
-    try:
-        if not Path(options.journal_dir).is_dir():
-            raise RecordingError(f"{expected}; make it")
-    except OSError as err:
-        raise RecordingError(f"{expected}: {os_reason(err)}") from err
-    return options._replace(journal_dir=os.path.realpath(options.journal_dir))

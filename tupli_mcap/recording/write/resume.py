@@ -198,10 +198,10 @@ def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> Non
         writer.container.codecs = image_codecs(writer.layout, writer.container.channels)
         writer.recorded_envs = len(steps)
         writer.recorded_vector = steps[0].topic != "/step"
-    elif contents.metadata["format_version"] < writer.options.format_version:
+    elif contents.metadata["format_version"] < writer.format_version:
         raise RecordingError(
             f"{writer.path} was begun in format version {contents.metadata['format_version']}, holds no step, and "
-            f"cannot hold what needs version {writer.options.format_version}; record to another file"
+            f"cannot hold what needs version {writer.format_version}; record to another file"
         )
 
 

@@ -11,13 +11,14 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.write.options import Mode, WriterOptions, check_local
+from tupli_mcap.recording.write.options import Mode, RecordOptions, check_place
 from tupli_mcap.recording.write.writer import RecordingWriter, finish_recording
 
 __all__ = ["Rotation"]
@@ -34,27 +35,31 @@ class Rotation:
 
     With limits, mode "a" goes on in the last file of a series, and finishes one before it that a killed process left.
 
+    Args:
+        options: how each of the files is written; `mode` is that of the first one.
+        format_version: the least one that has what is recorded.
+
     Attributes:
-        limited: whether there is a limit other than the number of rows.
         beginning: a context in which the next file is made.
         finished: called with each file that is left.
 
     Raises:
-        RecordingError: a limit is no positive number, or files of an earlier series would follow a new one.
+        RecordingError: files of an earlier series would follow a new one.
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], mode: Mode, max_bytes: int | None, max_seconds: float | None
+        self, path: str | os.PathLike[str], options: RecordOptions, format_version: str = "1"
     ) -> None:
-        check_local(path)
-        for name, limit in (("max_bytes", max_bytes), ("max_seconds", max_seconds)):
-            if limit is not None and not (isinstance(limit, int | float) and limit > 0):
-                raise RecordingError(f"{name}: expected a positive number or None, found {limit!r:.40}")
-        self._max_bytes, self._max_seconds = max_bytes, max_seconds
-        self.limited = max_bytes is not None or max_seconds is not None
+        check_place(path)
+        self._options, self._format_version = options, format_version
+        self._limited, self._max_bytes, self._max_seconds = (
+            options.has_limits,
+            options.max_bytes,
+            options.max_seconds,
+        )
         self._paths = [Path(path)]
-        if self.limited:
-            self._join(mode)
+        if self._limited:
+            self._join(options.mode)
         self._opened = 0.0
         self._head = 0  # bytes of attachments
         self.beginning: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
@@ -74,7 +79,7 @@ class Rotation:
         files = [base, *later.values()]
         for left in files[-2:-1]:  # changes nothing about a finished one
             with contextlib.suppress(RecordingError, FormatError):  # it is read as it is
-                finish_recording(left, WriterOptions(mode="a"))
+                finish_recording(left, RecordOptions(mode="a"))
         self._paths = [files[-1]]
 
     @property
@@ -90,19 +95,18 @@ class Rotation:
         """The newest of them."""
         return self.paths[-1]
 
-    def open_first(self, options: WriterOptions) -> RecordingWriter:
+    def open_first(self) -> RecordingWriter:
         """A writer of the first file, or of the one to go on with; mode "a" makes it where there is none.
 
         Raises:
             RecordingError: as `RecordingWriter`.
         """
-        path = self._paths[0]
-        if options.mode == "a" and not os.path.lexists(path):
-            options = options._replace(mode="x")
-        return self._open(path, options)
+        path, mode = self._paths[0], self._options.mode
+        return self._open(path, "x" if mode == "a" and not os.path.lexists(path) else mode)
 
-    def _open(self, path: Path, options: WriterOptions) -> RecordingWriter:
-        writer = RecordingWriter(path, options)
+    def _open(self, path: Path, mode: Mode) -> RecordingWriter:
+        options = replace(self._options, mode=mode)
+        writer = RecordingWriter(path, options, format_version=self._format_version)
         attachments = writer.container.attachment_indexes
         self._head = sum(index.length for index in attachments if index.name != INDEX_NAME)
         self._opened = time.monotonic()
@@ -115,7 +119,7 @@ class Rotation:
         if len(container.chunk_indexes) != self._counted:
             self._counted = len(container.chunk_indexes)
             self._most = max(container.counts.values(), default=0)
-        if not self.limited:
+        if not self._limited:
             return self._most >= _MANY_ROWS
         is_full = (
             self._most >= _MANY_ROWS
@@ -124,7 +128,7 @@ class Rotation:
         )
         return is_full and (writer.journal is not None or writer.index.count > 0)
 
-    def open_next(self, options: WriterOptions) -> RecordingWriter:
+    def open_next(self) -> RecordingWriter:
         """A writer of the next file; the caller closes the one before.
 
         Raises:
@@ -133,6 +137,6 @@ class Rotation:
         base, later = series(self._paths[-1])
         path = base.with_name(f"{base.stem}_{max(later, default=0) + 1:04}{base.suffix}")
         with self.beginning():
-            writer = self._open(path, options._replace(mode="x"))
+            writer = self._open(path, "x")
         self._paths.append(path)
         return writer

@@ -42,7 +42,7 @@ from tupli_mcap.recording.topics import register_channels
 from tupli_mcap.recording.write.areas import plan_areas
 from tupli_mcap.recording.write.compressing import ChunkWorker
 from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
-from tupli_mcap.recording.write.options import WriterOptions, check_options
+from tupli_mcap.recording.write.options import RecordOptions, check_place
 from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.rows.stores import Stores
@@ -66,13 +66,24 @@ _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
 
 
 class RecordingWriter:
-    """Writes one recording; `begin` is called at the first step, when the layout is known."""
+    """Writes one recording; `begin` is called at the first step, when the layout is known.
 
-    def __init__(self, path: str | os.PathLike[str], options: WriterOptions) -> None:
+    A new recording that no step came into is removed when it is closed, unless `keep_empty`.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        options: RecordOptions,
+        *,
+        format_version: str = "1",
+        keep_empty: bool = False,
+    ) -> None:
+        check_place(path)
         self.path = Path(path)
         # the process may change its directory before the journal is made
         self._place = Path(os.path.realpath(path))
-        self.options = options = check_options(path, options)
+        self.options, self.format_version, self._keep_empty = options, format_version, keep_empty
         self.closed = False
         self.failed: RecordingError | None = None  # why nothing more can be recorded, where that is known
         self._told_deleted = False
@@ -111,9 +122,13 @@ class RecordingWriter:
         self._is_cut = True  # False on append, while the file still is as it was found
         self._flush_seconds = options.flush_seconds
         self._flushed_at = time.monotonic()
+        self._take_file()
+        _live.add(self)
+
+    def _take_file(self) -> None:
         lock: FileLock | None = None
         try:
-            self.lock = lock = FileLock(self.path, options.mode)
+            self.lock = lock = FileLock(self.path, self.options.mode)
             self._open()
         except BaseException as err:
             if lock is not None:
@@ -122,7 +137,6 @@ class RecordingWriter:
             if isinstance(err, OSError):
                 raise RecordingError(f"{self.path} cannot be recorded to: {os_reason(err)}") from err
             raise
-        _live.add(self)
 
     def _open(self) -> None:
         self.container = Container(self.lock.fd, str(self.path), self.options.compression)
@@ -150,7 +164,7 @@ class RecordingWriter:
         now = time.time_ns()
         values = {
             "uuid": self.uuid,
-            "format_version": self.options.format_version,
+            "format_version": self.format_version,
             "library": library(),
             "created_ns": str(now),
             "benchmark_id": self.options.benchmark_id,
@@ -451,9 +465,9 @@ class RecordingWriter:
 
     def _choose_journal_place(self) -> Path:
         directory = self.options.journal_dir
-        return (
-            journal_path(self._place) if directory is None else journal_in(directory, self._place, self.uuid)
-        )
+        if directory is None:
+            return journal_path(self._place)
+        return journal_in(os.path.realpath(directory), self._place, self.uuid)
 
     def close(self) -> None:
         """Writes the rest, the episode index and the summary, and removes the journal.
@@ -514,7 +528,9 @@ class RecordingWriter:
         if self.lock.replaces or (self.journal is None and self._is_new_and_empty()):
             self._leave()
             return
-        options = WriterOptions(self.options.compression, "a", durability=self.options.durability)
+        options = RecordOptions(
+            compression=self.options.compression, mode="a", durability=self.options.durability
+        )
         # errors name the file as its user does, unless the process has changed its directory since
         is_there = os.path.realpath(self.path) == str(self._place)
         try:
@@ -564,7 +580,7 @@ class RecordingWriter:
                 place.unlink()
 
     def _is_new_and_empty(self) -> bool:
-        return self.options.mode != "a" and not self.options.keep_empty
+        return self.options.mode != "a" and not self._keep_empty
 
     def _leave(self) -> None:
         """No step was recorded: what is appended to or replaced stays as it was, and a new file would only be in the
@@ -590,7 +606,7 @@ class RecordingWriter:
         self.on_close()
 
 
-def finish_recording(path: Path, options: WriterOptions) -> None:
+def finish_recording(path: Path, options: RecordOptions) -> None:
     """Finishes a recording that its writer has left unfinished; a finished one stays as it is.
 
     Raises:
