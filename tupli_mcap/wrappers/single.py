@@ -5,42 +5,32 @@ from __future__ import annotations
 import copy
 import os
 import time
-import weakref
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.errors import StepError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.frames import FrameRecorder
-from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.options import CaptureEnv, Mode, RecordInfo, RecordOptions, StepCallback
-from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.single import SingleRecorder
-from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE, Work
+from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
-from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
-from tupli_mcap.wrappers.benchmark import Captured
-from tupli_mcap.wrappers.labels import with_labels
+from tupli_mcap.schema import EpisodeMetadataCallback
+from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, metadata_of
 from tupli_mcap.wrappers.seeds import drawn_seed
-from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
-if TYPE_CHECKING:
-    from tupli_mcap.live import LiveSession
-
-__all__ = ["RecordEpisodes", "check_kind", "close_recordings", "live_session", "metadata_of"]
+__all__ = ["RecordEpisodes"]
 
 
-class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
+class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     """Records the episodes of `env` into the MCAP file `path`.
 
     Nothing the policy sees changes: the same objects are returned. A step is safe, whatever happens to the process,
@@ -94,6 +84,10 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
     Not thread-safe. A forked child cannot go on recording; the parent can.
     """
 
+    env: gym.Env[Any, Any]
+    _recorder: SingleRecorder
+    _frames: FrameRecorder | None
+
     def __init__(
         self,
         env: gym.Env[Any, Any],
@@ -132,50 +126,20 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             frame_format=frame_format, image_format=image_format, stack_size=stack_size, live=live,
             max_bytes=max_bytes, max_seconds=max_seconds,
         )  # fmt: skip
-        options.check_rendering(env.render_mode)
         self._metadata_callback = metadata_callback
-        self._step_callback = step_callback
-        captured = Captured(env, capture_env, attachments)
-        self._infos = InfoRecorder(record_info) if options.has_infos else None
-        self._spaces = spaces = StepLayout(
-            env.observation_space, env.action_space, reward_space
-        )  # refused before a file is made
-        self._spaces = spaces = with_stacks(env, spaces, stack_size)
-        spaces.to_metadata()
-        options = replace(options, attachments=with_labels(captured, env, spaces, labels))
-        self.rotation = Rotation(path, options, format_version(spaces, image_format))
         self._watches = options.has_callbacks or bool(options.every)
-        self._plain = options.is_plain
+        self._parts = (RecordEpisodes._watch, RecordEpisodes._end, RecordEpisodes._go_on)
         self._stepped = True  # the callback may hold what another recorder has left in it
         self._state: Any = None
-        self._work = work = Work()
-        writer: RecordingWriter | None = None
-        try:
-            self._writer = writer = self.rotation.open_first()
-            self._recorder = SingleRecorder(self._writer, spaces, self._infos, leaves_to_rows=self._plain)
-            work.recorders.append(self._recorder)
-            captured.trust_stored(writer)
-            self._writer.check_spaces(spaces, 1, vector=False)
-            self._recorder.resets_itself = _resets_itself(env)
-            self._frames = FrameRecorder(self._writer, 1, options, work.ask) if options.every else None
-            self._live = live_session(self._writer, live, env)
-            # must not hold the wrapper
-            self._finalizer = weakref.finalize(self, close_recordings, work, self._live)
-        except BaseException:
-            work.close()
-            if writer is not None:
-                writer.close()
-            raise
+        self._open(path, options, StepLayout(env.observation_space, env.action_space, reward_space), None)
 
-    @property
-    def path(self) -> Path:
-        """The file that is recorded to."""
-        return self.rotation.path
+    def _recorder_of(self, writer: RecordingWriter) -> SingleRecorder:
+        recorder = SingleRecorder(writer, self._spaces, self._infos, leaves_to_rows=self._plain)
+        recorder.resets_itself = _resets_itself(self.env)
+        return recorder
 
-    @property
-    def paths(self) -> list[Path]:
-        """The files that this wrapper has recorded to, in their order."""
-        return self.rotation.paths
+    def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> FrameRecorder:
+        return FrameRecorder(writer, 1, options, self._work.ask)
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
@@ -225,36 +189,6 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         if refusal is not None:
             raise refusal
         return result
-
-    def _finish_step(self, action: Any, result: Any) -> BaseException | None:
-        """Everything that follows a step's row; returns what a callback raised, which changes nothing about that."""
-        work, refusal = self._work, None
-        for part in (self._watch, self._end, self._go_on):
-            try:
-                part(action, result)
-            except BaseException as err:
-                if not work.is_whole_after(err):
-                    self._writer.stop(err)
-                    raise
-                refusal = err if refusal is None else refusal
-                work.state = BEGUN
-        return refusal
-
-    def _rotate(self, state: Any) -> None:
-        """Goes on in the next file, with the environment at `state`."""
-        work, before, left = self._work, self._recorder, self._writer
-        writer = work.ask(self.rotation.open_next)
-        recorder = SingleRecorder(writer, self._spaces, self._infos, leaves_to_rows=before.leaves_to_rows)
-        work.recorders.append(recorder)
-        recorder.go_on_from(before, state)
-        self._writer, self._recorder = writer, recorder
-        if self._live is not None:
-            self._live.go_on(writer)
-        if self._frames is not None:
-            self._frames.go_on(writer)
-        before.close()
-        work.recorders.remove(before)
-        work.ask(self.rotation.finished, left.path)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -318,23 +252,14 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
             self._start_frames()
             return
         self._stepped = True
+        taken = Step(before, action, reward, terminal, timeout, info)
         if self._infos is not None:
-            taken = Step(before, action, reward, terminal, timeout, info)
-            self._recorder.put_info(ask(self._entries, self._infos, taken))
+            self._recorder.put_info(ask(self._entries, taken))
         if self._metadata_callback is not None:
-            rl_tuple = RLTuple.model_construct(
-                state=before, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
-            )
-            self._recorder.metadata = ask(metadata_of, self._metadata_callback, rl_tuple)
+            self._recorder.metadata = ask(metadata_of, self._metadata_callback, taken)
         if self._frames is not None:
             number, step = self._recorder.running
             self._frames.step(0, number, step, bool(terminal or timeout), self.env.render)
-
-    def _entries(self, infos: InfoRecorder, step: Step) -> dict[str, Any]:
-        entries = infos.chosen(step.info)
-        if self._step_callback is not None:
-            entries.update(entries_of(self._step_callback(step), "step_callback: what it returns"))
-        return entries
 
     def _end(self, action: Any, result: Any) -> None:
         """The end of an episode that a step has ended."""
@@ -356,77 +281,9 @@ class RecordEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         self._writer.flush_if_due()
         self._writer.sync_step()
 
-    def flush(self) -> None:
-        """Writes everything recorded so far into chunks; the journal already protects it."""
-        self._work.flush()
-
-    def close(self) -> None:
-        """Finishes the recording, then closes the environment. Calling it twice is fine.
-
-        Raises:
-            RecordingError: the disk refuses; everything that was recorded is safe.
-        """
-        try:
-            close_recordings(self._work, self._live)
-            self._finalizer.detach()
-            if self._stepped:  # the episode was interrupted
-                self._reset_callback()
-        finally:
-            super().close()
-
-    def __enter__(self) -> RecordEpisodes:
-        return self
-
-    def __exit__(self, *_: object) -> Literal[False]:
-        self.close()
-        return False
-
-    def __getstate__(self) -> dict[str, Any]:
-        raise RecordingError(
-            f"a wrapper that records to {self.path} cannot be pickled or copied; wrap the environment there"
-        )
-
-
-def metadata_of(callback: EpisodeMetadataCallback, step: RLTuple) -> str:
-    """What a metadata callback returns, as JSON; RecordingError unless it is a dict of what JSON can hold."""
-    metadata: Any = callback(step)
-    if not metadata:
-        return "{}"
-    if not isinstance(metadata, Mapping):
-        raise RecordingError(f"metadata_callback: expected a dict, found {metadata!r:.100}")
-    try:
-        return jsonvalue.dumps_plain(dict(metadata))
-    except (TypeError, ValueError) as err:
-        raise RecordingError(f"metadata_callback: {err}") from err
-
-
-def check_kind(env: object, *, vector: bool) -> None:
-    """Raises RecordingError if an environment is single where a vector one is expected, or the other way round."""
-    if isinstance(env, gym.Env if vector else gym.vector.VectorEnv):
-        expected, found = ("vector", "single") if vector else ("single", "vector")
-        raise RecordingError(
-            f"expected a {expected} environment, found the {found} environment {type(env).__name__}; "
-            f"use tupli_mcap.{'' if vector else 'vector.'}RecordEpisodes"
-        )
-
-
-def close_recordings(work: Work, live: LiveSession | None) -> None:
-    """Finishes the files, and shows the rest of them."""
-    try:
-        work.close()
-    finally:
-        if live is not None:
-            live.close()
-
-
-def live_session(writer: RecordingWriter, live: str | None, env: Any) -> LiveSession | None:
-    """The live view of a recording that has just been opened."""
-    if live is None:
-        return None
-    from tupli_mcap.live import open_session
-
-    spec = getattr(env, "spec", None)
-    return open_session(writer, live, writer.path.name if spec is None else f"{spec.id} {writer.path.name}")
+    def _when_closed(self) -> None:
+        if self._stepped:  # the episode was interrupted
+            self._reset_callback()
 
 
 def _resets_itself(env: gym.Env[Any, Any]) -> bool:

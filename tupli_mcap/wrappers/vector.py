@@ -6,10 +6,7 @@ import copy
 import os
 import time
 import warnings
-import weakref
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -17,31 +14,26 @@ import numpy as np
 from gymnasium.vector.utils import iterate
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import RecordingError, SpaceError, StepError
+from tupli_mcap.errors import SpaceError, StepError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.frames import VectorFrames
-from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.options import CaptureEnv, Mode, RecordInfo, RecordOptions, StepCallback
-from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.vector import VectorRecorder
 from tupli_mcap.recording.write.vector_infos import final_info_of, info_of
-from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE, Work
+from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
-from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
-from tupli_mcap.wrappers.benchmark import Captured
-from tupli_mcap.wrappers.labels import with_labels
+from tupli_mcap.schema import EpisodeMetadataCallback
+from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, metadata_of
 from tupli_mcap.wrappers.seeds import drawn_seed
-from tupli_mcap.wrappers.single import check_kind, close_recordings, live_session, metadata_of
-from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
 __all__ = ["RecordEpisodes"]
 
 
-class RecordEpisodes(gym.vector.VectorWrapper):
+class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
     """Records every sub-environment of a vector environment (Sync, Async, custom) into the MCAP file `path`.
 
     Arguments are those of `tupli_mcap.RecordEpisodes`; the environment in the file is the first sub-environment, and
@@ -54,6 +46,10 @@ class RecordEpisodes(gym.vector.VectorWrapper):
     With `max_bytes` or `max_seconds`, a full file is left when no sub-environment is within an episode; where there is
     always one that is, at a `reset` of all.
     """
+
+    env: gym.vector.VectorEnv[Any, Any, Any]
+    _recorder: VectorRecorder
+    _frames: VectorFrames | None
 
     def __init__(
         self,
@@ -93,65 +89,29 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             frame_format=frame_format, image_format=image_format, stack_size=stack_size, live=live,
             max_bytes=max_bytes, max_seconds=max_seconds,
         )  # fmt: skip
-        options.check_rendering(getattr(env, "render_mode", None))
-        self._autoreset = Autoreset.of(env, autoreset_mode)
-        n = env.num_envs
-        self._callbacks = (
-            None if metadata_callback is None else [copy.deepcopy(metadata_callback) for _ in range(n)]
-        )
-        self._step_callback = step_callback
-        self._infos = InfoRecorder(record_info) if options.has_infos else None
-        captured = Captured(env, capture_env, attachments)
         if reward_space is not None and reward_space.shape is None:
             raise SpaceError(
                 f"reward: expected a space of arrays for a vector environment, found {reward_space}"
             )
-        self._spaces = spaces = StepLayout(
-            env.single_observation_space, env.single_action_space, reward_space
-        )
-        self._spaces = spaces = with_stacks(env, spaces, stack_size)
-        spaces.to_metadata()
-        options = replace(options, attachments=with_labels(captured, env, spaces, labels))
-        self.rotation = Rotation(path, options, format_version(spaces, image_format))
+        self._autoreset = Autoreset.of(env, autoreset_mode)
+        n = env.num_envs
+        given = metadata_callback
+        self._callbacks = None if given is None else [copy.deepcopy(given) for _ in range(n)]
         self._texts = ["{}"] * n
         self._states: list[Any] = []
         self._watches = options.has_callbacks
-        parts = (
-            (RecordEpisodes._watch, self._watches),
-            (RecordEpisodes._film, bool(options.every)),
-            (RecordEpisodes._end, True),
-            (RecordEpisodes._go_on, True),
+        watch = [RecordEpisodes._watch] * options.has_callbacks + [RecordEpisodes._film] * bool(options.every)
+        self._parts = (*watch, RecordEpisodes._end, RecordEpisodes._go_on)
+        spaces = StepLayout(env.single_observation_space, env.single_action_space, reward_space)
+        self._open(path, options, spaces, n)
+
+    def _recorder_of(self, writer: RecordingWriter) -> VectorRecorder:
+        return VectorRecorder(
+            writer, self._spaces, self.num_envs, self._autoreset, self._infos, leaves_to_rows=self._plain
         )
-        self._parts = [part for part, is_wanted in parts if is_wanted]
-        self._work = work = Work()
-        writer: RecordingWriter | None = None
-        try:
-            self._writer = writer = self.rotation.open_first()
-            self._recorder = VectorRecorder(
-                self._writer, spaces, n, self._autoreset, self._infos,
-                leaves_to_rows=options.is_plain,
-            )  # fmt: skip
-            work.recorders.append(self._recorder)
-            captured.trust_stored(writer)
-            self._writer.check_spaces(spaces, n, vector=True)
-            self._frames = VectorFrames(self._writer, n, options, work.ask) if options.every else None
-            self._live = live_session(self._writer, live, env)
-            self._finalizer = weakref.finalize(self, close_recordings, work, self._live)
-        except BaseException:
-            work.close()
-            if writer is not None:
-                writer.close()
-            raise
 
-    @property
-    def path(self) -> Path:
-        """The file that is recorded to."""
-        return self.rotation.path
-
-    @property
-    def paths(self) -> list[Path]:
-        """The files that this wrapper has recorded to, in their order."""
-        return self.rotation.paths
+    def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> VectorFrames:
+        return VectorFrames(writer, self.num_envs, options, self._work.ask)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         work = self._work
@@ -176,7 +136,7 @@ class RecordEpisodes(gym.vector.VectorWrapper):
         except BaseException as err:
             self._writer.stop(err)
             raise
-        refusal = self._finish_step(stepped, actions, result)
+        refusal = self._finish_step((stepped, actions), result)
         work.finish()
         if self._autoreset.doubt:
             doubt, self._autoreset.doubt = self._autoreset.doubt, ""
@@ -185,62 +145,29 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             raise refusal
         return result
 
-    def _finish_step(self, stepped: Any, actions: Any, result: Any) -> BaseException | None:
-        """Everything that follows a batch's rows; returns what a callback raised, which changes nothing about that."""
-        work, refusal = self._work, None
-        for part in self._parts:
-            try:
-                part(self, stepped, actions, result)
-            except BaseException as err:
-                if not work.is_whole_after(err):
-                    self._writer.stop(err)
-                    raise
-                refusal = err if refusal is None else refusal
-                work.state = BEGUN
-        return refusal
-
-    def _film(self, stepped: Any, actions: Any, result: Any) -> None:
+    def _film(self, taken: Any, result: Any) -> None:
         if self._frames is not None:
             _, _, terminals, timeouts, _ = result
             ended = np.logical_or(terminals, timeouts)
             self._frames.step(
-                self._recorder, stepped, ended, self.env.render, same_step=self._autoreset.mode == "SameStep"
+                self._recorder, taken[0], ended, self.env.render, same_step=self._autoreset.mode == "SameStep"
             )
 
-    def _end(self, stepped: Any, actions: Any, result: Any) -> None:
+    def _end(self, taken: Any, result: Any) -> None:
         """The ends of the episodes that the batch has ended."""
         _, _, terminals, timeouts, infos = result
         if self._watches:
             self._recorder.note_metadata(self._texts)
         self._recorder.finish(terminals, infos)
         if self._callbacks is not None:
-            self._work.ask(self._forget, np.flatnonzero(stepped & np.logical_or(terminals, timeouts)))
+            self._work.ask(self._forget, np.flatnonzero(taken[0] & np.logical_or(terminals, timeouts)))
 
-    def _go_on(self, stepped: Any, actions: Any, result: Any) -> None:
+    def _go_on(self, taken: Any, result: Any) -> None:
         """In another file, if this one is full; and with what is to be on the disk."""
         self._writer.flush_if_due()
         self._writer.sync_step()
         if self.rotation.is_due(self._writer) and not self._recorder.is_running:
             self._rotate(result[0])
-
-    def _rotate(self, states: Any) -> None:
-        """Goes on in the next file, with the environments at `states`."""
-        work, before, left = self._work, self._recorder, self._writer
-        writer = work.ask(self.rotation.open_next)
-        recorder = VectorRecorder(
-            writer, self._spaces, self.num_envs, self._autoreset, self._infos,
-            leaves_to_rows=before.leaves_to_rows,
-        )  # fmt: skip
-        work.recorders.append(recorder)
-        recorder.go_on_from(before, states)
-        self._writer, self._recorder = writer, recorder
-        if self._live is not None:
-            self._live.go_on(writer)
-        if self._frames is not None:
-            self._frames.go_on(writer)
-        before.close()
-        work.recorders.remove(before)
-        work.ask(self.rotation.finished, left.path)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -302,9 +229,9 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             facts.append(ResetFacts(seeds[i], drawn, options, text, now))
         return facts
 
-    def _watch(self, stepped: Any, actions: Any, result: Any) -> None:
+    def _watch(self, taken: Any, result: Any) -> None:
         """Callbacks and infos of a batch."""
-        ask, before = self._work.ask, self._states
+        (stepped, actions), ask, before = taken, self._work.ask, self._states
         self._states = ask(self._each_state, result[0])
         self._recorder.put_infos(stepped, ask(self._asked, before, stepped, actions, result))
 
@@ -326,51 +253,13 @@ class RecordEpisodes(gym.vector.VectorWrapper):
             self._call(i, step)
         return entries
 
-    def _entries(self, step: Step) -> dict[str, Any]:
-        entries = {} if self._infos is None else self._infos.chosen(step.info)
-        if self._step_callback is not None:
-            entries.update(entries_of(self._step_callback(step), "step_callback: what it returns"))
-        return entries
-
     def _call(self, i: int, step: Step) -> None:
-        if self._callbacks is None:
-            return
-        state, action, reward, terminal, timeout, info = step
-        rl_tuple = RLTuple.model_construct(
-            state=state,
-            action=action,
-            reward=reward if np.ndim(reward) else float(reward),
-            info=info,
-            terminal=terminal,
-            timeout=timeout,
-        )
-        self._texts[i] = metadata_of(self._callbacks[i], rl_tuple)
+        if self._callbacks is not None:
+            reward = step.reward if np.ndim(step.reward) else float(step.reward)
+            self._texts[i] = metadata_of(self._callbacks[i], step._replace(reward=reward))
 
     def _forget(self, chosen: Any) -> None:
         for i in chosen:
             if self._callbacks is not None:
                 self._callbacks[i].reset()
             self._texts[i] = "{}"
-
-    def flush(self) -> None:
-        """Writes everything recorded so far into chunks; the journal already protects it."""
-        self._work.flush()
-
-    def close(self, **kwargs: Any) -> None:
-        """Finishes the recording, then closes the environment. Calling it twice is fine."""
-        if "_finalizer" not in self.__dict__:
-            return  # collected after its constructor raised: Gymnasium 1.0 closes then, and the caller's env too
-        try:
-            close_recordings(self._work, self._live)
-            self._finalizer.detach()
-        finally:
-            super().close(**kwargs)
-
-    def __enter__(self) -> RecordEpisodes:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __getstate__(self) -> dict[str, Any]:
-        raise RecordingError(f"a wrapper that records to {self.path} cannot be pickled or copied; wrap there")

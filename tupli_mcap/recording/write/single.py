@@ -287,7 +287,6 @@ class SingleRecorder:
         before._settle()
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = {0}
-        self.resets_itself = before.resets_itself
         if self.resets_itself and before._episode is None:
             self.put = self._continue
             return

@@ -538,6 +538,7 @@ class VectorRecorder:
     def go_on_from(self, before: VectorRecorder, states: Any) -> None:
         """Takes over from the recorder of the file before, between episodes, with the sub-environments at `states`."""
         before._settle()
+        self.leaves_to_rows = before.leaves_to_rows
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = set(range(self._n))
         self._facts, self._earlier = before._facts, before._earlier

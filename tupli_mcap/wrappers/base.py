@@ -1,0 +1,230 @@
+"""What the wrappers of one environment and of many have in common: their files, from the first to the last."""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import gymnasium as gym
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.episode import Step
+from tupli_mcap.recording.write.frames import FrameRecorder, VectorFrames
+from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
+from tupli_mcap.recording.write.options import RecordOptions
+from tupli_mcap.recording.write.rotation import Rotation
+from tupli_mcap.recording.write.work import BEGUN, Recorder, Work
+from tupli_mcap.recording.write.writer import RecordingWriter
+from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+from tupli_mcap.wrappers.benchmark import Captured
+from tupli_mcap.wrappers.labels import with_labels
+from tupli_mcap.wrappers.stacks import format_version, with_stacks
+
+if TYPE_CHECKING:
+    from tupli_mcap.live import LiveSession
+
+__all__ = ["EpisodeWrapper", "check_kind", "metadata_of"]
+
+
+class EpisodeWrapper:
+    """Keeps the files that a wrapper records to. `step` and `reset` are the wrapper's own.
+
+    Its constructor sets `_parts` and calls `_open`; `_recorder_of` says what records into a file.
+
+    Attributes:
+        rotation: which files there are.
+    """
+
+    env: Any
+    rotation: Rotation
+    # what follows the rows of a step; not bound, for the wrapper must not hold itself
+    _parts: Sequence[Callable[[Any, Any, Any], None]]
+    _recorder: Any
+    _frames: FrameRecorder | VectorFrames | None
+
+    def _open(
+        self,
+        path: str | os.PathLike[str],
+        options: RecordOptions,
+        spaces: StepLayout,
+        sub_environments: int | None,
+    ) -> None:
+        """Opens the first file, once everything that may be refused has been looked at.
+
+        Args:
+            spaces: of the environment, or of one of its sub-environments.
+            sub_environments: None for a single environment.
+        """
+        env = self.env
+        options.check_rendering(getattr(env, "render_mode", None))
+        self._infos = InfoRecorder(options.record_info) if options.has_infos else None
+        self._step_callback = options.step_callback
+        captured = Captured(env, options.capture_env, options.attachments)
+        self._spaces = spaces = with_stacks(env, spaces, options.stack_size)
+        spaces.to_metadata()
+        options = replace(options, attachments=with_labels(captured, env, spaces, options.labels))
+        self.rotation = Rotation(path, options, format_version(spaces, options.image_format))
+        self._plain = options.is_plain
+        self._work = work = Work()
+        writer: RecordingWriter | None = None
+        try:
+            self._writer = writer = self.rotation.open_first()
+            self._recorder = recorder = self._recorder_of(writer)
+            work.recorders.append(recorder)
+            captured.trust_stored(writer)
+            writer.check_spaces(spaces, sub_environments or 1, vector=sub_environments is not None)
+            self._frames = self._film_of(writer, options) if options.every else None
+            self._live = _live_session(writer, options.live, env)
+            # must not hold the wrapper
+            self._finalizer = weakref.finalize(self, _close_recordings, work, self._live)
+        except BaseException:
+            work.close()
+            if writer is not None:
+                writer.close()
+            raise
+
+    def _recorder_of(self, writer: RecordingWriter) -> Recorder:
+        """What records the episodes that go to a file."""
+        raise NotImplementedError
+
+    def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> FrameRecorder | VectorFrames:
+        """What records the frames that go to a file."""
+        raise NotImplementedError
+
+    @property
+    def path(self) -> Path:
+        """The file that is recorded to."""
+        return self.rotation.path
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that this wrapper has recorded to, in their order."""
+        return self.rotation.paths
+
+    def _finish_step(self, taken: Any, result: Any) -> BaseException | None:
+        """Everything that follows a step's rows; returns what a callback raised, which changes nothing about that.
+
+        Args:
+            taken: the action, or which sub-environments took a step, and the actions.
+            result: what the environment returned.
+        """
+        work, refusal = self._work, None
+        for part in self._parts:
+            try:
+                part(self, taken, result)
+            except BaseException as err:
+                if not work.is_whole_after(err):
+                    self._writer.stop(err)
+                    raise
+                refusal = err if refusal is None else refusal
+                work.state = BEGUN
+        return refusal
+
+    def _rotate(self, state: Any) -> None:
+        """Goes on in the next file, with the environment at `state`."""
+        work, before, left = self._work, self._recorder, self._writer
+        writer = work.ask(self.rotation.open_next)
+        recorder: Any = self._recorder_of(writer)
+        work.recorders.append(recorder)
+        recorder.go_on_from(before, state)
+        self._writer, self._recorder = writer, recorder
+        if self._live is not None:
+            self._live.go_on(writer)
+        if self._frames is not None:
+            self._frames.go_on(writer)
+        before.close()
+        work.recorders.remove(before)
+        work.ask(self.rotation.finished, left.path)
+
+    def _entries(self, step: Step) -> dict[str, Any]:
+        """What is to be recorded with the info of a step."""
+        entries = {} if self._infos is None else self._infos.chosen(step.info)
+        if self._step_callback is not None:
+            entries.update(entries_of(self._step_callback(step), "step_callback: what it returns"))
+        return entries
+
+    def flush(self) -> None:
+        """Writes everything recorded so far into chunks; the journal already protects it."""
+        self._work.flush()
+
+    def close(self, **kwargs: Any) -> None:
+        """Finishes the recording, then closes the environment. Calling it twice is fine.
+
+        Raises:
+            RecordingError: the disk refuses; everything that was recorded is safe.
+        """
+        if "_finalizer" not in self.__dict__:
+            return  # collected after its constructor raised: Gymnasium 1.0 closes then, and the caller's env too
+        try:
+            _close_recordings(self._work, self._live)
+            self._finalizer.detach()
+            self._when_closed()
+        finally:
+            self.env.close(**kwargs)
+
+    def _when_closed(self) -> None:
+        """After the files are finished."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> Literal[False]:
+        self.close()
+        return False
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise RecordingError(
+            f"a wrapper that records to {self.path} cannot be pickled or copied; wrap the environment there"
+        )
+
+
+def metadata_of(callback: EpisodeMetadataCallback, step: Step) -> str:
+    """What a metadata callback returns, as JSON; RecordingError unless it is a dict of what JSON can hold."""
+    state, action, reward, terminal, timeout, info = step
+    rl_tuple = RLTuple.model_construct(
+        state=state, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
+    )
+    metadata: Any = callback(rl_tuple)
+    if not metadata:
+        return "{}"
+    if not isinstance(metadata, Mapping):
+        raise RecordingError(f"metadata_callback: expected a dict, found {metadata!r:.100}")
+    try:
+        return jsonvalue.dumps_plain(dict(metadata))
+    except (TypeError, ValueError) as err:
+        raise RecordingError(f"metadata_callback: {err}") from err
+
+
+def check_kind(env: object, *, vector: bool) -> None:
+    """Raises RecordingError if an environment is single where a vector one is expected, or the other way round."""
+    if isinstance(env, gym.Env if vector else gym.vector.VectorEnv):
+        expected, found = ("vector", "single") if vector else ("single", "vector")
+        raise RecordingError(
+            f"expected a {expected} environment, found the {found} environment {type(env).__name__}; "
+            f"use tupli_mcap.{'' if vector else 'vector.'}RecordEpisodes"
+        )
+
+
+def _close_recordings(work: Work, live: LiveSession | None) -> None:
+    """Finishes the files, and shows the rest of them."""
+    try:
+        work.close()
+    finally:
+        if live is not None:
+            live.close()
+
+
+def _live_session(writer: RecordingWriter, live: str | None, env: Any) -> LiveSession | None:
+    """The live view of a recording that has just been opened."""
+    if live is None:
+        return None
+    from tupli_mcap.live import open_session
+
+    spec = getattr(env, "spec", None)
+    return open_session(writer, live, writer.path.name if spec is None else f"{spec.id} {writer.path.name}")
