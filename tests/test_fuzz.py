@@ -16,10 +16,10 @@ from fuzzing.oracle import judge, observe
 from fuzzing.plain import Mutant
 from fuzzing.run import MUTATORS, Case, Fuzzer, case_of
 
+from tupli_mcap.dataset.items import steps_of
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.check.verify import verify_recording
-from tupli_mcap.sampling import steps_of
 
 SEEDS = {seed.name: seed for seed in load_seeds()}
 SAMPLE = 2_500

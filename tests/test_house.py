@@ -11,7 +11,7 @@ import tupli_mcap
 
 PACKAGE = Path(tupli_mcap.__file__).parent
 FOLDERS = sorted({path.parent for path in PACKAGE.rglob("*.py")})
-LAZY_DOORS = [PACKAGE / "__init__.py", PACKAGE / "recording" / "__init__.py"]
+LAZY_DOORS = [PACKAGE / folder / "__init__.py" for folder in ("", "recording", "dataset")]
 
 
 def name_of(path: Path) -> str:
@@ -41,5 +41,5 @@ def test_a_folder_can_be_looked_over(folder: Path) -> None:
     )
 
 
-LARGEST = {"dataset": 18, "sampling": 16, "storage": 18, "viewer": 21, "cli": 16, "write": 15}
+LARGEST = {"dataset": 18, "items": 16, "storage": 18, "viewer": 21, "cli": 16, "write": 15}
 """Folders that are still to be parted; these numbers only become smaller."""

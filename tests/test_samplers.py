@@ -13,9 +13,9 @@ import pytest
 from gymnasium import spaces
 
 from tupli_mcap import F, TupliDataset
+from tupli_mcap.dataset.items import Batches, Order, Sampler, SamplingError, Transitions
 from tupli_mcap.errors import FilterError
 from tupli_mcap.recording import EpisodeData, write_recording
-from tupli_mcap.sampling import Batches, Order, Sampler, SamplingError, Transitions
 
 LENGTHS = [2, 40, 3, 5, 50]
 

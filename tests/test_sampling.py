@@ -14,7 +14,7 @@ from gymnasium import spaces
 from test_readme import missing, run_python
 
 from tupli_mcap import RecordEpisodes, Recording, TupliDataset
-from tupli_mcap.sampling import FIELDS
+from tupli_mcap.dataset.items import FIELDS
 
 SPACES: dict[str, gym.Space[Any]] = {
     "box": spaces.Box(-1, 1, (3,)),

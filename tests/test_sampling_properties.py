@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tupli_mcap import F, TupliDataset
+from tupli_mcap.dataset.items import SamplingError
 from tupli_mcap.recording import EpisodeData, write_recording
-from tupli_mcap.sampling import SamplingError
 
 SPACE = spaces.Box(0, 1e6, (2,), np.float64)
 

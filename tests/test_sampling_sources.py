@@ -24,11 +24,11 @@ from test_sampling import naive
 
 from tupli_mcap import F, FileStorage, RecordEpisodes, Recording, TupliDataset
 from tupli_mcap.dataset import open_columns
+from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, RecordedSteps, SamplingError, Windows, steps_of
 from tupli_mcap.dataset.saved import save_columns
 from tupli_mcap.dataset.sources import FilesSource
 from tupli_mcap.errors import FormatError, NotFoundError, SpaceError
 from tupli_mcap.recording import EpisodeData, write_recording
-from tupli_mcap.sampling import FIELDS, ListedEpisodes, RecordedSteps, SamplingError, Windows, steps_of
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 IMAGE = spaces.Dict({"eye": spaces.Box(0, 255, (3, 4, 3), np.uint8), "x": spaces.Box(0, 1, (2,))})

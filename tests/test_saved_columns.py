@@ -28,9 +28,9 @@ from test_sampling_properties import FEW, Library, dataset_of, libraries
 from tupli_mcap import F, FileStorage, RecordEpisodes, TupliDataset, files
 from tupli_mcap.dataset import DatasetError, SavedColumns, open_columns, saved
 from tupli_mcap.dataset.access import RandomAccess
+from tupli_mcap.dataset.items import FIELDS, MemorySteps, SamplingError
 from tupli_mcap.errors import FormatError, StorageError, TupliError
 from tupli_mcap.recording import EpisodeData, write_recording
-from tupli_mcap.sampling import FIELDS, MemorySteps, SamplingError
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 __all__ = ["libraries"]  # a fixture

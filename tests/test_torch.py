@@ -29,7 +29,7 @@ from test_sampling import SPACES, record
 
 from tupli_mcap import F, FormatError, Recording, TupliDataset
 from tupli_mcap.dataset import open_columns
-from tupli_mcap.sampling import DeltaWindows, Order, Sampler, SamplingError
+from tupli_mcap.dataset.items import DeltaWindows, Order, Sampler, SamplingError
 
 torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader, DistributedSampler, default_collate  # noqa: E402

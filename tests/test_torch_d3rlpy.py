@@ -14,7 +14,7 @@ from gymnasium import spaces
 from test_sampling import SPACES, record
 
 from tupli_mcap import F, RecordEpisodes, TupliDataset
-from tupli_mcap.sampling import SamplingError
+from tupli_mcap.dataset.items import SamplingError
 
 
 @pytest.fixture

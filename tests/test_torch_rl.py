@@ -15,8 +15,8 @@ from gymnasium import spaces
 from test_sampling import SPACES, at, record
 
 from tupli_mcap import F, TupliDataset
+from tupli_mcap.dataset.items import SamplingError
 from tupli_mcap.recording import EpisodeData, write_recording
-from tupli_mcap.sampling import SamplingError
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("torchrl")

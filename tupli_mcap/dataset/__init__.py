@@ -1,15 +1,35 @@
 """Datasets: a lazy query over recorded episodes, and the arrays it yields."""
 
-from tupli_mcap.dataset.curate import FilterReport, filter_recording
-from tupli_mcap.dataset.dataset import TupliDataset
-from tupli_mcap.dataset.parsers import (
-    BaseTupleParser,
-    NumpyTupleParser,
-    TensorflowTupleParser,
-    TorchTupleParser,
-)
-from tupli_mcap.dataset.saved import SavedColumns, open_columns
-from tupli_mcap.dataset.sources import DatasetError
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tupli_mcap.dataset.curate import FilterReport, filter_recording
+    from tupli_mcap.dataset.dataset import TupliDataset
+    from tupli_mcap.dataset.parsers import (
+        BaseTupleParser,
+        NumpyTupleParser,
+        TensorflowTupleParser,
+        TorchTupleParser,
+    )
+    from tupli_mcap.dataset.saved import SavedColumns, open_columns
+    from tupli_mcap.dataset.sources import DatasetError
+
+# Imported on first use: who only reads items, as a worker of a DataLoader does, needs no storage.
+_HOMES = {
+    "BaseTupleParser": "parsers",
+    "DatasetError": "sources",
+    "FilterReport": "curate",
+    "NumpyTupleParser": "parsers",
+    "SavedColumns": "saved",
+    "TensorflowTupleParser": "parsers",
+    "TorchTupleParser": "parsers",
+    "TupliDataset": "dataset",
+    "filter_recording": "curate",
+    "open_columns": "saved",
+}
 
 __all__ = [
     "BaseTupleParser",
@@ -23,3 +43,11 @@ __all__ = [
     "filter_recording",
     "open_columns",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.dataset.items import DeltaWindows, Pad, Steps, Transitions, Unit, Windows
+from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.dataset.weights import episode_values
-from tupli_mcap.sampling import DeltaWindows, Pad, Steps, Transitions, Unit, Windows
-from tupli_mcap.sampling.transitions import TRANSITION_FIELDS
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 
 __all__ = ["RandomAccess"]

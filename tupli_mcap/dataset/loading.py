@@ -11,6 +11,8 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.columns import FieldBuilder, pick
+from tupli_mcap.dataset.items import ListedEpisodes
+from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.selection import TupleSelector
 from tupli_mcap.dataset.sources import Source
 from tupli_mcap.errors import memory_for
@@ -18,8 +20,6 @@ from tupli_mcap.messages.shared_dtypes import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
-from tupli_mcap.sampling import ListedEpisodes
-from tupli_mcap.sampling.index import positions_of
 from tupli_mcap.schema import EpisodeHeader
 
 __all__ = ["Selected", "read_columns"]

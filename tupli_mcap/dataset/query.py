@@ -9,14 +9,14 @@ from typing import Any, Self
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.columns import pick
+from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
+from tupli_mcap.dataset.items.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.dataset.loading import Selected, read_columns
 from tupli_mcap.dataset.parsers import map_columns
 from tupli_mcap.dataset.selection import TupleFilter, selector_of
 from tupli_mcap.dataset.sources import Source
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
-from tupli_mcap.sampling import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
-from tupli_mcap.sampling.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_keys
 
 __all__ = ["Query"]

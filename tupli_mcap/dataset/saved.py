@@ -20,14 +20,14 @@ from pydantic import BaseModel, Field, ValidationError
 from tupli_mcap import files, jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.access import RandomAccess
+from tupli_mcap.dataset.items import FIELDS, Steps
+from tupli_mcap.dataset.items.steps import checked_fields, following, pick, pick_runs, rows_of_runs
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import progress
 from tupli_mcap.recording.blocks import step_bytes
-from tupli_mcap.sampling import FIELDS, Steps
-from tupli_mcap.sampling.steps import checked_fields, following, pick, pick_runs, rows_of_runs
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 from tupli_mcap.storage.atomic import os_errors
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.dataset.items import SamplingError
 from tupli_mcap.errors import FilterError
-from tupli_mcap.sampling import SamplingError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate, split_key
 from tupli_mcap.schema.predicate import MISSING, look_up
 

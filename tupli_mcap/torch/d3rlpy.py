@@ -14,8 +14,8 @@ from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset import SavedColumns, TupliDataset
+from tupli_mcap.dataset.items import SamplingError, Steps
 from tupli_mcap.errors import missing_extra
-from tupli_mcap.sampling import SamplingError, Steps
 
 try:
     from d3rlpy.constants import ActionSpace

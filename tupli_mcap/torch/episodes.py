@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling import Items, Steps, Window
-from tupli_mcap.sampling.steps import checked_fields, map_arrays
-from tupli_mcap.sampling.windows import FIVE
+from tupli_mcap.dataset.items import Items, Steps, Window
+from tupli_mcap.dataset.items.steps import checked_fields, map_arrays
+from tupli_mcap.dataset.items.windows import FIVE
 
 __all__ = ["Episodes"]
 

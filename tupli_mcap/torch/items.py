@@ -8,8 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch.utils.data import get_worker_info
 
-from tupli_mcap.sampling import Items, SamplingError
-from tupli_mcap.sampling.steps import checked_count
+from tupli_mcap.dataset.items import Items, SamplingError
+from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.torch.packed import packed
 from tupli_mcap.torch.tensors import tensors
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torch.utils.data import Dataset
 
-from tupli_mcap.sampling import Items
+from tupli_mcap.dataset.items import Items
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.tensors import Samples
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling import Items
+from tupli_mcap.dataset.items import Items
 
 __all__ = ["Batches", "Blocks", "Part", "blocks_of"]
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from tupli_mcap.dataset.items import SamplingError, Transitions
+from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.errors import missing_extra
-from tupli_mcap.sampling import SamplingError, Transitions
-from tupli_mcap.sampling.transitions import TRANSITION_FIELDS
 from tupli_mcap.torch.items import check_state
 from tupli_mcap.torch.tensors import tensors
 

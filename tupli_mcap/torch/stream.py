@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
-from tupli_mcap.sampling import Items, SamplingError
-from tupli_mcap.sampling.steps import checked_count
+from tupli_mcap.dataset.items import Items, SamplingError
+from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.order import Batches, Blocks, Part, blocks_of
 

@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.items.files import OpenFiles
+from tupli_mcap.dataset.items.gather import TIME, ConstantRows, Rows
+from tupli_mcap.dataset.items.index import ListedEpisodes, StepIndex
+from tupli_mcap.dataset.items.kinds import EPISODE, final_rows, image_rows, step_rows
+from tupli_mcap.dataset.items.steps import SamplingError, checked_fields, rows_of_runs
 from tupli_mcap.errors import FormatError, memory_for
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.chunk_store import ChunkCache
-from tupli_mcap.sampling.files import OpenFiles
-from tupli_mcap.sampling.gather import TIME, ConstantRows, Rows
-from tupli_mcap.sampling.index import ListedEpisodes, StepIndex
-from tupli_mcap.sampling.kinds import EPISODE, final_rows, image_rows, step_rows
-from tupli_mcap.sampling.steps import SamplingError, checked_fields, rows_of_runs
 
 __all__ = ["CACHE_BYTES", "THREADS", "RecordedSteps", "steps_of"]
 

@@ -1,54 +1,25 @@
-"""Numbers of items in batches: drawn without end, or each once an epoch. Seeded; they go on from a saved state."""
+"""Numbers of items drawn without end, in batches. Seeded; they go on from a saved state."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling.shuffling import through_buffer
-from tupli_mcap.sampling.steps import SamplingError, checked_count, checked_numbers
-from tupli_mcap.sampling.sumtree import SumTree
+from tupli_mcap.dataset.items.order import check_state, checked_seed, seeded
+from tupli_mcap.dataset.items.steps import SamplingError, checked_count, checked_numbers
+from tupli_mcap.dataset.items.sumtree import SumTree
 from tupli_mcap.schema import BaseFilter, F
 
 if TYPE_CHECKING:
-    from tupli_mcap.sampling.items import Items
+    from tupli_mcap.dataset.items.items import Items
 
-__all__ = ["Numbers", "Order", "Sampler", "Shuffle", "Weights"]
+__all__ = ["Sampler", "Weights"]
 
-Shuffle = Literal["exact", "blocks"]
 Weights = Array | Sequence[float] | F | BaseFilter
-_DRAWS, _EPOCHS = 0, 1  # streams of random numbers
-_BUFFER = 1 << 16
-_SHUFFLES = (False, "exact", "blocks")
-
-
-class Numbers(Protocol):
-    """Batches of item numbers (int64), one after the other.
-
-    `items_identity` tells of which items; `give_back` takes the last batches that were not used after all.
-    """
-
-    items_identity: str
-
-    def __iter__(self) -> Iterator[Array]: ...
-
-    def give_back(self, batches: Sequence[Array]) -> None: ...
-
-    def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
-        """Where this is: plain numbers, strings, bytes and lists. `unused` are the last batches, to be given again."""
-        ...
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from there.
-
-        Raises:
-            SamplingError: it is the state of something else, or of other items.
-        """
-        ...
+_DRAWS = 0  # the stream of random numbers; an `Order` has another
 
 
 class Sampler:
@@ -82,7 +53,7 @@ class Sampler:
         self.items_identity = items.identity
         self.batch_size = checked_count(batch_size, 1, "a batch size")
         self.by = by
-        self.seed = _checked_seed(seed)
+        self.seed = checked_seed(seed)
         self.batch = 0  # the next one
         self._unused: list[Array] = []
         self._n = len(items)
@@ -162,7 +133,7 @@ class Sampler:
 
     def draw(self, number: int) -> Array:
         """Batch `number` of this seed, with the weights as they are now."""
-        random = _random(self.seed, _DRAWS, checked_count(number, 0, "the number of a batch"))
+        random = seeded(self.seed, _DRAWS, checked_count(number, 0, "the number of a batch"))
         if self._tree is not None:
             if not self._tree.total > 0:
                 raise SamplingError(f"expected a weight above 0, found 0 for every {self._what}")
@@ -200,8 +171,8 @@ class Sampler:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        _check_state(state, self.state_dict())
-        seed, batch = _checked_seed(state["seed"]), checked_count(state["batch"], 0, "a batch")
+        check_state(state, self.state_dict())
+        seed, batch = checked_seed(state["seed"]), checked_count(state["batch"], 0, "a batch")
         unused = self._checked_unused(state["unused"])
         weights = state["weights"]
         if (self._tree is None) != (weights is None):
@@ -223,154 +194,6 @@ class Sampler:
         return found
 
 
-class Order:
-    """Gives every item's number once an epoch, in batches; iterating again begins the next epoch.
-
-    Args:
-        items: what is numbered.
-        batch_size: numbers in a batch; the last one has what is left.
-        shuffle: False: in their order. "exact": any order is as likely as any other. "blocks": items wait in a
-            buffer that is filled block (chunk) by block, in random order, and leave it at random: few chunks are in
-            use at a time, and each is read once or twice an epoch, also where the cache holds only some of them.
-        seed: an integer from 0; None takes one of the system's. Each epoch has an order of its own.
-        drop_last: leave out a last batch that is not full.
-        buffer: how many items' worth of blocks are in use at a time; by default 65,536, or as many as half the cache
-            holds.
-
-    Raises:
-        SamplingError: an argument means nothing.
-    """
-
-    def __init__(
-        self,
-        items: Items[Any],
-        batch_size: int,
-        *,
-        shuffle: Shuffle | Literal[False] = False,
-        seed: int | None = None,
-        drop_last: bool = False,
-        buffer: int | None = None,
-    ) -> None:
-        if shuffle not in _SHUFFLES:
-            raise SamplingError(
-                f"expected shuffle to be one of {', '.join(map(repr, _SHUFFLES))}, found {shuffle!r:.80}"
-            )
-        self.items_identity = items.identity
-        self.batch_size = checked_count(batch_size, 1, "a batch size")
-        self.shuffle, self.drop_last = shuffle, drop_last
-        self.seed = _checked_seed(seed)
-        self.epoch, self.batch = 0, 0  # the next batch
-        self._resumed = True
-        self._n = len(items)
-        if buffer is not None:
-            self.buffer = checked_count(buffer, 1, "a buffer")
-        else:
-            room = getattr(items.source, "room", len(items.source))
-            self.buffer = max(1, min(_BUFFER, room * self._n // len(items.source)))
-        self._runs = items.block_runs() if shuffle == "blocks" else None
-        self._blocks = None if self._runs is None else _digest(self._runs)
-        if not len(self):
-            raise SamplingError(
-                f"expected at least {batch_size} items for one full batch, found {self._n}; take drop_last=False"
-            )
-
-    def __len__(self) -> int:
-        """Batches in an epoch."""
-        return self._n // self.batch_size if self.drop_last else -(-self._n // self.batch_size)
-
-    def __iter__(self) -> Iterator[Array]:
-        if not self._resumed and self.batch:
-            self.epoch, self.batch = self.epoch + 1, 0
-        self._resumed = False
-        return self._rest()
-
-    def _rest(self) -> Iterator[Array]:
-        epoch, batches = self.epoch, self._batches(self.epoch)
-        for number in range(len(self)):
-            batch = next(batches)
-            if number < self.batch:
-                continue  # before the state that was loaded
-            self.batch = number + 1
-            yield batch
-            if self.epoch != epoch:
-                return  # another iteration has begun the next one
-        self.epoch, self.batch = epoch + 1, 0
-
-    def _batches(self, epoch: int) -> Iterator[Array]:
-        random = _random(self.seed, _EPOCHS, epoch)
-        if self._runs is not None:
-            return through_buffer(self._runs, self.buffer, self.batch_size, random)
-        order: Callable[[int], Array] = np.arange if self.shuffle is False else random.permutation
-        return _cut(order(self._n), self.batch_size)
-
-    def give_back(self, batches: Sequence[Array]) -> None:
-        state = self.state_dict(batches)
-        self.epoch, self.batch = state["epoch"], state["batch"]
-
-    def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
-        epoch, batch = self.epoch, self.batch
-        if unused and not batch:
-            epoch, batch = epoch - 1, len(self)
-        return {
-            "kind": f"{type(self).__name__}, shuffle={self.shuffle}",
-            "items": self.items_identity,
-            "batch_size": self.batch_size,
-            "buffer": self.buffer if self._runs is not None else 0,
-            "blocks": self._blocks,
-            "seed": self.seed,
-            "epoch": epoch,
-            "batch": batch - len(unused),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        _check_state(state, self.state_dict())
-        seed, epoch = _checked_seed(state["seed"]), checked_count(state["epoch"], 0, "an epoch")
-        self.batch = checked_count(state["batch"], 0, "a batch", len(self))
-        self.seed, self.epoch, self._resumed = seed, epoch, True
-
-
-def _cut(order: Array, size: int) -> Iterator[Array]:
-    for first in range(0, len(order), size):
-        yield order[first : first + size]
-
-
-def _random(seed: int, stream: int, number: int) -> np.random.Generator:
-    """A generator of its own for each number of a stream."""
-    return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, number]))
-
-
 def _usable(weights: Array, n: int) -> Array:
     """Which weights can be one of n: from 0 on, and so small that the sum of n such is finite."""
     return (weights >= 0) & (weights <= np.finfo(np.float64).max / n)
-
-
-def _digest(runs: tuple[Array, Array, Array]) -> str:
-    """Of which items lie in which block."""
-    return hashlib.sha256(b"".join(part.tobytes() for part in runs)).hexdigest()
-
-
-def _checked_seed(seed: object) -> int:
-    if seed is None:
-        return int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
-    return checked_count(seed, 0, "a seed", (1 << 128) - 1)
-
-
-def _check_state(state: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-    """SamplingError unless a state is of the same kind, and of the same items."""
-    if not isinstance(state, Mapping) or not {"kind", "items"} <= state.keys():
-        raise SamplingError(f"expected a state that state_dict() gave, found {state!r:.80}")
-    if state["items"] != own["items"]:
-        raise SamplingError(
-            "expected the state of these items, found that of others: the dataset, its filters or the windows have "
-            "changed since; begin anew, or take what the state was saved with"
-        )
-    if state.get("blocks") != own.get("blocks") and state["kind"] == own["kind"]:
-        raise SamplingError(
-            "expected the state of a shuffle of these blocks, found that of others: the recordings have been written "
-            "anew, loaded or saved as columns since; read them as before, or take shuffle='exact'"
-        )
-    for key in ("kind", "batch_size", "buffer"):
-        if state.get(key) != own.get(key):
-            raise SamplingError(f"expected a state with {key} {own.get(key)!r}, found {state.get(key)!r:.80}")
-    if not own.keys() <= state.keys():
-        raise SamplingError(f"expected {', '.join(own)} in a state, found {', '.join(map(str, state))}")

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.dataset.items.gather import TIME, Column, ConstantRows, DecodedRows, RowFormat, Rows
+from tupli_mcap.dataset.items.index import StepIndex
+from tupli_mcap.dataset.items.segments import Segments
 from tupli_mcap.messages.batches import BatchDecoder, Decode
 from tupli_mcap.messages.shared_dtypes import common_dtype
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.sampling.gather import TIME, Column, ConstantRows, DecodedRows, RowFormat, Rows
-from tupli_mcap.sampling.index import StepIndex
-from tupli_mcap.sampling.segments import Segments
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["EPISODE", "final_rows", "image_rows", "step_rows"]

@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.items.files import FileOfMany, OpenFiles
+from tupli_mcap.dataset.items.segments import Segments, SegmentsBuilder
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.messages.shared_dtypes import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.chunk_store import ChunkCache, ChunkStore
 from tupli_mcap.recording.columns.stored_steps import StoredSteps
-from tupli_mcap.sampling.files import FileOfMany, OpenFiles
-from tupli_mcap.sampling.segments import Segments, SegmentsBuilder
 from tupli_mcap.schema import EpisodeHeader
 
 __all__ = ["ListedEpisodes", "StepIndex", "positions_of"]

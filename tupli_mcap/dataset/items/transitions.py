@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling.items import Parts, StepItems
-from tupli_mcap.sampling.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
+from tupli_mcap.dataset.items.items import Parts, StepItems
+from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
 
 __all__ = ["TRANSITION_FIELDS", "Transition", "Transitions"]
 

@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling.items import Parts, StepItems
-from tupli_mcap.sampling.steps import SamplingError, Steps
-from tupli_mcap.sampling.windows import shaped_rows
+from tupli_mcap.dataset.items.items import Parts, StepItems
+from tupli_mcap.dataset.items.steps import SamplingError, Steps
+from tupli_mcap.dataset.items.windows import shaped_rows
 
 __all__ = ["DeltaWindow", "DeltaWindows", "Unit"]
 

@@ -8,11 +8,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling.draws import Numbers
-from tupli_mcap.sampling.steps import SamplingError, checked_count
+from tupli_mcap.dataset.items.order import Numbers
+from tupli_mcap.dataset.items.steps import SamplingError, checked_count
 
 if TYPE_CHECKING:
-    from tupli_mcap.sampling.items import Items
+    from tupli_mcap.dataset.items.items import Items
 
 __all__ = ["Batches"]
 

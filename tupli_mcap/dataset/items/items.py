@@ -11,9 +11,10 @@ from typing import Any, Generic, Literal, Self, TypeVar
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling.batches import Batches
-from tupli_mcap.sampling.draws import Numbers, Order, Sampler, Shuffle, Weights
-from tupli_mcap.sampling.steps import SamplingError, Steps, checked_numbers
+from tupli_mcap.dataset.items.batches import Batches
+from tupli_mcap.dataset.items.draws import Sampler, Weights
+from tupli_mcap.dataset.items.order import Numbers, Order, Shuffle
+from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_numbers
 from tupli_mcap.schema import BaseFilter, F
 
 __all__ = [

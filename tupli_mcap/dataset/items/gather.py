@@ -9,13 +9,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.items.segments import Piece, Segments
+from tupli_mcap.dataset.items.steps import following, pick, pick_runs, rows_of_runs
 from tupli_mcap.messages.batches import LOG_TIME, Decode
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.runs import items, items_dtype, put
 from tupli_mcap.recording.columns.threads import do_all
 from tupli_mcap.recording.limits import check_bools
-from tupli_mcap.sampling.segments import Piece, Segments
-from tupli_mcap.sampling.steps import following, pick, pick_runs, rows_of_runs
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["TIME", "Column", "ConstantRows", "DecodedRows", "RowFormat", "Rows"]

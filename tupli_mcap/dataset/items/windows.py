@@ -9,8 +9,15 @@ from typing import Any, Literal
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.sampling.items import Items, Parts
-from tupli_mcap.sampling.steps import FIELDS, SamplingError, Steps, checked_count, checked_fields, map_arrays
+from tupli_mcap.dataset.items.items import Items, Parts
+from tupli_mcap.dataset.items.steps import (
+    FIELDS,
+    SamplingError,
+    Steps,
+    checked_count,
+    checked_fields,
+    map_arrays,
+)
 
 __all__ = ["Pad", "Window", "Windows", "shaped_rows"]
 

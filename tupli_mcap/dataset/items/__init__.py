@@ -1,0 +1,43 @@
+"""Steps by number, and what is made of them: windows, transitions, the values around a step.
+
+steps                          what all of these read from; steps in memory
+recorded                       steps read out of recordings
+items                          what windows, transitions and delta windows have in common
+windows, transitions, deltas   the three kinds of items
+order, draws, sumtree          which items come next: each once an epoch, or drawn by weight
+batches                        items read in batches, some of them ahead
+"""
+
+from tupli_mcap.dataset.items.batches import Batches
+from tupli_mcap.dataset.items.deltas import DeltaWindow, DeltaWindows, Unit
+from tupli_mcap.dataset.items.draws import Sampler
+from tupli_mcap.dataset.items.index import ListedEpisodes
+from tupli_mcap.dataset.items.items import Items
+from tupli_mcap.dataset.items.order import Numbers, Order
+from tupli_mcap.dataset.items.recorded import RecordedSteps, steps_of
+from tupli_mcap.dataset.items.steps import FIELDS, MemorySteps, SamplingError, Steps
+from tupli_mcap.dataset.items.transitions import Transition, Transitions
+from tupli_mcap.dataset.items.windows import Pad, Window, Windows
+
+__all__ = [
+    "FIELDS",
+    "Batches",
+    "DeltaWindow",
+    "DeltaWindows",
+    "Items",
+    "ListedEpisodes",
+    "MemorySteps",
+    "Numbers",
+    "Order",
+    "Pad",
+    "RecordedSteps",
+    "Sampler",
+    "SamplingError",
+    "Steps",
+    "Transition",
+    "Transitions",
+    "Unit",
+    "Window",
+    "Windows",
+    "steps_of",
+]
