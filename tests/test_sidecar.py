@@ -14,7 +14,7 @@ import gymnasium as gym
 import pytest
 
 from tupli_mcap import TupliDataset
-from tupli_mcap.dataset.choose import choose_episodes
+from tupli_mcap.dataset.which import choose_episodes
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.recover.prefix import metadata_at

@@ -105,9 +105,8 @@ def _chosen(
     source: str, episodes: str, wanted: BaseFilter | None
 ) -> Iterator[tuple[Recording, list[Episode]]]:
     """Some episodes, and the one recording that they are of."""
-    from tupli_mcap.dataset.choose import choose_episodes
+    from tupli_mcap.dataset.which import choose_episodes, chosen_from
     from tupli_mcap.recording import Recording
-    from tupli_mcap.viewer.choice import chosen_from
 
     if "://" in source or not Path(source).is_dir():
         with Recording(source) as recording:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from tupli_mcap.dataset.choose import candidates
+from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema import BaseFilter, parse_filter

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from tupli_mcap.dataset.subjects import Examinable, Subject, subjects_of
+from tupli_mcap.dataset.which import Examinable, Subject, subjects_of
 from tupli_mcap.doctor.checks import CHECKS, Check
 from tupli_mcap.doctor.findings import Diagnosis, Finding, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic

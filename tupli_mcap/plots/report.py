@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.dataset.choose import choose_among
-from tupli_mcap.dataset.subjects import Examinable, Subject, subjects_of
+from tupli_mcap.dataset.which import Examinable, Subject, named_positions, subjects_of
 from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.plots import texts
 from tupli_mcap.plots.draw_episodes import add_episodes
@@ -208,7 +207,7 @@ def _traces(subjects: Sequence[Subject], measured: Sequence[Measured], episode: 
         sign = 1 if word == "best" else -1
         at = max(filled, key=lambda i: np.nan_to_num(sign * measured[i].rows["return"], nan=-np.inf).max())
     with subjects[at].open() as recording:
-        positions = choose_among(recording, subjects[at].choose(recording), episode)
+        positions = named_positions(recording, subjects[at].choose(recording), episode)
         if len(positions) > _MOST_TRACES:
             raise RecordingError(
                 f"expected at most {_MOST_TRACES} episodes to show in full, found {len(positions)}"

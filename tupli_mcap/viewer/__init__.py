@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from tupli_mcap.dataset.which import Source, chosen_from
 from tupli_mcap.recording import Recording
-from tupli_mcap.viewer.choice import Source, chosen_from
 from tupli_mcap.viewer.notebook import Display, in_notebook
 from tupli_mcap.viewer.plan import Form, plans_of
 from tupli_mcap.viewer.sdk import ViewerError, rerun_sdk

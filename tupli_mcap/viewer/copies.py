@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tupli_mcap.dataset.which import Source, chosen_from
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.viewer.choice import Source, chosen_from
 from tupli_mcap.viewer.companions import write_companions
 from tupli_mcap.viewer.foxglove_layout import write_layout
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from tupli_mcap.dataset.which import Chosen
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
@@ -21,18 +22,11 @@ from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk
 from tupli_mcap.viewer.sending import Times
 
-__all__ = ["Chosen", "Form", "Plan", "plans_of"]
+__all__ = ["Form", "Plan", "plans_of"]
 
 Form = Literal["joined", "split", "compare"]
 _MOST_SPLIT = 200
 _MOST_COMPARED = 16
-
-
-class Chosen(NamedTuple):
-    """Episodes of a recording, by position."""
-
-    recording: Recording
-    positions: Sequence[int]
 
 
 class Part(NamedTuple):

@@ -1,0 +1,331 @@
+"""Which episodes of which recordings are meant: by number, by return, by a filter; of files, directories and datasets.
+
+Storages take long to import, and a file that was never in one can do without: they are imported where they are needed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, Union
+
+import numpy as np
+
+from tupli_mcap.errors import FilterError, RecordingError, TupliError
+from tupli_mcap.recording import Episode, Recording
+
+if TYPE_CHECKING:
+    from tupli_mcap.dataset.dataset import TupliDataset
+    from tupli_mcap.schema import BaseFilter, EpisodeHeader
+    from tupli_mcap.storage import TupliStorage
+
+__all__ = [
+    "Chosen",
+    "Examinable",
+    "Source",
+    "Subject",
+    "candidates",
+    "choose_episodes",
+    "chosen_from",
+    "named_positions",
+    "subjects_of",
+]
+
+WORDS: Final = ("best", "worst", "first", "last", "all")
+"""What may stand in place of an episode's number; best and worst are by return, the first of equals."""
+
+_MAX_DIGITS: Final = 10  # an episode's number has 32 bits
+_CACHE_BYTES = 64 << 20  # each chunk is read once or twice
+_MOST_OPEN = 200
+Positions = np.ndarray[Any, np.dtype[np.int64]]
+Source = Recording | str | os.PathLike[str]
+Examinable: TypeAlias = Union[Source, "TupliDataset", "TupliStorage"]
+
+
+# ---- of one recording
+
+
+def choose_episodes(
+    recording: Recording, text: str = "all", filter: BaseFilter | None = None
+) -> list[Episode]:
+    """The episodes that a text such as "3,7,9", "best" or "first,last" names, in its order, each once.
+
+    Args:
+        text: numbers of episodes and `WORDS`, with commas between them.
+        filter: the choice is among the episodes it is true of; a number it leaves out is an error.
+
+    Episodes that the recording's storage has deleted are not there.
+
+    Raises:
+        FilterError: the text is none of this, or the filter has an unknown key.
+        RecordingError: there is no such episode, or none at all.
+    """
+    among = candidates(recording, filter)
+    return [recording.episodes[position] for position in named_positions(recording, among, text, filter)]
+
+
+def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positions:
+    """The positions of the episodes that a filter is true of, without those that the storage has deleted."""
+    path, deleted = recording.path, set[int]()
+    if path is not None and _may_be_noted(path):
+        from tupli_mcap.storage.sidecar import Notes
+
+        deleted = Notes.read(path).about(recording.metadata).deleted
+    if filter is None:
+        return np.flatnonzero(~np.isin(recording.index["episode"], list(deleted)))
+    from tupli_mcap.dataset.sources import episode_headers
+    from tupli_mcap.schema import EpisodeHeader, check_keys, compile_predicate
+
+    check_keys(filter, EpisodeHeader)
+    matches = compile_predicate(filter, EpisodeHeader)
+    headers = episode_headers(recording, recording.name, deleted)
+    return _positions(recording, (header for header in headers if matches(header)))
+
+
+def _may_be_noted(path: Path) -> bool:
+    """Whether a storage may have noted of a recording what is deleted."""
+    folders = list(path.absolute().parents)[:3]
+    return path.with_name(f"{path.name}.json").exists() or any(
+        (folder / "deleting.json").exists() for folder in folders
+    )
+
+
+def _positions(recording: Recording, headers: Iterable[EpisodeHeader]) -> Positions:
+    numbers = [header.episode for header in headers]
+    return np.flatnonzero(np.isin(recording.index["episode"], numbers))
+
+
+def named_positions(
+    recording: Recording, among: Positions, text: str, filter: BaseFilter | None = None
+) -> list[int]:
+    """The positions that a text names, as for `choose_episodes`, among some positions in the recording.
+
+    `filter` is why there are no others; errors say so.
+
+    Raises:
+        FilterError: the text is none of this.
+        RecordingError: there is no such episode, or none at all.
+    """
+    why = "" if filter is None else f" that {filter} is true of"
+    if not len(among):
+        raise RecordingError(f"{recording.name} has no episode{why}")
+    chosen: dict[int, None] = {}
+    for item in text.split(","):
+        chosen.update(dict.fromkeys(_named(recording, among, item.strip().lower(), text, why)))
+    return list(chosen)
+
+
+def _named(recording: Recording, among: Positions, item: str, text: str, why: str) -> list[int]:
+    if item == "all":
+        return [int(position) for position in among]
+    if item in ("first", "last"):
+        return [int(among[0 if item == "first" else -1])]
+    if item in ("best", "worst"):
+        # a return that is not a number is neither
+        returns = np.nan_to_num(recording.index["return"][among], nan=-np.inf if item == "best" else np.inf)
+        return [int(among[returns.argmax() if item == "best" else returns.argmin()])]
+    if not item.isdecimal() or len(item) > _MAX_DIGITS:
+        raise FilterError(
+            f"expected numbers of episodes such as '3,7,9', or {', '.join(WORDS[:-1])} or {WORDS[-1]}, "
+            f"found {item[:40]!r} in {text[:80]!r}"
+        )
+    numbers = recording.index["episode"][among]
+    found = among[numbers == int(item)]
+    if not len(found):
+        raise RecordingError(f"{recording.name} has no episode {item}{why}; choose from {_range(numbers)}")
+    return [int(found[0])]
+
+
+def _range(numbers: Any) -> str:
+    """The numbers there are: they may have gaps, where episodes were deleted or the filter leaves some out."""
+    low, high = int(numbers[0]), int(numbers[-1])
+    if high - low + 1 == len(numbers):
+        return f"{low} to {high}" if low < high else f"episode {low} only"
+    return f"{len(numbers)} episodes between {low} and {high}"
+
+
+# ---- of several
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A recording and how to open it; `choose` gives the positions of the episodes that are meant, in their order.
+
+    error: why it cannot be opened, where that is known already.
+    """
+
+    name: str
+    open: Callable[[], AbstractContextManager[Recording]]
+    choose: Callable[[Recording], Positions]
+    error: TupliError | None = None
+
+
+def subjects_of(
+    source: Examinable | Iterable[Examinable], episode_filter: BaseFilter | None
+) -> Iterator[Subject]:
+    """The recordings of a path, a directory, a recording, a dataset, a storage, or several of those.
+
+    Raises:
+        RecordingError: it is none of those.
+        FilterError: the filter names an unknown field.
+    """
+    from tupli_mcap.dataset.dataset import TupliDataset
+    from tupli_mcap.storage import TupliStorage
+
+    if isinstance(source, str | os.PathLike):
+        yield from _of_path(os.fspath(source), partial(candidates, filter=episode_filter))
+    elif isinstance(source, Recording):
+        choose = _all if episode_filter is None else partial(candidates, filter=episode_filter)
+        yield Subject(source.name, lambda: nullcontext(source), choose)
+    elif isinstance(source, TupliDataset):
+        yield from _of_dataset(source if episode_filter is None else _narrowed(source, episode_filter))
+    elif isinstance(source, TupliStorage):
+        yield from _of_dataset(TupliDataset(source).with_episode_filter(episode_filter))
+    elif isinstance(source, Iterable):
+        for item in source:
+            yield from subjects_of(item, episode_filter)
+    else:
+        raise RecordingError(f"expected a path, Recording, TupliDataset or storage, found {source!r:.80}")
+
+
+def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Subject]:
+    from tupli_mcap.storage.listing import find_recordings
+
+    error: TupliError = RecordingError(f"{name} holds no recording (.mcap)")
+    files = [name]
+    if "://" not in name:
+        try:
+            files = [str(file) for file in find_recordings(Path(name))]
+        except TupliError as err:
+            files, error = [], err
+    for file in files:
+        yield Subject(file, partial(Recording, file, cache_bytes=_CACHE_BYTES), choose)
+    if not files:
+        yield Subject(name, _unopened, _all, error)
+
+
+def _of_dataset(dataset: TupliDataset) -> Iterator[Subject]:
+    source = dataset._query.source
+    for name, group in itertools.groupby(dataset.preview(), key=lambda header: header.recording):
+        yield Subject(name, partial(source.open, name), partial(_positions, headers=list(group)))
+
+
+def _narrowed(dataset: TupliDataset, episode_filter: BaseFilter) -> TupliDataset:
+    own = dataset._query.episode_filter
+    return dataset.with_episode_filter(episode_filter if own is None else own & episode_filter)
+
+
+def _all(recording: Recording) -> Positions:
+    return np.arange(len(recording.index))
+
+
+def _unopened() -> AbstractContextManager[Recording]:
+    raise RecordingError("there is nothing to open")
+
+
+# ---- open together
+
+
+class Chosen(NamedTuple):
+    """Episodes of a recording, by position."""
+
+    recording: Recording
+    positions: Sequence[int]
+
+
+@contextlib.contextmanager
+def chosen_from(
+    sources: Source | Sequence[Source], episodes: str | Sequence[int] | None, filter: BaseFilter | str | None
+) -> Iterator[list[Chosen]]:
+    """The chosen episodes of recordings, open within the block.
+
+    Of a directory, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a number is that of
+    each recording which has it; a file in it that cannot be read is left out with a warning.
+
+    Raises:
+        RecordingError: a source cannot be opened, or has no such episode.
+        FilterError: what names the episodes, or the filter, has no meaning.
+    """
+    given = [sources] if isinstance(sources, Recording | str | os.PathLike) else list(sources)
+    text = (
+        episodes
+        if isinstance(episodes, str)
+        else ",".join(map(str, ["all"] if episodes is None else episodes))
+    )
+    wanted = _parsed(filter) if isinstance(filter, str) else filter
+    with ExitStack() as stack:
+        chosen: list[Chosen] = []
+        for source in given:
+            if not isinstance(source, Recording) and _is_directory(source):
+                chosen += _of_directory(Path(source), text, wanted, stack)
+                continue
+            if not isinstance(source, Recording):
+                source = stack.enter_context(Recording(source, cache_bytes=_CACHE_BYTES))
+            among = candidates(source, wanted)
+            chosen.append(Chosen(source, named_positions(source, among, text, wanted)))
+        if not chosen:
+            raise RecordingError("expected a recording to show, found none; give its path")
+        yield chosen
+
+
+def _parsed(text: str) -> BaseFilter:
+    from tupli_mcap.schema import parse_filter
+
+    return parse_filter(text)
+
+
+def _is_directory(source: str | os.PathLike[str]) -> bool:
+    return "://" not in os.fspath(source) and Path(source).is_dir()
+
+
+def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: ExitStack) -> list[Chosen]:
+    from tupli_mcap.storage.listing import find_recordings
+
+    items = list(dict.fromkeys(item.strip().lower() for item in text.split(",")))
+    named: dict[str, dict[str, tuple[float, list[int]]]] = {item: {} for item in items}  # by item and file
+    for path in find_recordings(folder):
+        try:
+            with Recording(path, cache_bytes=_CACHE_BYTES) as recording:
+                among = candidates(recording, filter)
+                for item in items:
+                    with contextlib.suppress(RecordingError):  # another one of the directory may have it
+                        positions = named_positions(recording, among, item, filter)
+                        named[item][str(path)] = float(recording.index["return"][positions[0]]), positions
+        except FilterError:
+            raise
+        except TupliError as err:
+            warnings.warn(f"{err}; it is left out", stacklevel=4)
+    chosen: dict[str, dict[int, None]] = {}
+    for item in items:
+        for file in _files_of(item, {file: total for file, (total, _) in named[item].items()}):
+            chosen.setdefault(file, {}).update(dict.fromkeys(named[item][file][1]))
+    if not chosen:
+        why = "" if filter is None else f" that {filter} is true of"
+        raise RecordingError(
+            f"{folder} has no episode {text!r}{why} in any recording; see tupli-mcap ls {folder}"
+        )
+    if len(chosen) > _MOST_OPEN:
+        raise RecordingError(
+            f"expected episodes of at most {_MOST_OPEN} recordings, found {len(chosen)} in {folder}; choose fewer"
+        )
+    return [
+        Chosen(stack.enter_context(Recording(file, cache_bytes=_CACHE_BYTES)), list(positions))
+        for file, positions in chosen.items()
+    ]
+
+
+def _files_of(item: str, returns: dict[str, float]) -> list[str]:
+    """Of the files that have what an item names, and its return in each, those that are meant."""
+    files = list(returns)
+    if not files or item not in ("best", "worst", "first", "last"):
+        return files
+    if item in ("first", "last"):
+        return [files[0 if item == "first" else -1]]
+    return [(max if item == "best" else min)(files, key=returns.__getitem__)]
