@@ -409,7 +409,7 @@ def test_everything_reads_as_if_it_was_stored_whole(
 ) -> None:
     stacked, whole = tmp_path / "stacked.mcap", tmp_path / "whole.mcap"
     chunk_size = 20_000 if frames == 4 else 1 << 20
-    monkeypatch.setattr("tupli_mcap.recording.columns.read._MANY_ROWS", 60)
+    monkeypatch.setattr("tupli_mcap.recording.columns.gather._MANY_ROWS", 60)
     record(placed(FrameStackObservation(Screen(shape), frames)), stacked, 110, chunk_size=chunk_size)
     record(Plain(placed(FrameStackObservation(Screen(shape), frames))), whole, 110, chunk_size=chunk_size)
     with Recording(stacked) as one, Recording(whole) as other:

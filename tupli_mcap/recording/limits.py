@@ -17,7 +17,6 @@ from tupli_mcap.mcap.records import BODY, MAX_CHUNK, MAX_ROWS_A_BYTE
 __all__ = [
     "EPISODE_TOPICS",
     "StepClaims",
-    "check_bools",
     "check_chunks",
     "check_episodes",
     "check_rows",
@@ -130,14 +129,6 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
         raise FormatError(
             f"{name}: the episode index gives a step to two episodes; recover it into a new file"
         )
-
-
-def check_bools(column: Any, what: str, name: str) -> None:
-    """Raises FormatError if a column is of bools and the file holds one that is neither 0 nor 1."""
-    if not isinstance(column, np.ndarray) or column.dtype != np.bool_:
-        return
-    if np.bitwise_or.reduce(column.view(np.uint8), axis=None) > 1:
-        raise FormatError(f"{name}: expected bools of 0 or 1 in {what!r}, found another byte")
 
 
 class StepClaims:

@@ -355,10 +355,15 @@ class Recording:
 
     def final_state(self, i: int) -> Any:
         """The final state of episode `i`, nested as the observation space; None if it is not known."""
-        (values,) = self._finals(self.index[i : i + 1])
-        if values is None:
+        rows = self.index[i : i + 1]
+        if rows["final_row"][0] < 0:
             return None
-        return self.layout.nest_state([values[leaf.name] for leaf in self.layout.state])
+        columns = self._reader.final_columns(self._channel("/final_state"), rows)
+        values = [
+            column[0] if isinstance(column, list) or leaf.is_scalar else column[0, ...]
+            for leaf, column in zip(self.layout.state, columns, strict=True)
+        ]
+        return self.layout.nest_state(values)
 
     def final_states(self, episodes: Sequence[int] | np.ndarray[Any, Any]) -> Any:
         """The final states of some episodes (positions or a mask) as columns, nested as the observation space is.
@@ -383,9 +388,6 @@ class Recording:
                 f"{self.name}: expected a channel {topic}, found {', '.join(self._topics) or 'none'}"
             )
         return self._topics[topic]
-
-    def _finals(self, rows: Any) -> list[dict[str, Any] | None]:
-        return self._reader.final_states(self._channel("/final_state"), rows)
 
     @property
     def _reader(self) -> ColumnReader:

@@ -1,7 +1,7 @@
 """Steps by number, and what is made of them: windows, transitions, the values around a step.
 
 steps                          what all of these read from; steps in memory
-recorded                       steps read out of recordings
+recorded, index, kept          steps read out of recordings; where they lie; those kept decoded
 items                          what windows, transitions and delta windows have in common
 windows, transitions, deltas   the three kinds of items
 order, draws, sumtree          which items come next: each once an epoch, or drawn by weight

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items.files import FileOfMany, OpenFiles
-from tupli_mcap.dataset.items.segments import Segments, SegmentsBuilder
 from tupli_mcap.errors import NotFoundError
+from tupli_mcap.mcap.source import Source, open_source
 from tupli_mcap.messages.shared_dtypes import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.chunk_store import ChunkCache, ChunkStore
+from tupli_mcap.recording.columns.gather import Files, image_names
+from tupli_mcap.recording.columns.runs import Segments, SegmentsBuilder
 from tupli_mcap.recording.columns.stored_steps import StoredSteps
 from tupli_mcap.schema import EpisodeHeader
 
-__all__ = ["ListedEpisodes", "StepIndex", "positions_of"]
+__all__ = ["ListedEpisodes", "OpenFiles", "StepIndex", "positions_of"]
 
 
 class ListedEpisodes(NamedTuple):
@@ -101,6 +106,10 @@ class StepIndex:
                 builder.add(recording, part)
         return builder.finish()
 
+    @property
+    def files(self) -> Files:
+        return Files(self.layouts, self.layout_of, self.stores)
+
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "layouts": [layout.to_metadata() for layout in self.layouts]}
 
@@ -128,21 +137,6 @@ class _Part(NamedTuple):
         """Which of the episodes have more steps than were listed."""
         found: Array = self.rows["length"] > self.lengths
         return found
-
-    def locate(self, channels: Array, first: Array, counts: Array) -> tuple[Array, Array, Array]:
-        """Chunks, places in them and numbers of rows, run after run; each run is of the channel of its place."""
-        runs, found = [], []
-        for channel in np.unique(channels):
-            chosen = np.flatnonzero(channels == channel)
-            located = self.store.locate(int(channel), first[chosen], counts[chosen])
-            runs.append(chosen[located.run])
-            found.append(np.stack([located.chunk, located.begin, located.steps]))
-        if not runs:
-            none = np.empty(0, np.int64)
-            return none, none, none
-        order = np.argsort(np.concatenate(runs), kind="stable")
-        chunks, begins, steps = np.concatenate(found, axis=1)[:, order]
-        return chunks, begins, steps
 
 
 class _Builder:
@@ -188,14 +182,12 @@ class _Builder:
         after = np.cumsum(lengths) - 1
         after[known] = -1 - np.arange(len(numbers))
         after[went_on] = lengths.sum() + np.arange(np.count_nonzero(went_on))
-        images = dict.fromkeys(leaf.path for layout in self._layouts for leaf in layout.images)
-        names = {leaf.path: leaf.name for leaf in self._layouts[0].state} if parts else {}
         return StepIndex(
             self._layouts,
             self._layout_of,
             [part.store for part in parts],
             self._steps(None),
-            {names[path]: self._steps(path) for path in images},
+            {name: self._steps(path) for name, path in image_names(self._layouts).items()},
             self._finals(),
             numbers,
             lengths,
@@ -209,11 +201,11 @@ class _Builder:
         builder = SegmentsBuilder()
         places = [(*self._places(part, path), part) for part in self._parts]
         for file, (channels, first, part) in enumerate(places):
-            builder.add(file, *part.locate(channels, first, part.lengths))
+            builder.add(file, *part.store.locate(channels, first, part.lengths))
         for file, (channels, first, part) in enumerate(places):
             on = part.went_on
             next_rows = first[on] + part.lengths[on]
-            builder.add(file, *part.locate(channels[on], next_rows, np.ones_like(next_rows)))
+            builder.add(file, *part.store.locate(channels[on], next_rows, np.ones_like(next_rows)))
         return builder.build()
 
     def _places(self, part: _Part, path: str | None) -> tuple[Array, Array]:
@@ -228,9 +220,75 @@ class _Builder:
         for file, part in enumerate(self._parts):
             rows = part.rows["final_row"][part.known].astype(np.int64)
             channels = np.full(len(rows), part.stored.final_channel or 0)
-            builder.add(file, *part.locate(channels, rows, np.ones_like(rows)))
+            builder.add(file, *part.store.locate(channels, rows, np.ones_like(rows)))
         return builder.build()
 
 
 def _joined(parts: list[Array], dtype: Any) -> Array:
     return np.concatenate([np.empty(0, dtype), *parts]).astype(dtype)
+
+
+# ---- files
+
+
+class OpenFiles:
+    """Opens files when they are read, and keeps those open that were read last. Safe from several threads.
+
+    A forked child opens them itself, as does a copy in another process.
+
+    Args:
+        limit: how many are open at a time; a few more while several threads read.
+    """
+
+    def __init__(self, limit: int = 64) -> None:
+        self._limit = limit
+        self._forget()
+
+    def _forget(self) -> None:
+        self._sources: OrderedDict[str, Source] = OrderedDict()
+        self._lock = threading.Lock()
+        self._process = os.getpid()
+
+    def source(self, where: str) -> Source:
+        """The open file of a path or a URL. It closes when nobody holds it any more."""
+        if self._process != os.getpid():  # the lock may be held by a thread that is not here
+            self._forget()
+        with self._lock:
+            found = self._sources.get(where)
+            if found is None:
+                found = self._sources[where] = open_source(where)
+                if len(self._sources) > self._limit:
+                    self._sources.popitem(last=False)  # closed when the last reader has let go of it
+            self._sources.move_to_end(where)
+            return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"limit": self._limit}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        OpenFiles.__init__(self, state["limit"])
+
+
+class FileOfMany:
+    """A `Source` that is open only while it is among those read last."""
+
+    def __init__(self, files: OpenFiles, where: str, size: int) -> None:
+        self._files = files
+        self.name = where
+        self.path: Path | None = None if "://" in where else Path(where)
+        self.size = size
+
+    def read(self, offset: int, length: int) -> bytes:
+        return self._files.source(self.name).read(offset, length)
+
+    def lend(self, offset: int, length: int) -> memoryview:
+        return self._files.source(self.name).lend(offset, length)
+
+    def view(self, offset: int, length: int) -> memoryview:
+        return self._files.source(self.name).view(offset, length)
+
+    def refresh(self) -> None:
+        self.size = self._files.source(self.name).size
+
+    def close(self) -> None:
+        """Nothing: the others decide."""

@@ -6,34 +6,24 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items.files import OpenFiles
-from tupli_mcap.dataset.items.gather import TIME, ConstantRows, Rows
-from tupli_mcap.dataset.items.index import ListedEpisodes, StepIndex
-from tupli_mcap.dataset.items.kinds import EPISODE, final_rows, image_rows, step_rows
+from tupli_mcap.dataset.items.index import ListedEpisodes, OpenFiles, StepIndex
+from tupli_mcap.dataset.items.kept import NumberedRows
 from tupli_mcap.dataset.items.steps import SamplingError, checked_fields, rows_of_runs
 from tupli_mcap.errors import FormatError, memory_for
-from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.chunk_store import ChunkCache
+from tupli_mcap.recording.columns.gather import EPISODE, Plan, final_rows, image_rows, put, step_rows
 
 __all__ = ["CACHE_BYTES", "THREADS", "RecordedSteps", "steps_of"]
 
 CACHE_BYTES = 512 << 20
 THREADS = min(4, os.cpu_count() or 1)
-_PLAIN = {"terminals": "terminal", "timeouts": "timeout", "times": TIME}
-
-
-class _Plan(NamedTuple):
-    """How to read some fields: the leaves to read of each kind of rows, then how the fields are made of them."""
-
-    sources: list[tuple[Rows, list[str]]]
-    fields: list[tuple[str, Callable[[list[Any]], Any], list[str]]]
 
 
 class RecordedSteps:
@@ -93,15 +83,14 @@ class RecordedSteps:
     def _prepare(self) -> None:
         index = self._index
         self.layout: StepLayout | None = index.layouts[0] if index.layouts else None
-        self._rows: list[Rows] = []
+        self._rows: list[NumberedRows] = []  # steps, images, final states
         if index.layouts:
-            self._rows = [
-                step_rows(index),
-                *(image_rows(index, name) for name in index.images),
-                final_rows(index),
-            ]
+            files = index.files
+            images = [NumberedRows(image_rows(files, name), at) for name, at in index.images.items()]
+            finals = NumberedRows(final_rows(files), index.finals)
+            self._rows = [NumberedRows(step_rows(files), index.steps), *images, finals]
         self._used: list[set[str]] = [set() for _ in self._rows]
-        self._plans: dict[tuple[str, ...], _Plan] = {}
+        self._plans: dict[tuple[str, ...], Plan] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         rest = ("layout", "_rows", "_used", "_plans")
@@ -138,8 +127,7 @@ class RecordedSteps:
         self.cache_bytes, self.threads = cache_bytes, threads
         self._cache.clear()
         for rows in self._rows:
-            if isinstance(rows, ConstantRows):
-                rows.hold(())
+            rows.hold(())
         self._share_budget()
 
     @property
@@ -158,9 +146,7 @@ class RecordedSteps:
             raise IndexError(f"expected steps from 0 to {n - 1}, found {wrong}")
         listed = rows if self._wanted is None else self._wanted[rows]
         return self._columns(
-            fields,
-            lambda source, names: source.read(names, listed, self.threads),
-            lambda: listed,
+            fields, lambda rows, names: rows.read(names, listed, self.threads), lambda: listed
         )
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
@@ -168,102 +154,70 @@ class RecordedSteps:
             return self.read(fields, rows_of_runs(starts, length))
         return self._columns(
             fields,
-            lambda source, names: source.read_runs(names, starts, length, self.threads),
+            lambda rows, names: rows.read_runs(names, starts, length, self.threads),
             lambda: rows_of_runs(starts, length),
         )
 
     def _columns(
         self,
         fields: Sequence[str],
-        read: Callable[[Rows, Sequence[str]], dict[str, Any]],
+        read: Callable[[NumberedRows, Sequence[str]], dict[str, Any]],
         listed: Callable[[], Array],
     ) -> dict[str, Any]:
         """The columns of some listed steps, whose leaves `read` gives."""
-        with memory_for(lambda: f"reading {', '.join(fields)} of {len(listed())} steps"):
-            return self._planned(fields, read, listed)
-
-    def _planned(
-        self,
-        fields: Sequence[str],
-        read: Callable[[Rows, Sequence[str]], dict[str, Any]],
-        listed: Callable[[], Array],
-    ) -> dict[str, Any]:
-        plan = self._plans.get(tuple(fields)) or self._plan(fields)
-        found: dict[str, Any] = {}
-        for source, names in plan.sources:
-            found.update(read(source, names))
-        columns: dict[str, Any] = {}
-        for field, nest, names in plan.fields:
-            if field == "next_states":
-                columns[field] = self._next_states(nest, names, listed())
-            else:
-                columns[field] = nest([found[name] for name in names])
-        return columns
-
-    def _plan(self, fields: Sequence[str]) -> _Plan:
-        """What has to be read for some fields; from now on, the budget is shared with it."""
         names = checked_fields(fields)
-        layout = self.layout
-        plan = _Plan([], [])
-        if layout is None:
-            plan.fields.extend((field, lambda _: np.empty(0), []) for field in names)
-            return plan
-        nests = {"actions": layout.nest_action, "rewards": layout.nest_reward, "times": _times}
-        for field in names:
-            leaves = field_leaves(field, layout)
-            own = [_PLAIN[field]] if leaves is None else [leaf.name for leaf in leaves]
-            nest = nests.get(field, _only if leaves is None else layout.nest_state)
-            plan.fields.append((field, nest, own))
-        needed = [name for field, _, own in plan.fields if field != "next_states" for name in own]
-        for source in self._rows[:-1]:
-            chosen = [name for name in needed if name in source.columns]
-            if chosen:
-                plan.sources.append((source, chosen))
-        self._use(plan)
+        if self.layout is None:
+            return {field: np.empty(0) for field in names}
+        with memory_for(lambda: f"reading {', '.join(fields)} of {len(listed())} steps"):
+            plan = self._plans.get(tuple(names)) or self._plan(self.layout, names)
+            found: dict[str, Any] = {}
+            for i, leaves in plan.sources:
+                found.update(read(self._rows[i], leaves))
+            columns = plan.nest(found)
+            if "next_states" in names:
+                columns["next_states"] = self._next_states(self.layout, listed())
+        return {field: columns[field] for field in names}
+
+    def _plan(self, layout: StepLayout, fields: Sequence[str]) -> Plan:
+        """What has to be read for some fields; from now on, the budget is shared with it."""
+        plan = Plan.of([field for field in fields if field != "next_states"], layout, self._rows[:-1])
+        for i, names in plan.sources:
+            self._used[i].update(names)
+        if "next_states" in fields:
+            for i, names in Plan.of(["states"], layout, self._rows[:-1]).sources:
+                self._used[i].update(names)
+            self._used[-1].update(leaf.name for leaf in layout.state)
+            self._used[-1].add(EPISODE)
+        self._share_budget()
         self._plans[tuple(fields)] = plan
         return plan
 
-    def _use(self, plan: _Plan) -> None:
-        wanted = list(plan.sources)
-        for field, _, names in plan.fields:
-            if field == "next_states":
-                wanted += [(source, [n for n in names if n in source.columns]) for source in self._rows[:-1]]
-                wanted.append((self._rows[-1], [*names, EPISODE]))
-        for source, names in wanted:
-            self._used[self._rows.index(source)].update(names)
-        self._share_budget()
-
     def _share_budget(self) -> None:
         """Decides which columns are kept decoded, out of those that were asked for so far."""
-        sizes = {
-            i: rows.nbytes(self._used[i])
-            for i, rows in enumerate(self._rows)
-            if isinstance(rows, ConstantRows)
-        }
+        sizes = {i: rows.nbytes(self._used[i]) for i, rows in enumerate(self._rows)}
         if sum(sizes.values()) > self.cache_bytes:
             sizes = {i: size for i, size in sizes.items() if i in (0, len(self._rows) - 1)}  # without images
             if sum(sizes.values()) > self.cache_bytes // 2:
                 sizes = {}
         for i, rows in enumerate(self._rows):
-            if isinstance(rows, ConstantRows):
-                rows.hold(self._used[i] if i in sizes else ())
+            rows.hold(self._used[i] if i in sizes else ())
         self._cache.budget = self.cache_bytes - sum(sizes.values())
 
-    def _next_states(self, nest: Callable[[list[Any]], Any], names: Sequence[str], listed: Array) -> Any:
+    def _next_states(self, layout: StepLayout, listed: Array) -> Any:
         index = self._index
         episodes = np.searchsorted(self._ends, listed, side="right")
         after = np.where(listed == self._ends[episodes] - 1, index.after[episodes], listed + 1)
         at_end = np.flatnonzero(after < 0)
         rows = np.where(after < 0, listed, after)
+        plan = Plan.of(["states"], layout, self._rows[:-1])
         found: dict[str, Any] = {}
-        for source in self._rows[:-1]:
-            chosen = [name for name in names if name in source.columns]
-            found.update(source.read(chosen, rows, self.threads) if chosen else {})
+        for i, names in plan.sources:
+            found.update(self._rows[i].read(names, rows, self.threads))
         if len(at_end):
-            finals = self._finals(names, -1 - after[at_end])
-            for name in names:
-                _put(found[name], at_end, finals[name])
-        return nest([found[name] for name in names])
+            finals = self._finals(list(found), -1 - after[at_end])
+            for name, column in found.items():
+                put(column, at_end, finals[name])
+        return plan.nest(found)["states"]
 
     def _finals(self, names: Sequence[str], rows: Array) -> dict[str, Any]:
         found = self._rows[-1].read([*names, EPISODE], rows, self.threads)
@@ -276,25 +230,6 @@ class RecordedSteps:
                 "verify the recordings"
             )
         return found
-
-
-def _put(column: Any, places: Array, values: Any) -> None:
-    if isinstance(column, list):
-        for place, value in zip(places.tolist(), values, strict=True):
-            column[place] = value
-    else:
-        column[places] = values
-
-
-def _only(values: list[Any]) -> Any:
-    return values[0]
-
-
-def _times(values: list[Any]) -> Array:
-    signed: Array = values[0].view(np.int64)
-    if (signed < 0).any():
-        raise FormatError(f"expected times of steps below 2**63 ns, found {values[0].max()}")
-    return signed
 
 
 def steps_of(

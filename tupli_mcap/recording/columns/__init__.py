@@ -1,8 +1,9 @@
 """From rows to columns.
 
 chunk_store    decompresses chunks, and keeps some
-runs           rows a to b of a chunk, for rows in any order
-read           whole columns
-stored_steps   a handle to a recording's step chunks that can be pickled
+runs           which rows of which chunks go where
+gather         columns out of chunks, of one file or of many: what everybody reads by
+read           columns of one recording
+stored_steps   where the steps of a recording lie, apart from the open file
 threads        a small pool
 """

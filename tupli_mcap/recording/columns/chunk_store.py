@@ -27,7 +27,7 @@ from tupli_mcap.mcap.records import BODY, MAX_CHUNK, iter_records
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.limits import StepClaims
 
-__all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Located", "Span"]
+__all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Span"]
 
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
 _CHUNK_HEAD = struct.Struct(
@@ -60,15 +60,6 @@ class Span(NamedTuple):
     chunk: int
     begin: int
     end: int
-
-
-class Located(NamedTuple):
-    """Where runs of rows lie, in arrays: `steps[i]` rows of run `run[i]` are in `chunk[i]`, from row `begin[i]` on."""
-
-    run: np.ndarray[Any, Any]
-    chunk: np.ndarray[Any, Any]
-    begin: np.ndarray[Any, Any]
-    steps: np.ndarray[Any, Any]
 
 
 class KeptChunk:
@@ -256,13 +247,32 @@ class ChunkStore:
         self._checked = np.zeros(len(self.table), np.bool_)
         self._held = np.zeros(len(self.table), np.bool_)
 
-    def locate(self, channel: int, first: np.ndarray[Any, Any], counts: np.ndarray[Any, Any]) -> Located:
-        """Where the runs `first[i]:first[i] + counts[i]` (int64) of a channel's rows lie, in their order."""
-        taken = np.flatnonzero(counts > 0)
-        first, counts = first[taken], counts[taken]
+    def locate(self, channels: Array, first: Array, counts: Array) -> tuple[Array, Array, Array]:
+        """Where the runs `first[i]:first[i] + counts[i]` of rows of `channels[i]` (int64) lie, in their order.
+
+        Returns:
+            Chunks, the first row in each, and how many rows (int64).
+
+        Raises:
+            FormatError: there are no such rows.
+        """
+        runs, found = [], []
+        for channel in np.unique(channels).tolist():
+            chosen = np.flatnonzero((channels == channel) & (counts > 0))
+            run, *places = self._locate(channel, first[chosen], counts[chosen])
+            runs.append(chosen[run])
+            found.append(np.stack(places))
+        if len(found) != 1:
+            order = np.argsort(np.concatenate([np.empty(0, np.int64), *runs]), kind="stable")
+            found = [np.concatenate([np.empty((3, 0), np.int64), *found], axis=1)[:, order]]
+        chunks, begins, steps = found[0]
+        return chunks, begins, steps
+
+    def _locate(self, channel: int, first: Array, counts: Array) -> tuple[Array, Array, Array, Array]:
+        """The same for one channel and runs that are not empty; before it, which run each is of."""
         if not len(first):
             none = np.empty(0, np.int64)
-            return Located(none, none, none, none)
+            return none, none, none, none
         last = first + counts
         if first.min() < 0 or last.max() > self.count(channel):
             raise FormatError(
@@ -276,7 +286,7 @@ class ChunkStore:
         at = low[run] + np.arange(len(run)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         start = np.maximum(first[run], firsts[at])
         end = np.minimum(last[run], firsts[at] + self.table["rows"][chosen[at]])
-        return Located(taken[run], chosen[at], start - firsts[at], end - start)
+        return run, chosen[at], start - firsts[at], end - start
 
     def load(self, i: int, *, keep: bool = True) -> Any:
         """The message records of chunk `i`; cached unless `keep` is False."""

@@ -1,11 +1,9 @@
-"""Which rows of which chunks go where: runs of rows, cut at the chunks, and copied a chunk at a time."""
+"""Which rows of which chunks go where: runs of a channel's rows, or any rows of many files, cut at the chunks."""
 
 from __future__ import annotations
 
-import math
-import sys
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,34 +11,67 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
-__all__ = ["Pieces", "Runs", "final_runs", "items", "items_dtype", "put", "runs_of"]
+__all__ = ["Part", "Runs", "Segments", "SegmentsBuilder", "final_runs", "parts_of", "runs_of"]
 
-_LITTLE = sys.byteorder == "little"  # as the rows are
 _FEW = 4  # so many pieces are copied one by one
+Numbers = Array | Sequence[int]
+
+
+class Part(NamedTuple):
+    """Rows of one chunk: `steps[i]` of them from row `begin[i]` on, which go to `out[i]` on. int64, or lists where few.
+
+    Without `steps`, one row each. `file` is the number of the file among several.
+    """
+
+    file: int
+    chunk: int
+    begin: Numbers
+    steps: Numbers | None
+    out: Numbers
+
+    def indexes(self) -> tuple[slice | Array, slice | Array]:
+        """The rows of the chunk, and where they go."""
+        begin, out = np.asarray(self.begin), np.asarray(self.out)
+        if self.steps is None:
+            return begin, out
+        steps = np.asarray(self.steps)
+        return _indexes(begin, steps), _indexes(out, steps)
+
+    def copy(self, rows: Array, targets: Sequence[tuple[str, Array]]) -> None:
+        """Copies fields of the chunk's rows to columns."""
+        if self.steps is not None and len(self.begin) <= _FEW:
+            for begin, steps, out in zip(self.begin, self.steps, self.out, strict=True):
+                for name, target in targets:
+                    target[out : out + steps] = rows[name][begin : begin + steps]
+            return
+        source, places = self.indexes()
+        if isinstance(source, slice) or len(targets) == 1:
+            for name, target in targets:
+                target[places] = rows[name][source]
+            return
+        picked = rows.take(source)  # whole rows: one walk through the chunk instead of one a field
+        for name, target in targets:
+            target[places] = picked[name]
+
+
+def _indexes(begin: Array, steps: Array) -> slice | Array:
+    """The rows of some pieces, one after the other."""
+    if (begin[1:] == begin[:-1] + steps[:-1]).all():
+        return slice(int(begin[0]), int(begin[-1] + steps[-1]))
+    before = np.cumsum(steps) - steps
+    found: Array = np.repeat(begin - before, steps) + np.arange(int(steps.sum()))
+    return found
+
+
+# ---- of one file
 
 
 class Runs(NamedTuple):
     """Consecutive rows of a channel each, which go to the columns one run after the other; int64 arrays, or lists."""
 
-    channels: Array | Sequence[int]
-    first: Array | Sequence[int]
-    steps: Array | Sequence[int]
-
-    @property
-    def few(self) -> bool:
-        """Whether arrays would take longer than these runs are worth: a window, an episode."""
-        return len(self.first) <= _FEW
-
-    def each(self) -> Iterator[tuple[int, int, int, int]]:
-        """Channel, first row, number of rows, and where they go, of one run after the other."""
-        place = 0
-        for channel, first, steps in zip(*map(_listed, self), strict=True):
-            yield channel, first, steps, place
-            place += steps
-
-
-def _listed(part: Array | Sequence[int]) -> Sequence[int]:
-    return part.tolist() if isinstance(part, np.ndarray) else part
+    channels: Numbers
+    first: Numbers
+    steps: Numbers
 
 
 def runs_of(episodes: Array, channels: Sequence[int]) -> Runs:
@@ -73,119 +104,120 @@ def _joined(channels: Array, first: Array, steps: Array) -> Runs:
     return Runs(channels[starts], first[starts], np.add.reduceat(steps, starts))
 
 
-class Pieces(NamedTuple):
-    """Parts of a chunk: `steps[i]` rows from `begin[i]` on, which go to `out[i]` on. int64, or lists where few."""
+def parts_of(runs: Runs, store: ChunkStore) -> list[Part]:
+    """The parts of some runs, one for each chunk.
 
-    chunk: int
-    begin: Array | Sequence[int]
-    steps: Array | Sequence[int]
-    out: Array | Sequence[int]
-
-    @classmethod
-    def of(cls, runs: Runs, store: ChunkStore) -> list[Pieces]:
-        """The pieces of some runs, one for each chunk.
-
-        Raises:
-            FormatError: there are no such rows.
-        """
-        if runs.few:
-            return _of_few(runs, store)
-        channels, first, steps = map(np.asarray, runs)
-        starts, found = np.cumsum(steps) - steps, []
-        for channel in np.unique(channels).tolist():
-            chosen = np.flatnonzero(channels == channel)
-            located = store.locate(channel, first[chosen], steps[chosen])
-            if not len(located.chunk):
-                continue
-            # Within its run, a piece comes after those before it.
-            before = np.cumsum(located.steps) - located.steps
-            new = np.diff(located.run, prepend=-1) != 0
-            out = starts[chosen[located.run]] + before - before[np.flatnonzero(new)][np.cumsum(new) - 1]
-            found += _by_chunk(located.chunk, located.begin, located.steps, out)
-        return found
-
-    def indexes(self) -> tuple[slice | Array, slice | Array]:
-        """The rows of the chunk, and where they go."""
-        begins, steps, outs = (np.asarray(part) for part in (self.begin, self.steps, self.out))
-        return _indexes(begins, steps), _indexes(outs, steps)
-
-    def copy(self, rows: Array, targets: Sequence[tuple[str, Array]]) -> None:
-        """Copies fields of the chunk's rows to columns of the same shape."""
-        if len(self.begin) <= _FEW:
-            for begin, steps, out in zip(self.begin, self.steps, self.out, strict=True):
-                for name, target in targets:
-                    target[out : out + steps] = rows[name][begin : begin + steps]
-            return
-        source, places = self.indexes()
-        if isinstance(source, slice) or len(targets) == 1:
-            for name, target in targets:
-                target[places] = rows[name][source]
-            return
-        picked = rows.take(source)  # whole rows: one walk through the chunk instead of one a field
-        for name, target in targets:
-            target[places] = picked[name]
+    Raises:
+        FormatError: there are no such rows.
+    """
+    if len(runs.first) <= _FEW:  # a window, an episode: arrays would take longer than it is worth
+        return _of_few(runs, store)
+    channels, first, steps = map(np.asarray, runs)
+    chunks, begin, counts = store.locate(channels, first, steps)
+    return _by_chunk(np.zeros_like(chunks), chunks, begin, counts, np.cumsum(counts) - counts)
 
 
-def _of_few(runs: Runs, store: ChunkStore) -> list[Pieces]:
+def _of_few(runs: Runs, store: ChunkStore) -> list[Part]:
     found: dict[int, tuple[list[int], list[int], list[int]]] = {}
-    for channel, first, steps, out in runs.each():
+    out = 0
+    for channel, first, steps in zip(*map(_listed, runs), strict=True):
         for chunk, begin, end in store.spans(channel, first, steps):
             parts = found.setdefault(chunk, ([], [], []))
             for part, value in zip(parts, (begin, end - begin, out), strict=True):
                 part.append(value)
             out += end - begin
-    return [Pieces(chunk, *parts) for chunk, parts in found.items()]
+    return [Part(0, chunk, *parts) for chunk, parts in found.items()]
 
 
-def _by_chunk(chunks: Array, begin: Array, steps: Array, out: Array) -> list[Pieces]:
-    order = np.lexsort((begin, chunks))
-    chunks, begin, steps, out = chunks[order], begin[order], steps[order], out[order]
-    firsts = np.flatnonzero(np.diff(chunks, prepend=-1))
+def _listed(part: Numbers) -> Sequence[int]:
+    return part.tolist() if isinstance(part, np.ndarray) else part
+
+
+def _by_chunk(files: Array, chunks: Array, begin: Array, steps: Array, out: Array) -> list[Part]:
+    order = np.lexsort((begin, chunks, files))
+    files, chunks, begin, steps, out = (each[order] for each in (files, chunks, begin, steps, out))
+    firsts = np.flatnonzero((np.diff(chunks, prepend=-1) != 0) | (np.diff(files, prepend=-1) != 0))
     ends = np.append(firsts[1:], len(chunks))
     return [
-        Pieces(int(chunks[a]), begin[a:b], steps[a:b], out[a:b])
+        Part(int(files[a]), int(chunks[a]), begin[a:b], steps[a:b], out[a:b])
         for a, b in zip(firsts.tolist(), ends.tolist(), strict=True)
     ]
 
 
-def _indexes(begin: Array, steps: Array) -> slice | Array:
-    """The rows of some pieces, one after the other."""
-    if (begin[1:] == begin[:-1] + steps[:-1]).all():
-        return slice(int(begin[0]), int(begin[-1] + steps[-1]))
-    before = np.cumsum(steps) - steps
-    found: Array = np.repeat(begin - before, steps) + np.arange(int(steps.sum()))
-    return found
+# ---- of several files
 
 
-def put(column: Any, places: slice | Array, values: Any) -> None:
-    """Sets rows of a column, which is a list where values are of variable size."""
-    if isinstance(places, slice) or isinstance(column, np.ndarray):
-        column[places] = values
-        return
-    for place, value in zip(places.tolist(), values, strict=True):
-        column[place] = value
+class Segments(NamedTuple):
+    """Rows 0 to n - 1 that lie in chunks of several recordings.
+
+    Segment i holds the rows from `starts[i]` (int64, ascending, the next one ends it) on, which are those of chunk
+    `units[i]` from `begins[i]` on. A unit is a chunk of a file: `file_of` and `chunk_of` say which.
+    """
+
+    total: int
+    starts: Array
+    units: Array
+    begins: Array
+    file_of: Array
+    chunk_of: Array
+
+    def of(self, rows: Array) -> Array:
+        """The segments that rows lie in."""
+        found: Array = np.searchsorted(self.starts, rows, side="right") - 1
+        return found
+
+    def parts(self, rows: Array | slice) -> list[Part]:
+        """The parts of rows, in any order, one for each chunk; a slice is of rows that there are, and not empty."""
+        if isinstance(rows, slice):
+            return self._between(rows.start, rows.stop)
+        if not len(rows):
+            return []
+        at = self.of(rows)
+        places, units = self.begins[at] + (rows - self.starts[at]), self.units[at]
+        return [
+            Part(int(self.file_of[unit]), int(self.chunk_of[unit]), places[out], None, out)
+            for unit, out in _by_value(units)
+        ]
+
+    def _between(self, first: int, stop: int) -> list[Part]:
+        low, last = self.of(np.array([first, stop - 1])).tolist()
+        high = last + 1
+        starts = np.maximum(self.starts[low:high], first)
+        ends = np.append(self.starts[low + 1 : high], stop)
+        begins, units = self.begins[low:high] + (starts - self.starts[low:high]), self.units[low:high]
+        return _by_chunk(self.file_of[units], self.chunk_of[units], begins, ends - starts, starts - first)
 
 
-def items_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The dtype of a row with each field of several numbers as one item of bytes: NumPy copies it twice as fast."""
-    fields = [(name, *found[:2]) for name, found in (dtype.fields or {}).items()]
-    spec: Any = {
-        "names": [name for name, _, _ in fields],
-        "formats": [_item_format(field) for _, field, _ in fields],
-        "offsets": [offset for _, _, offset in fields],
-        "itemsize": dtype.itemsize,
-    }
-    made: np.dtype[Any] = np.dtype(spec)
-    return made
+def _by_value(values: Array) -> list[tuple[int, Array]]:
+    """The different values, ascending, and where each of them is."""
+    if (values == values[0]).all():
+        return [(int(values[0]), np.arange(len(values)))]
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
+    cuts = np.flatnonzero(ordered[1:] != ordered[:-1]) + 1
+    firsts = ordered[np.concatenate([[0], cuts])].tolist()
+    return list(zip(firsts, np.split(order, cuts), strict=True))
 
 
-def _item_format(field: np.dtype[Any]) -> Any:
-    return np.dtype(f"V{field.itemsize}") if field.shape and _LITTLE else field
+class SegmentsBuilder:
+    """Collects the segments of one file after the other."""
 
+    def __init__(self) -> None:
+        self._total = 0
+        self._parts: list[tuple[Array, Array, Array, Array]] = []  # starts, file, chunk, begin
 
-def items(column: Array) -> Array:
-    """A column of shape (rows, ...) as `items_dtype` has it: one item a row. The memory is the same."""
-    if column.ndim == 1 or not _LITTLE:
-        return column
-    size = math.prod(column.shape[1:])
-    return column.reshape(len(column), size).view(f"V{size * column.itemsize}")[:, 0]
+    def add(self, file: int, chunks: Array, begins: Array, steps: Array) -> None:
+        """Appends pieces of a file's chunks, each of `steps` rows, in their order."""
+        starts = self._total + np.cumsum(steps) - steps
+        self._parts.append((starts, np.full(len(chunks), file), chunks, begins))
+        self._total += int(steps.sum())
+
+    def build(self) -> Segments:
+        parts = [np.concatenate([np.empty(0, np.int64), *part]) for part in zip(*self._parts, strict=True)]
+        starts, files, chunks, begins = parts or [np.empty(0, np.int64)] * 4
+        # a piece that continues the one before, in the same chunk, is of its segment
+        new = (np.diff(files, prepend=-1) != 0) | (np.diff(chunks, prepend=-1) != 0)
+        new[1:] |= np.diff(begins) != np.diff(starts)
+        starts, files, chunks, begins = (each[new] for each in (starts, files, chunks, begins))
+        kinds, units = np.unique(files << 32 | chunks, return_inverse=True)
+        return Segments(self._total, starts, units.reshape(-1), begins, kinds >> 32, kinds & 0xFFFFFFFF)

@@ -1,0 +1,116 @@
+"""Rows by number, in any order: out of decoded columns where all of them fit into memory, else chunk by chunk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.items.steps import following, pick, pick_runs, rows_of_runs
+from tupli_mcap.recording.columns.gather import Column, Rows
+from tupli_mcap.recording.columns.runs import Part, Segments
+from tupli_mcap.recording.columns.threads import do_all
+
+__all__ = ["NumberedRows"]
+
+# Threads that decode small chunks take the interpreter from each other at every one: for so few, one thread is quicker.
+_FEW_CHUNKS = 128
+_LARGE_CHUNK = 1 << 20  # bytes
+
+
+class NumberedRows:
+    """The rows of one kind, by number.
+
+    A row is copied from decoded columns where `hold` says so (they fill as chunks are read), else from the chunks that
+    the stores' cache keeps. Values of variable size are decoded each time they are read, so that nobody shares them.
+    Safe from several threads: two may read the same chunk, with the same result.
+    """
+
+    def __init__(self, rows: Rows, segments: Segments) -> None:
+        self._rows, self._segments = rows, segments
+        self._held: _HeldColumns | None = None
+
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        return self._rows.columns
+
+    def hold(self, names: Iterable[str]) -> None:
+        """Keeps these columns decoded, in `nbytes` of memory as far as they have been read; none: not any more."""
+        chosen = set(names) if self._rows.constant else set()
+        if not chosen:
+            self._held = None
+        elif self._held is None or self._held.columns.keys() != chosen:
+            total = self._segments.total
+            self._held = _HeldColumns(
+                self._segments, {name: self.columns[name].empty(total) for name in chosen}
+            )
+
+    def nbytes(self, names: Iterable[str]) -> int:
+        """Bytes of some columns of all rows, decoded; 0 where they cannot be kept so."""
+        return self._segments.total * sum(self.columns[name].nbytes for name in names if self._rows.constant)
+
+    def read(self, names: Sequence[str], rows: Array, threads: int) -> dict[str, Any]:
+        """Columns of the rows (int64, any order), by name."""
+        where = following(rows, self._segments.total)
+        held = self._held
+        if held is None or not held.columns.keys() >= set(names):
+            return self._rows.read(names, self._segments.parts(where), len(rows), threads)
+        if not held.whole:
+            self._fill(held, rows, threads)
+        return {name: pick(held.columns[name], where) for name in names}
+
+    def read_runs(self, names: Sequence[str], starts: Array, length: int, threads: int) -> dict[str, Any]:
+        """Columns of the rows `start` to `start + length - 1` for each of `starts`, one run after the other."""
+        held = self._held
+        if held is None or not held.columns.keys() >= set(names):
+            return self.read(names, rows_of_runs(starts, length), threads)
+        if not held.whole:
+            self._fill(held, rows_of_runs(starts, length), threads)
+        return {name: pick_runs(held.columns[name], starts, length) for name in names}
+
+    def _fill(self, held: _HeldColumns, rows: Array, threads: int) -> None:
+        units = held.missing(rows)
+        parts = [held.part(unit) for unit in units]
+        if len(parts) <= _FEW_CHUNKS and self._rows.bytes_of(parts) < len(parts) * _LARGE_CHUNK:
+            threads = 1
+        tasks = self._rows.tasks(held.columns, parts, keep=False)
+
+        def fill(unit: int, part: Part, task: Callable[[], None]) -> None:
+            task()
+            self._rows.check(held.columns, [part], whole=False)
+            held.there[unit] = True  # last: another thread may be looking
+
+        do_all([partial(fill, *each) for each in zip(units, parts, tasks, strict=True)], threads)
+        if units:
+            held.whole = bool(held.there.all())
+
+
+class _HeldColumns:
+    """Decoded columns of all rows. `there` says which units are in them, `whole` that all are."""
+
+    def __init__(self, segments: Segments, columns: dict[str, Array]) -> None:
+        self.columns = columns
+        self.there = np.zeros(len(segments.chunk_of), np.bool_)
+        self.whole = not any(column.size for column in columns.values())
+        self._segments = segments
+        self._order = np.argsort(segments.units, kind="stable")  # by unit
+        counts = np.bincount(segments.units, minlength=len(self.there))
+        self._ends = np.concatenate([[0], np.cumsum(counts)])
+
+    def missing(self, rows: Array) -> list[int]:
+        """The units that rows lie in and that are not there."""
+        wanted = np.zeros(len(self.there), np.bool_)
+        wanted[self._segments.units[self._segments.of(rows)]] = True
+        return np.flatnonzero(wanted & ~self.there).tolist()
+
+    def part(self, unit: int) -> Part:
+        """The rows of a unit, and where they belong."""
+        chosen = self._order[self._ends[unit] : self._ends[unit + 1]]
+        begins, starts = self._segments.begins[chosen], self._segments.starts[chosen]
+        steps = np.append(self._segments.starts[1:], self._segments.total)[chosen] - starts
+        return Part(
+            int(self._segments.file_of[unit]), int(self._segments.chunk_of[unit]), begins, steps, starts
+        )

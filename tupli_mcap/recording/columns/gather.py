@@ -1,0 +1,343 @@
+"""Columns out of chunks: of one file or of many, of one layout or of several.
+
+Rows are of a kind: steps, the images of a leaf, final states. A `RowFormat` says how those of the files of one layout
+become columns, a `Rows` reads a kind of all files, and a `Plan` says which kinds the fields of a step are made of.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.batches import LOG_TIME, BatchDecoder, Decode
+from tupli_mcap.messages.shared_dtypes import common_dtype, field_leaves
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.columns.runs import Part
+from tupli_mcap.recording.columns.threads import do_all
+from tupli_mcap.spaces.leaves import Leaf
+
+__all__ = [
+    "EPISODE",
+    "Column",
+    "Files",
+    "Plan",
+    "Rows",
+    "final_rows",
+    "image_names",
+    "image_rows",
+    "put",
+    "step_rows",
+]
+
+EPISODE = "episode"  # the column of the number that a final state says its episode has
+_BOOL, _U32, _U64 = np.dtype(np.bool_), np.dtype(np.uint32), np.dtype(np.uint64)
+_PLAIN = {"terminals": "terminal", "timeouts": "timeout", "times": LOG_TIME}
+_LITTLE = sys.byteorder == "little"  # as the rows are
+_MANY_ROWS = 1000  # fewer are copied before they have been looked at in another way
+
+
+class Column(NamedTuple):
+    """What one row of a column is: an array or a number; a value of variable size where `dtype` is None."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any] | None
+
+    def empty(self, rows: int) -> Any:
+        return [None] * rows if self.dtype is None else np.empty((rows, *self.shape), self.dtype)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of one row in memory."""
+        return 0 if self.dtype is None else int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
+
+
+class RowFormat:
+    """How the rows of one kind become columns, in files of one layout.
+
+    Args:
+        columns: what the columns hold, in a dtype for the values of all layouts.
+        dtype: of a Message record; None for rows of variable size.
+        decode: gives columns of the messages whose records begin and end at places of a buffer, for variable size.
+        fields: the name that each column has in these rows, where it is another one.
+        turned: the image leaf whose frames lie first in these rows, and last in its values; None for all others.
+    """
+
+    def __init__(
+        self,
+        columns: Mapping[str, Column],
+        dtype: np.dtype[Any] | None,
+        decode: Decode | None,
+        fields: Mapping[str, str],
+        turned: Leaf | None = None,
+    ) -> None:
+        self._dtype, self._decode, self._turned = dtype, decode, turned
+        self._fields = {name: fields.get(name, name) for name in columns}
+        self._items: np.dtype[Any] | None = None
+        if dtype is not None and turned is None:
+            stored: Mapping[str, Any] = dtype.fields or {}  # there is none for an array of no elements
+            same = [
+                column.dtype == stored[self._fields[name]][0].base
+                for name, column in columns.items()
+                if self._fields[name] in stored
+            ]
+            self._items = _items_dtype(dtype) if all(same) else None
+
+    def reader(self, columns: Mapping[str, Any]) -> Callable[[ChunkStore, Part, bool], None]:
+        """What reads a chunk, and copies rows of it into columns."""
+        if self._decode is not None:
+            targets = {self._fields[name]: column for name, column in columns.items()}
+            return partial(self._read_decoded, self._decode, targets)
+        pairs = [(self._fields[name], column) for name, column in columns.items()]
+        if self._items is None or len(pairs[0][1]) < _MANY_ROWS:
+            return partial(self._read, self._dtype, pairs)
+        return partial(self._read, self._items, [(field, _as_items(column)) for field, column in pairs])
+
+    def _read(
+        self, dtype: Any, targets: Sequence[tuple[str, Array]], store: ChunkStore, part: Part, keep: bool
+    ) -> None:
+        rows: Any = store.rows(part.chunk, dtype, keep=keep)
+        if self._turned is not None:
+            rows = {field: self._turned.as_values(rows[field]) for field, _ in targets}
+        part.copy(rows, targets)
+
+    def _read_decoded(
+        self, decode: Decode, targets: Mapping[str, Any], store: ChunkStore, part: Part, keep: bool
+    ) -> None:
+        data, records = store.records(part.chunk, keep=keep)
+        rows, places = part.indexes()
+        for field, values in decode(data, records[rows], targets).items():
+            put(targets[field], places, values)
+
+
+class Files(NamedTuple):
+    """Recordings: their layouts, which of these each file has, and the chunks of each file."""
+
+    layouts: Sequence[StepLayout]
+    layout_of: Sequence[int]
+    stores: Sequence[ChunkStore]
+
+
+class Rows:
+    """The rows of one kind in some files, and the columns that are made of them."""
+
+    def __init__(self, files: Files, columns: Mapping[str, Column], formats: Sequence[RowFormat]) -> None:
+        self.columns = columns
+        self._stores = files.stores
+        self._formats = [formats[i] for i in files.layout_of]
+
+    @property
+    def constant(self) -> bool:
+        """Whether no value is of variable size."""
+        return all(column.dtype is not None for column in self.columns.values())
+
+    def tasks(
+        self, columns: Mapping[str, Any], parts: Sequence[Part], keep: bool = True
+    ) -> list[Callable[[], None]]:
+        """What fills columns, by name: a task for each part. `keep` leaves the chunks in the stores' cache."""
+        filled = {name: column for name, column in columns.items() if isinstance(column, list) or column.size}
+        if not filled:
+            return []
+        readers = {of_file: of_file.reader(filled) for of_file in set(self._formats)}
+        return [
+            partial(readers[self._formats[part.file]], self._stores[part.file], part, keep) for part in parts
+        ]
+
+    def check(self, columns: Mapping[str, Any], parts: Sequence[Part], *, whole: bool) -> None:
+        """Raises FormatError if bools in parts of columns are neither 0 nor 1 in their files.
+
+        `whole`: the columns have nothing but these parts.
+        """
+        for name, column in columns.items():
+            if self.columns[name].dtype == _BOOL and not (whole and _are_bools(column)):
+                for part in parts:
+                    if not _are_bools(column[part.indexes()[1]]):
+                        raise FormatError(
+                            f"{self._stores[part.file].name}: expected bools of 0 or 1 in {name!r}, found another byte"
+                        )
+
+    def read(self, names: Sequence[str], parts: Sequence[Part], total: int, threads: int) -> dict[str, Any]:
+        """Columns of `total` rows, by name."""
+        columns = {name: self.columns[name].empty(total) for name in names}
+        do_all(self.tasks(columns, parts), threads)
+        self.check(columns, parts, whole=True)
+        return columns
+
+    def bytes_of(self, parts: Sequence[Part]) -> int:
+        """Bytes of the chunks once they are decompressed."""
+        return sum(int(self._stores[part.file].table["uncompressed"][part.chunk]) for part in parts)
+
+
+# ---- kinds
+
+
+def step_rows(files: Files) -> Rows:
+    """The leaves of steps that are no images, "terminal", "timeout" and `LOG_TIME`."""
+    apart = image_names(files.layouts)
+    leaves = [leaf for leaf in files.layouts[0].leaves if leaf.name not in apart]
+    plain = {"terminal": Column((), _BOOL), "timeout": Column((), _BOOL), LOG_TIME: Column((), _U64)}
+    return _rows(
+        files, leaves, plain, lambda layout: layout.step_message.dtype, lambda decoder: decoder.steps
+    )
+
+
+def final_rows(files: Files) -> Rows:
+    """The leaves of final states, and `EPISODE`."""
+    leaves, plain = files.layouts[0].state, {EPISODE: Column((), _U32)}
+    return _rows(
+        files, leaves, plain, lambda layout: layout.final_message.dtype, lambda decoder: decoder.finals
+    )
+
+
+def image_rows(files: Files, name: str) -> Rows:
+    """A leaf of the state (ROS name in the first layout) that is an image in one of the layouts."""
+    (leaf,) = (leaf for leaf in files.layouts[0].state if leaf.name == name)
+    columns = {name: _column(files, leaf)}
+
+    def of_layout(layout: StepLayout) -> RowFormat:
+        own = _own_names(files, layout)[name]
+        if own not in layout.image_messages:
+            return RowFormat(columns, layout.step_message.dtype, None, {name: own})
+        turned = next((one for one in layout.images if one.name == own and one.frames_last), None)
+        return RowFormat(columns, layout.image_messages[own].dtype, None, {name: "data"}, turned)
+
+    return Rows(files, columns, [of_layout(layout) for layout in files.layouts])
+
+
+def image_names(layouts: Sequence[StepLayout]) -> dict[str, str]:
+    """The leaves that are images in one of the layouts: paths by their ROS names in the first layout."""
+    paths = {leaf.path for layout in layouts for leaf in layout.images}
+    return {leaf.name: leaf.path for leaf in (layouts[0].state if layouts else ()) if leaf.path in paths}
+
+
+def _rows(
+    files: Files,
+    leaves: Sequence[Leaf],
+    plain: Mapping[str, Column],
+    dtype_of: Callable[[StepLayout], np.dtype[Any]],
+    decode_of: Callable[[BatchDecoder], Decode],
+) -> Rows:
+    columns = {**{leaf.name: _column(files, leaf) for leaf in leaves}, **plain}
+
+    def of_layout(layout: StepLayout) -> RowFormat:
+        fields = _own_names(files, layout)
+        if layout.constant:
+            return RowFormat(columns, dtype_of(layout), None, fields)
+        return RowFormat(columns, None, decode_of(BatchDecoder(layout)), fields)
+
+    return Rows(files, columns, [of_layout(layout) for layout in files.layouts])
+
+
+def _column(files: Files, leaf: Leaf) -> Column:
+    """A leaf of the first layout, in a dtype that holds the values of all layouts."""
+    if leaf.kind == "variable":
+        return Column((), None)
+    dtype = files.layouts[0].dtypes[leaf.name]
+    for layout in files.layouts[1:]:
+        dtype = common_dtype(dtype, layout.dtypes[_own_names(files, layout)[leaf.name]]) or dtype
+    return Column(leaf.shape, dtype)
+
+
+def _own_names(files: Files, layout: StepLayout) -> dict[str, str]:
+    """ROS names of leaves in a layout, by those in the first one."""
+    names = {leaf.path: leaf.name for leaf in layout.leaves}
+    return {leaf.name: names[leaf.path] for leaf in files.layouts[0].leaves}
+
+
+# ---- fields
+
+
+class Kind(Protocol):
+    """Rows of one kind, however they are read."""
+
+    @property
+    def columns(self) -> Mapping[str, Column]: ...
+
+
+class Plan(NamedTuple):
+    """How to read some fields: which columns of which kinds of rows, and how the fields are made of them."""
+
+    sources: list[tuple[int, list[str]]]
+    fields: list[tuple[str, Callable[[list[Any]], Any], list[str]]]
+
+    @classmethod
+    def of(cls, fields: Sequence[str], layout: StepLayout, kinds: Sequence[Kind]) -> Plan:
+        """For fields but "next_states"."""
+        nests: dict[str, Callable[[list[Any]], Any]] = {
+            "states": layout.nest_state, "actions": layout.nest_action, "rewards": layout.nest_reward,
+            "times": _times,
+        }  # fmt: skip
+        plan = cls([], [])
+        for field in fields:
+            leaves = field_leaves(field, layout)
+            names = [_PLAIN[field]] if leaves is None else [leaf.name for leaf in leaves]
+            plan.fields.append((field, nests.get(field, _only), names))
+        needed = dict.fromkeys(name for _, _, names in plan.fields for name in names)
+        for i, rows in enumerate(kinds):
+            if names := [name for name in needed if name in rows.columns]:
+                plan.sources.append((i, names))
+        return plan
+
+    def nest(self, columns: Mapping[str, Any]) -> dict[str, Any]:
+        """The fields, of the columns of all sources."""
+        return {field: nest([columns[name] for name in names]) for field, nest, names in self.fields}
+
+
+def _only(values: list[Any]) -> Any:
+    return values[0]
+
+
+def _times(values: list[Any]) -> Array:
+    signed: Array = values[0].view(np.int64)
+    if (signed < 0).any():
+        raise FormatError(f"expected times of steps below 2**63 ns, found {values[0].max()}")
+    return signed
+
+
+# ---- copying
+
+
+def _are_bools(column: Array) -> bool:
+    """Whether what was copied into a column of bools is 0 or 1."""
+    return bool(np.bitwise_or.reduce(column.view(np.uint8), axis=None) <= 1)
+
+
+def put(column: Any, places: slice | Array, values: Any) -> None:
+    """Sets rows of a column, which is a list where values are of variable size."""
+    if isinstance(places, slice) or isinstance(column, np.ndarray):
+        column[places] = values
+        return
+    for place, value in zip(places.tolist(), values, strict=True):
+        column[place] = value
+
+
+def _items_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The dtype of a row with each field of several numbers as one item of bytes: NumPy copies it twice as fast."""
+    fields = [(name, *found[:2]) for name, found in (dtype.fields or {}).items()]
+    spec: Any = {
+        "names": [name for name, _, _ in fields],
+        "formats": [_item_format(field) for _, field, _ in fields],
+        "offsets": [offset for _, _, offset in fields],
+        "itemsize": dtype.itemsize,
+    }
+    made: np.dtype[Any] = np.dtype(spec)
+    return made
+
+
+def _item_format(field: np.dtype[Any]) -> Any:
+    return np.dtype(f"V{field.itemsize}") if field.shape and _LITTLE else field
+
+
+def _as_items(column: Array) -> Array:
+    """A column of shape (rows, ...) as `_items_dtype` has it: one item a row. The memory is the same."""
+    if column.ndim == 1 or not _LITTLE:
+        return column
+    size = math.prod(column.shape[1:])
+    return column.reshape(len(column), size).view(f"V{size * column.itemsize}")[:, 0]
