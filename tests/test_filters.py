@@ -740,6 +740,8 @@ class TestParser:
             ('metadata."a.b".c >= 1e-3', F("metadata", "a.b", "c") >= 1e-3),
             ("metadata.größe.run-1.0 < inf", F("metadata.größe.run-1.0") < math.inf),
             (r"""a = 'it\'s' and b = "\u00e9" """, (F("a") == "it's") & (F("b") == "é")),
+            ("nanor = 1 and metadata.class = 2", (F("nanor") == 1) & (F("metadata.class") == 2)),
+            ("(" * 64 + "a = 1" + ")" * 64, F("a") == 1),
             ("a = none and android = -inf", (F("a") == None) & (F("android") == -math.inf)),  # noqa: E711
         ],
     )
@@ -754,7 +756,9 @@ class TestParser:
             ("a > ", "needs a value .* at character 4, found the end"),
             ("a > b", "needs a value .* at character 4, found 'b'"),
             ("a > 3 b", "needs and, or, or the end at character 6, found 'b'"),
-            ("(a > 3", r"needs '\)' at character 6"),
+            ("(a > 3", r"needs and, or, or '\)' at character 6, found the end"),
+            ("(a > 3 b", r"needs and, or, or '\)' at character 7, found 'b'"),
+            ("a > 3)", r"needs and, or, or the end at character 5, found '\)'"),
             ("a in (1)", r"needs '\[' at character 5"),
             ("a in [1 2]", "needs ',' at character 8"),
             ("a ; drop", "at character 2, found ';'"),

@@ -1,22 +1,26 @@
 """Filters as text, for command lines: `metadata.score > -200 and (env in [1, 2] or not terminated = true)`.
 
-    filter     = conjunction { "or" conjunction }
+    filter      = conjunction { "or" conjunction }
     conjunction = negation { "and" negation }
-    negation   = "not" negation | "(" filter ")" | comparison
-    comparison = key ( "=" | "==" | "!=" | ">" | ">=" | "<" | "<=" ) value
-               | key [ "not" ] "in" "[" [ value { "," value } ] "]"
-    value      = number | "text" | 'text' | true | false | null | nan | inf | -inf
+    negation    = "not" negation | "(" filter ")" | comparison
+    comparison  = key ( "=" | "==" | "!=" | ">" | ">=" | "<" | "<=" ) value
+                | key [ "not" ] "in" "[" [ value { "," value } ] "]"
+    value       = number | "text" | 'text' | true | false | null | nan | inf | -inf
 
 Words are case-insensitive (`none` is `null`), keys are not; a name in a key that is no word is quoted:
 `metadata."a b"`.
+
+The order of and, or, not and parentheses is Python's, so Python's parser finds it. It sees a key as `k`, a value as `0`
+and a sign as `<`, nothing else of the text, and nothing is evaluated.
 """
 
 from __future__ import annotations
 
+import ast
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from tupli_mcap.errors import FilterError
@@ -40,11 +44,13 @@ from tupli_mcap.schema.values import tag_float
 _MAX_PARENTHESES: Final = 64
 _TOKEN: Final = re.compile(
     r"""\s*(?:
-      (?P<number>[-+]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|inf\b|nan\b))
+      (?P<number>[-+]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|(?:inf|nan)\b))(?=(?:and|or)\b|[\s()\[\],"'=<>!]|\Z)
     | (?P<text>"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')
     | (?P<word>[^\W\d][\w\-]*(?:\.(?:[\w\-]+|"(?:[^"\\]|\\.)*"))*)
-    | (?P<sign>==|!=|>=|<=|[=<>()\[\],])
+    | (?P<sign>==|!=|>=|<=|[=<>])
+    | (?P<bracket>[()\[\],])
     | (?P<end>\Z)
+    | (?P<unknown>.)
     )""",
     re.VERBOSE | re.IGNORECASE | re.DOTALL,
 )
@@ -60,21 +66,47 @@ _COMPARISON: Final[Mapping[str, type[BaseFilter]]] = {
     "<=": FilterLEQ,
 }
 _SIGNS: Final = {cls.model_fields["type"].default: sign for sign, cls in _COMPARISON.items()}
+_WORDS: Final = ("and", "or", "not", "in")
 _CONSTANTS: Final[Mapping[str, Any]] = {"true": True, "false": False, "null": None, "none": None}
-_RESERVED: Final = frozenset({"and", "or", "not", "in", "nan", "inf", *_CONSTANTS})
+_RESERVED: Final = frozenset({*_WORDS, "nan", "inf", *_CONSTANTS})
 _PLAIN_KEY: Final = re.compile(r"[^\W\d][\w\-]*")
 _PLAIN_SEGMENT: Final = re.compile(r"[\w\-]+")
 _ESCAPES: Final = {"n": "\n", "t": "\t", "r": "\r"}
 _SINGLE_ESCAPE: Final = re.compile(r"\\(.)", re.DOTALL)
 
+_A_VALUE: Final = 'a value (a number, "text", true, false or null)'
+_EXPECTED: Final[Mapping[str, str]] = {
+    "key": "a key such as metadata.score",
+    "sign": f"one of {' '.join(_COMPARISON)} in",
+    "in": "'in'",
+    "list": "'['",
+    "item": _A_VALUE,
+    "comma": "','",
+    "value": _A_VALUE,
+    "more": "and, or, or the end",
+}
+_NEXT: Final[Mapping[str, Mapping[str, str]]] = {
+    "key": {"not": "key", "(": "key", "key": "sign"},
+    "sign": {"sign": "value", "in": "list", "not": "in"},
+    "in": {"in": "list"},
+    "list": {"[": "item"},
+    "item": {"value": "comma", "]": "more"},
+    "comma": {",": "item", "]": "more"},
+    "value": {"value": "more"},
+    "more": {"and": "key", "or": "key", ")": "more", "end": "more"},
+}
+"""What is expected -> the kinds of token that may come, and what is expected after each."""
+_PYTHON: Final = {"key": "k", "value": "0", "sign": "<", "end": ""}
+_WIDTH: Final = 4  # characters of Python for each token, so that a node's column says which token it is
+
 
 class _Token(NamedTuple):
+    """kind: key, value, sign, end, unknown, or the word or bracket itself. value: of a value."""
+
     kind: str
     text: str
     position: int
-
-    def says(self, *words: str) -> bool:
-        return self.kind in ("word", "sign") and self.text.lower() in words
+    value: Any = None
 
 
 def parse_filter(text: str) -> BaseFilter:
@@ -84,10 +116,9 @@ def parse_filter(text: str) -> BaseFilter:
         FilterError: The text is no filter, or a comparison in it has no meaning; names the character
             (from 0) and what was expected there.
     """
-    parser = _Parser(text)
-    parsed = parser.filter(0)
-    parser.expect_end()
-    return parsed
+    tokens = _checked_tokens(text)
+    python = "".join(f"{_PYTHON.get(token.kind, token.kind):{_WIDTH}}" for token in tokens)
+    return _filter(ast.parse(python, mode="eval").body, tokens)
 
 
 def format_filter(filter: BaseFilter) -> str:
@@ -99,149 +130,89 @@ def format_filter(filter: BaseFilter) -> str:
     return _format(filter, outer=True)
 
 
-class _Parser:
-    """Recursive descent over the tokens of one text, one token ahead."""
+def _checked_tokens(text: str) -> list[_Token]:
+    """The tokens of a filter, each of which may come where it does."""
+    tokens: list[_Token] = []
+    expected, parentheses, negations = "key", 0, 0
+    for token in _tokens(text):
+        if parentheses + negations > _MAX_PARENTHESES:
+            raise FilterError(f"filter nests deeper than {_MAX_PARENTHESES} at character {token.position}")
+        if token.kind not in _NEXT[expected] or token.kind == (")", "end")[parentheses > 0]:
+            if expected in ("value", "item") and token.kind in ("key", "unknown"):
+                raise _unquoted(text, token)
+            inside = expected == "more" and parentheses
+            raise _error(text, "and, or, or ')'" if inside else _EXPECTED[expected], token)
+        parentheses += {"(": 1, ")": -1}.get(token.kind, 0)
+        negations = negations + 1 if token.kind == "not" else 0 if token.kind == "key" else negations
+        expected = _NEXT[expected][token.kind]
+        tokens.append(token)
+        if token.kind == "end":
+            break
+    return tokens
 
-    def __init__(self, text: str) -> None:
-        self._text = text
-        self._position = 0
-        self._next = self._read()
 
-    def filter(self, depth: int) -> BaseFilter:
-        parts = [self._conjunction(depth)]
-        while self._next.says("or"):
-            self._take()
-            parts.append(self._conjunction(depth))
-        return parts[0] if len(parts) == 1 else FilterOR(filters=parts)
-
-    def expect_end(self) -> None:
-        if self._next.kind != "end":
-            raise self._error("and, or, or the end")
-
-    def _conjunction(self, depth: int) -> BaseFilter:
-        parts = [self._negation(depth)]
-        while self._next.says("and"):
-            self._take()
-            parts.append(self._negation(depth))
-        return parts[0] if len(parts) == 1 else FilterAND(filters=parts)
-
-    def _negation(self, depth: int) -> BaseFilter:
-        if depth > _MAX_PARENTHESES:
-            raise FilterError(
-                f"filter nests deeper than {_MAX_PARENTHESES} at character {self._next.position}"
-            )
-        if self._next.says("not"):
-            self._take()
-            return FilterNOT(filters=[self._negation(depth + 1)])
-        if self._next.says("("):
-            self._take()
-            inner = self.filter(depth + 1)
-            self._expect(")")
-            return inner
-        return self._comparison()
-
-    def _comparison(self) -> BaseFilter:
-        token = self._next
-        if token.kind != "word" or token.text.lower() in _RESERVED:
-            raise self._error("a key such as metadata.score")
-        self._take()
-        try:
-            return self._compare(token.text)
-        except FilterError as err:
-            if "at character" in str(err):
-                raise
-            raise FilterError(f"{err} (at character {token.position} of the filter)") from err
-
-    def _compare(self, key: str) -> BaseFilter:
-        if self._next.says("not"):
-            self._take()
-            self._expect("in")
-            return FilterNOT(filters=[FilterIN(key=key, value=self._list())])
-        if self._next.says("in"):
-            self._take()
-            return FilterIN(key=key, value=self._list())
-        if not self._next.says(*_COMPARISON):
-            raise self._error(f"one of {' '.join(_COMPARISON)} in")
-        cls = _COMPARISON[self._take().text]
-        return cls(key=key, value=self._value())
-
-    def _list(self) -> list[Any]:
-        self._expect("[")
-        values: list[Any] = []
-        while not self._next.says("]"):
-            values.append(self._value())
-            if not self._next.says("]"):
-                self._expect(",")
-        self._take()
-        return values
-
-    def _value(self) -> Any:
-        token = self._next
-        if token.kind == "number":
-            value: Any = self._number(token.text)
-        elif token.kind == "text":
-            value = self._string(token.text)
-        elif token.kind == "word" and token.text.lower() in _CONSTANTS:
-            value = _CONSTANTS[token.text.lower()]
+def _tokens(text: str) -> Iterator[_Token]:
+    for match in _TOKEN.finditer(text):
+        kind = str(match.lastgroup)
+        token = _Token(kind, match[kind], match.start(kind))
+        word = token.text.lower()
+        if kind in ("number", "text"):
+            yield token._replace(kind="value", value=_value(text, token))
+        elif kind == "word" and word in _CONSTANTS:
+            yield token._replace(kind="value", value=_CONSTANTS[word])
+        elif kind == "word":
+            yield token._replace(kind=word if word in _WORDS else "key")
         else:
-            raise self._no_value(token)
-        self._take()
-        touches = self._next.position == token.position + len(token.text)
-        if touches and self._next.kind in ("number", "word", "unknown") and not self._next.says("and", "or"):
-            raise self._no_value(token)  # 2024-05-01, 7d ago, 1.2.3
-        return value
+            yield token._replace(kind=token.text) if kind == "bracket" else token
 
-    def _no_value(self, token: _Token) -> FilterError:
-        """What to say of a token that begins no value, perhaps a text or a time without quotes."""
-        expected = 'a value (a number, "text", true, false or null)'
-        match = _UNQUOTED.match(self._text, token.position)
-        if match is None or token.says("and", "or", "not", "in"):
-            return self._error(expected, token)
-        unquoted = _AFTER_UNQUOTED.split(match[0], maxsplit=1)[0].rstrip()
-        before, after = self._text[: token.position], self._text[token.position + len(unquoted) :]
-        right = f"{before}{json.dumps(unquoted, ensure_ascii=False)}{after}"
-        error = self._error(expected, token._replace(text=unquoted))
-        return FilterError(f"{error}; put a text or a time in quotes, as in {right:.200}")
 
-    def _number(self, text: str) -> float:
-        try:
-            return float(text) if re.search(r"[.enEN]", text) else int(text)
-        except ValueError as err:  # Python refuses ints of more than 4300 digits
-            raise self._error("a shorter number") from err
+def _value(text: str, token: _Token) -> float | str:
+    """The number or text that a token spells."""
+    is_number, spelled = token.kind == "number", token.text
+    if spelled[0] == "'":
+        return _SINGLE_ESCAPE.sub(lambda match: _ESCAPES.get(match[1], match[1]), spelled[1:-1])
+    try:
+        if is_number:
+            return float(spelled) if re.search(r"[.enEN]", spelled) else int(spelled)
+        return str(json.loads(spelled, strict=False))
+    except ValueError as err:  # Python refuses ints of more than 4300 digits
+        raise _error(text, "a shorter number" if is_number else "a text with JSON's escapes", token) from err
 
-    def _string(self, text: str) -> str:
-        if text[0] == "'":
-            return _SINGLE_ESCAPE.sub(lambda match: _ESCAPES.get(match[1], match[1]), text[1:-1])
-        try:
-            return str(json.loads(text, strict=False))
-        except ValueError as err:
-            raise self._error("a text with JSON's escapes") from err
 
-    def _expect(self, text: str) -> None:
-        if not self._next.says(text):
-            raise self._error(repr(text))
-        self._take()
+def _filter(node: ast.expr, tokens: Sequence[_Token]) -> BaseFilter:
+    if isinstance(node, ast.BoolOp):
+        parts = [_filter(part, tokens) for part in node.values]
+        return FilterAND(filters=parts) if isinstance(node.op, ast.And) else FilterOR(filters=parts)
+    if isinstance(node, ast.UnaryOp):
+        return FilterNOT(filters=[_filter(node.operand, tokens)])
+    assert isinstance(node, ast.Compare)
+    first = node.left.col_offset // _WIDTH
+    key, sign, right = tokens[first], tokens[first + 1], node.comparators[0]
+    try:
+        if isinstance(right, ast.List):
+            values = [tokens[item.col_offset // _WIDTH].value for item in right.elts]
+            chosen = FilterIN(key=key.text, value=values)
+            return FilterNOT(filters=[chosen]) if sign.kind == "not" else chosen
+        return _COMPARISON[sign.text](key=key.text, value=tokens[first + 2].value)
+    except FilterError as err:
+        raise FilterError(f"{err} (at character {key.position} of the filter)") from err
 
-    def _take(self) -> _Token:
-        token, self._next = self._next, self._read()
-        return token
 
-    def _read(self) -> _Token:
-        match = _TOKEN.match(self._text, self._position)
-        if match is None or match.lastgroup is None:
-            rest = self._text[self._position :]
-            start = self._position + len(rest) - len(rest.lstrip())
-            return _Token("unknown", self._text[start : start + 1], start)
-        self._position = match.end()
-        kind = match.lastgroup
-        return _Token(kind, match[kind], match.start(kind))
+def _unquoted(text: str, token: _Token) -> FilterError:
+    """What to say of a token that begins no value, perhaps a text or a time without quotes."""
+    match = _UNQUOTED.match(text, token.position)
+    if match is None:
+        return _error(text, _A_VALUE, token)
+    unquoted = _AFTER_UNQUOTED.split(match[0], maxsplit=1)[0].rstrip()
+    before, after = text[: token.position], text[token.position + len(unquoted) :]
+    right = f"{before}{json.dumps(unquoted, ensure_ascii=False)}{after}"
+    error = _error(text, _A_VALUE, token._replace(text=unquoted))
+    return FilterError(f"{error}; put a text or a time in quotes, as in {right:.200}")
 
-    def _error(self, expected: str, token: _Token | None = None) -> FilterError:
-        token = token or self._next
-        found = "the end" if token.kind == "end" else repr(token.text[:40])
-        return FilterError(
-            f"filter {self._text!r:.200} needs {expected} at character {token.position}, found {found}"
-        )
+
+def _error(text: str, expected: str, token: _Token) -> FilterError:
+    found = "the end" if token.kind == "end" else repr(token.text[:40])
+    return FilterError(f"filter {text!r:.200} needs {expected} at character {token.position}, found {found}")
 
 
 def _format(filter: BaseFilter, outer: bool) -> str:
