@@ -21,7 +21,6 @@ from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
-from tupli_mcap.storage.ahead import Ahead, ReadRecording
 from tupli_mcap.storage.atomic import Lock, os_errors
 from tupli_mcap.storage.catalog.catalog import (
     Catalog,
@@ -30,7 +29,7 @@ from tupli_mcap.storage.catalog.catalog import (
     CatalogUnusableError,
     RecordingStamp,
 )
-from tupli_mcap.storage.catalog.entries import catalog_rows
+from tupli_mcap.storage.catalog.entries import Entry, entry_of, read_ahead
 from tupli_mcap.storage.common import LOCAL_USER, published_in
 from tupli_mcap.storage.place import cache_dir, catalog_path
 from tupli_mcap.storage.scan import scan, stamp_of
@@ -242,8 +241,9 @@ class RecordingFiles:
             ) from err
 
         def put() -> int:
-            with self._catalog.alone(), contextlib.suppress(CatalogMovedError):
-                return self._put(relative, path, stamp_of(self._root, relative))
+            alone = self._catalog.alone()
+            with alone, contextlib.suppress(CatalogMovedError), entry_of(self._root, relative) as entry:
+                return self._put(relative, entry)
             return -1  # the next query fills the new one
 
         with self._lock:
@@ -272,12 +272,15 @@ class RecordingFiles:
     def _follow(self, changes: Mapping[str, Path | None]) -> None:
         """Brings what has changed into the catalog."""
         there = [relative for relative, path in changes.items() if path is not None]
-        with progress(len(changes), "Cataloguing recordings") as bar, Ahead(self._root, there) as ahead:
+        with (
+            progress(len(changes), "Cataloguing recordings") as bar,
+            contextlib.closing(read_ahead(self._root, there)) as entries,
+        ):
             for relative, path in changes.items():
                 if path is None:
                     self._catalog.remove_recording(relative)
                 else:
-                    self._try_to_put(relative, path, ahead.take(relative))
+                    self._try_to_put(relative, next(entries))
                 bar.advance(1)
 
     def _changes(self) -> dict[str, Path | None]:
@@ -301,14 +304,16 @@ class RecordingFiles:
                 changes[item.relative] = path
         return changes
 
-    def _try_to_put(self, relative: str, path: Path, read: ReadRecording | None) -> None:
+    def _try_to_put(self, relative: str, entry: Entry | None) -> None:
+        """Catalogue a recording by its entry, or else read it here."""
         stamp = RecordingStamp(0, 0, 0)
         try:
-            if read is not None:
-                self._put_read(relative, path, read)
-                return
-            stamp = stamp_of(self._root, relative)
-            self._put(relative, path, stamp)
+            if entry is None:
+                stamp = stamp_of(self._root, relative)
+                with entry_of(self._root, relative) as entry:
+                    self._put(relative, entry)
+            else:
+                self._put(relative, entry)
         except FileNotFoundError:
             self._catalog.remove_recording(relative)
         except (FormatError, RecordingError, OSError) as err:
@@ -322,47 +327,31 @@ class RecordingFiles:
             self._warned.add((relative, stamp))
             warnings.warn(message, stacklevel=6)
 
-    def _put(self, relative: str, path: Path, stamp: RecordingStamp) -> int:
+    def _put(self, relative: str, entry: Entry) -> int:
         """Catalogue a recording unless it is a copy; returns how many episodes it holds."""
-        notes = Notes.read(path, self._root)
-        live = is_locked(path)
-        with Recording(path) as recording:
-            live |= is_locked(path)  # a writer may have come or gone meanwhile
-            ends = [int(recording.index["episode"][i]) for i in (0, -1)] if len(recording) else []
-            if not self._is_copy(relative, path, stamp, recording.uuid, ends):
-                self._catalog.put_recording(
-                    relative,
-                    stamp._replace(mixed=_LIVE) if live else stamp,
-                    uuid=recording.uuid,
-                    benchmark_id=recording.benchmark_id,
-                    rows=catalog_rows(recording, notes.about(recording.metadata), live=live),
-                )
-            return len(recording)
-
-    def _put_read(self, relative: str, path: Path, read: ReadRecording) -> None:
-        """The same of a recording that has been read already."""
-        if not self._is_copy(relative, path, read.stamp, read.uuid, read.ends):
-            self._catalog.put_stored(
+        if not self._is_copy(relative, entry):
+            self._catalog.put_recording(
                 relative,
-                read.stamp._replace(mixed=_LIVE) if read.live else read.stamp,
-                uuid=read.uuid,
-                benchmark_id=read.benchmark_id,
-                rows=read.rows,
+                entry.stamp._replace(mixed=_LIVE) if entry.live else entry.stamp,
+                uuid=entry.uuid,
+                benchmark_id=entry.benchmark_id,
+                rows=entry.rows,
             )
+        return len(entry.numbers)
 
-    def _is_copy(
-        self, relative: str, path: Path, stamp: RecordingStamp, uuid: str, ends: Sequence[int]
-    ) -> bool:
+    def _is_copy(self, relative: str, entry: Entry) -> bool:
         """Whether another recording holds the first or the last episode of this one, which then is left out."""
-        if not self._catalog.copies(relative, uuid):
+        if not self._catalog.copies(relative, entry.uuid):
             return False
-        for number in set(ends):
-            for header in self._catalog.episodes(FilterEQ(key="id", value=episode_id(uuid, number))):
+        for number in {*entry.numbers[:1], *entry.numbers[-1:]}:
+            for header in self._catalog.episodes(FilterEQ(key="id", value=episode_id(entry.uuid, number))):
                 if header.recording != relative:
                     self._catalog.remove_recording(relative)
-                    original = f"holds episodes of {header.recording} again"
+                    path, original = self._root / relative, f"holds episodes of {header.recording} again"
                     advice = "that one is listed, whatever they hold; verify both, and delete one"
-                    self._warn_once(relative, stamp, f"skipped a recording: {path} {original}; {advice}")
+                    self._warn_once(
+                        relative, entry.stamp, f"skipped a recording: {path} {original}; {advice}"
+                    )
                     return True
         return False
 

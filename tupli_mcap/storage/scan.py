@@ -9,10 +9,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap.journal.file import journal_name
-from tupli_mcap.storage.catalog.rows import RecordingStamp
 from tupli_mcap.storage.sidecar import DELETING, Deletion, sidecar_path
 
-__all__ = ["FoundRecording", "scan", "stamp_of"]
+__all__ = ["FoundRecording", "RecordingStamp", "scan", "stamp_of"]
+
+
+class RecordingStamp(NamedTuple):
+    """What a recording's file and its sidecar looked like when they were catalogued.
+
+    size (bytes), mtime_ns: of the recording. mixed: a hash of what else tells both files from others.
+    """
+
+    size: int
+    mtime_ns: int
+    mixed: int
 
 
 class FoundRecording(NamedTuple):

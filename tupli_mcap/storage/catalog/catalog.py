@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +22,7 @@ from tupli_mcap.storage.catalog.database import (
     Database,
     MemoryDatabase,
 )
-from tupli_mcap.storage.catalog.rows import EpisodeRow, RecordingStamp, StoredRow, header, store_row
+from tupli_mcap.storage.catalog.rows import EpisodeRow, StoredRow, header, store_row
 from tupli_mcap.storage.catalog.sql import compile_filter
 from tupli_mcap.storage.catalog.sqlite import SqliteDialect, is_searchable, key_statements
 from tupli_mcap.storage.catalog.tables import (
@@ -34,6 +34,7 @@ from tupli_mcap.storage.catalog.tables import (
     of_one_recording,
 )
 from tupli_mcap.storage.common import escape_text, unescape_text
+from tupli_mcap.storage.scan import RecordingStamp
 
 __all__ = [
     "Catalog",
@@ -146,22 +147,6 @@ class Catalog:
             while chunk:
                 connection.exec_driver_sql(_INSERT, [store_row(number, row) for row in chunk])
                 chunk = list(itertools.islice(remaining, _ROWS_AT_ONCE))
-
-    def put_stored(
-        self,
-        relpath: str,
-        stamp: RecordingStamp,
-        *,
-        uuid: str,
-        benchmark_id: str,
-        rows: Sequence[tuple[Any, ...]],
-    ) -> None:
-        """The same with rows that `store_row(0, …)` has made; raises as it does."""
-        with self._write() as connection:
-            number = _add_recording(connection, relpath, stamp, uuid, benchmark_id)
-            if rows:
-                base = number << EPISODE_BITS
-                connection.exec_driver_sql(_INSERT, [(base + row[0], number, *row[2:]) for row in rows])
 
     def remove_recording(self, relpath: str) -> None:
         """Forget a recording and its episodes; nothing happens if it is not catalogued."""

@@ -1,21 +1,141 @@
-"""What the catalog holds of a recording: one row an episode, from its index and its sidecar."""
+"""What the catalog holds of a recording, read from its index and what is noted beside it; by several processes where
+there are many recordings to read.
+
+Such a process must not run the caller's script again, as those of `multiprocessing` do, ends with the one that started
+it, and leaves Ctrl-C to that. What goes wrong in one is nobody's trouble: the recording is read here then.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import json
-from collections.abc import Iterator, Sequence
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from multiprocessing.context import SpawnContext, SpawnProcess
+from pathlib import Path
+from typing import NamedTuple
 
+from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.common import LOCAL_USER
-from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.scan import RecordingStamp, stamp_of
+from tupli_mcap.storage.sidecar import Notes, Sidecar
 
-__all__ = ["catalog_rows"]
+__all__ = ["Entry", "entry_of", "read_ahead"]
 
 _ENDS = ("terminal", "timeout", "interrupted")
+_MOST_EPISODES = 50_000  # of a recording that another process reads: its rows are in memory twice
+_TRIAL = 1.0  # seconds of reading here before it is known whether more processes are worth their start
+_WORTH = 3.0  # seconds that must be left then
+_MOST_WORKERS = 8
 
 
-def catalog_rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[EpisodeRow]:
+class Entry(NamedTuple):
+    """A recording to catalogue.
+
+    stamp: taken before it was read. live: somebody writes to it. numbers: of all its episodes, deleted ones too.
+    """
+
+    stamp: RecordingStamp
+    live: bool
+    uuid: str
+    benchmark_id: str
+    numbers: Sequence[int]
+    rows: Iterable[EpisodeRow]
+
+
+@contextlib.contextmanager
+def entry_of(root: Path, relative: str) -> Iterator[Entry]:
+    """The entry of a recording below a storage's root; its rows can be read inside the block.
+
+    Raises:
+        FormatError, RecordingError, OSError: It is damaged, or gone.
+    """
+    path = root / relative
+    stamp, notes, live = stamp_of(root, relative), Notes.read(path, root), is_locked(path)
+    with Recording(path) as recording:
+        live |= is_locked(path)  # a writer may have come or gone meanwhile
+        numbers = recording.index["episode"].tolist()
+        rows = _rows(recording, notes.about(recording.metadata), live=live)
+        yield Entry(stamp, live, recording.uuid, recording.benchmark_id, numbers, rows)
+
+
+def read_ahead(root: Path, names: Sequence[str]) -> Generator[Entry | None]:
+    """What other processes read of recordings, once they are worth their start; None for what is to be read here."""
+    begun, workers = time.monotonic(), min(len(os.sched_getaffinity(0)), _MOST_WORKERS)
+    if workers == 1 or multiprocessing.current_process().daemon:  # which may start none
+        workers = 0
+    for done in range(len(names)):
+        taken = time.monotonic() - begun
+        if workers and taken > _TRIAL and taken / max(1, done) * (len(names) - done) > _WORTH:
+            yield from _read_elsewhere(root, names[done:], workers)
+            return
+        yield None
+
+
+def _read_elsewhere(root: Path, names: Sequence[str], workers: int) -> Generator[Entry | None]:
+    pool = ProcessPoolExecutor(workers, _Context(), initializer=_end_with_parent)
+    done = 0
+    try:
+        for start in range(0, len(names), 8 * workers):
+            block = names[start : start + 8 * workers]
+            for entry in pool.map(functools.partial(_read, root), block):
+                yield entry
+                done += 1
+    except (BrokenExecutor, OSError):  # one was killed, or cannot be started
+        yield from [None] * (len(names) - done)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+class _Process(SpawnProcess):
+    def start(self) -> None:
+        main = vars(sys.modules["__main__"])
+        kept: dict[str, object] = {name: main[name] for name in ("__spec__", "__file__") if name in main}
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # as it is in the process then
+        main.update(dict.fromkeys(kept))  # with which it would be found
+        try:
+            super().start()
+        finally:
+            main.update(kept)
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+class _Context(SpawnContext):
+    Process = _Process
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+
+    def wait() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def _read(root: Path, relative: str) -> Entry | None:
+    """In another process: a recording's entry with its rows; None if it is too long, or there is anything to say."""
+    with contextlib.suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with entry_of(root, relative) as entry:
+            if len(entry.numbers) <= _MOST_EPISODES:
+                return entry._replace(rows=list(entry.rows))
+    return None
+
+
+def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[EpisodeRow]:
     """The rows of a recording, without deleted episodes and those a live writer is in the middle of."""
     index = recording.index
     columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return", "end_time")]

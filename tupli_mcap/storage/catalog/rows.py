@@ -26,17 +26,6 @@ INT64_MAX: Final = 2**63 - 1
 _UNUSUAL: Final = re.compile('[\\\\\x01\ud7ff\ud800-\udfff]|"\\$')
 
 
-class RecordingStamp(NamedTuple):
-    """What a recording's file and its sidecar looked like when they were catalogued.
-
-    size (bytes), mtime_ns: of the recording. mixed: a hash of what else tells both files from others.
-    """
-
-    size: int
-    mtime_ns: int
-    mixed: int
-
-
 class EpisodeRow(NamedTuple):
     """An episode to catalogue.
 
