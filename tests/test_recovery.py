@@ -34,9 +34,8 @@ from tupli_mcap.cli.app import app
 from tupli_mcap.journal.committed import Salvage
 from tupli_mcap.journal.file import JournalContents, RowArea, read_journal
 from tupli_mcap.journal.seals import checksum
-from tupli_mcap.mcap.checksums import with_crc
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.mcap.records import BODY, iter_records
+from tupli_mcap.mcap.records import BODY, iter_records, with_crc
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.recording.recover import unfinished as recover
 from tupli_mcap.vector import RecordEpisodes as RecordVector

@@ -37,7 +37,7 @@ def template(path: Path, episodes: int) -> bytes:
 def add(path: Path, data: bytes) -> None:
     """A copy of the template, as a recording of its own."""
     from tupli_mcap import Recording
-    from tupli_mcap.mcap.checksums import with_crc
+    from tupli_mcap.mcap.records import with_crc
 
     with Recording(io.BytesIO(data)) as recording:
         metadata = dict(recording.metadata)

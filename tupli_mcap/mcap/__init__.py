@@ -3,9 +3,9 @@
 source                      where bytes come from: a path, an open file, a URL
 lock                        whether the process that writes a file is alive
 container                   writes: header, metadata, attachments, chunks, summary; writer_name goes to the header
+records                     the records, how they lie in bytes: parsed, and checked
 summary                     reads the footer and the summary
 chunk_records               the messages of a chunk, as arrays
-checked_records             message indexes and attachments, with their checks
 survey                      walks over the records of a damaged file, from one good one to the next
-compression, crc, checksums bytes made small, and checked
+compression, crc            bytes made small, and checked
 """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -12,12 +11,10 @@ from mcap.records import Channel, Schema
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, iter_records
-from tupli_mcap.mcap.summary import parse_record
+from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, RECORD, iter_records, parse_record
 
 __all__ = ["HEADERS", "ChunkRecords", "chunk_records", "message_headers"]
 
-_RECORD = struct.Struct("<BQ")
 _BLOCK = 1 << 16  # records whose headers are looked at together
 HEADERS = np.dtype([(name, kind) for name, kind, _ in HEADER_FIELDS] + [("#offset", "<u8")])
 
@@ -57,7 +54,7 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
     """
     skip, schemas, channels = 0, [], []
     while skip + 9 <= len(data) and data[skip] in (Opcode.SCHEMA, Opcode.CHANNEL):
-        opcode, length = _RECORD.unpack_from(data, skip)
+        opcode, length = RECORD.unpack_from(data, skip)
         if length > len(data) - skip - 9:
             raise FormatError(f"{where}: a record in it claims {length} bytes")
         record = parse_record(opcode, data[skip + 9 : skip + 9 + length], skip, where)

@@ -36,8 +36,8 @@ from mcap.records import (
 )
 
 from tupli_mcap.errors import RecordingError, os_reason
-from tupli_mcap.mcap.checksums import with_crc
 from tupli_mcap.mcap.crc import crc32
+from tupli_mcap.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, with_crc
 
 __all__ = ["CHUNK_ROWS", "MAGIC", "Compression", "Container"]
 
@@ -116,7 +116,7 @@ class Container:
         self._name = name
         self._compression = compression
         method = b"" if compression == "none" else compression.encode()
-        self._method = len(method).to_bytes(4, "little") + method, COMPRESSIONS.index(compression)
+        self._method = method, COMPRESSIONS.index(compression)
         self._local = threading.local()  # a compressor is not to be shared
         self.position = 0
         self.schemas: dict[int, Schema] = {}
@@ -319,7 +319,7 @@ class Container:
         for (rows, skip, data, crc), body, entries in zip(chunks, packed, indexes, strict=True):
             start, end, size, count = rows.times.item(0), rows.times.item(-1), len(data), len(rows.offsets)
             head = _chunk_head(name, len(body), (start, end, size, crc))
-            index = _MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), rows.channel, len(entries))
+            index = MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), rows.channel, len(entries))
             length, index_length = len(head) + len(body), len(index) + len(entries)
             found = (start, end, position, length, rows.channel, position + length, index_length)
             entry = _chunk_index(name, found, (len(body), size))
@@ -350,10 +350,9 @@ class Container:
     def note_chunk(self, row: tuple[int, ...], start: int, end: int) -> None:
         """Remembers a chunk that is in the file (as CHUNK_ROWS, and its times in ns), for the summary and the index."""
         offset, length, size, _, rows, _, _, channel, method, _ = row
-        text = COMPRESSIONS[method].replace("none", "").encode()
-        name = len(text).to_bytes(4, "little") + text
-        place = (start, end, offset, length, channel, offset + length, _MESSAGE_INDEX.size + 16 * rows)
-        packed = length - _CHUNK.size - len(name) - 8
+        name = COMPRESSIONS[method].replace("none", "").encode()
+        place = (start, end, offset, length, channel, offset + length, MESSAGE_INDEX.size + 16 * rows)
+        packed = length - CHUNK_HEAD.size - len(name) - 8
         self._note(_chunk_index(name, place, (packed, size)), start, end, row)
 
     def _note(self, index: bytes, start: int, end: int, row: tuple[int, ...]) -> None:
@@ -413,22 +412,23 @@ class Container:
 # The three records a chunk takes are packed here: with 64 sub-environments the package's builder took longer than the
 # compressor did.
 
-_CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last time, uncompressed size, CRC
-# opcode, length, first and last time, place and length of the chunk; the map of one message index; its length
-_CHUNK_INDEX = struct.Struct("<BQQQQQIHQQ")
+# RECORD, first and last time, place and length of the chunk; the map of one message index; its length; length of the
+# compression's name
+_CHUNK_INDEX = struct.Struct("<BQQQQQIHQQI")
 _SIZES = struct.Struct("<QQ")  # compressed, uncompressed
-_MESSAGE_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the entries
 
 
 def _chunk_head(name: bytes, packed: int, facts: tuple[int, int, int, int]) -> bytes:
-    """A Chunk record up to its `packed` bytes; `name` is the compression with its length."""
-    length = _CHUNK.size - 9 + len(name) + 8 + packed
-    return _CHUNK.pack(Opcode.CHUNK, length, *facts) + name + packed.to_bytes(8, "little")
+    """A Chunk record up to its `packed` bytes; `name` is the compression."""
+    length = CHUNK_HEAD.size - 9 + len(name) + 8 + packed
+    return CHUNK_HEAD.pack(Opcode.CHUNK, length, *facts, len(name)) + name + packed.to_bytes(8, "little")
 
 
 def _chunk_index(name: bytes, facts: tuple[int, ...], sizes: tuple[int, int]) -> bytes:
     """A ChunkIndex record of a chunk with one message index."""
     *place, channel, index_offset, index_length = facts
     length = _CHUNK_INDEX.size - 9 + len(name) + _SIZES.size
-    head = _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, length, *place, 10, channel, index_offset, index_length)
-    return head + name + _SIZES.pack(*sizes)
+    index = 10, channel, index_offset, index_length
+    return (
+        _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, length, *place, *index, len(name)) + name + _SIZES.pack(*sizes)
+    )

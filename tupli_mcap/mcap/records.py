@@ -1,31 +1,65 @@
-"""The records of MCAP files that rows are made of: their layout, and how large they may be."""
+"""The records of MCAP files, parsed and checked: what a file says is a claim, and each defect a FormatError."""
 
 from __future__ import annotations
 
+import io
 import struct
-from collections.abc import Iterator
+import zlib
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Header,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.crc import crc32
+from tupli_mcap.mcap.source import Source
 
 __all__ = [
+    "ATTACHMENT_HEAD",
     "BODY",
     "CDR_HEADER",
+    "CHUNK_HEAD",
     "HEADER_FIELDS",
     "MAX_CHUNK",
     "MAX_ROWS_A_BYTE",
+    "MESSAGE_INDEX",
+    "RECORD",
     "RECORD_HEADER",
+    "attachment_index",
+    "check_crc",
+    "checked_attachment",
     "iter_records",
+    "message_index",
+    "parse_record",
+    "read_attachment",
+    "read_metadata",
+    "records",
+    "with_crc",
 ]
 
-MAX_CHUNK = 1 << 31  # bytes, uncompressed
-MAX_ROWS_A_BYTE = 16
-"""Messages that a byte of a compressed chunk may stand for at most: each has a number of its own (`sequence`), so that
-no compressor gets far below a byte a message."""
-CDR_HEADER = b"\x00\x01\x00\x00"
-# opcode, record length, channel, sequence, log_time, publish_time; then the CDR header
+RECORD = struct.Struct("<BQ")  # what every record begins with: opcode, and the length of what follows
+# RECORD, times of the first and the last message, uncompressed size, CRC, length of the compression's name; then the
+# name, and the length of the compressed bytes (u64)
+CHUNK_HEAD = struct.Struct("<BQQQQII")
+ATTACHMENT_HEAD = struct.Struct("<BQQQI")  # RECORD, log_time, create_time, length of the name
+MESSAGE_INDEX = struct.Struct("<BQHI")  # RECORD, channel, length of the entries
+# RECORD, channel, sequence, log_time, publish_time; then the CDR header
 RECORD_HEADER = struct.Struct("<BQHIQQ")
+CDR_HEADER = b"\x00\x01\x00\x00"
 BODY = RECORD_HEADER.size + len(CDR_HEADER)  # offset of the CDR body in a Message record
-_OPCODE_MESSAGE = 5
 HEADER_FIELDS: list[tuple[str, str, int]] = [
     ("#opcode", "u1", 0),
     ("#length", "<u8", 1),
@@ -35,6 +69,207 @@ HEADER_FIELDS: list[tuple[str, str, int]] = [
     ("#publish_time", "<u8", 23),
     ("#cdr", "<u4", 31),
 ]
+MAX_CHUNK = 1 << 31  # bytes, uncompressed
+MAX_ROWS_A_BYTE = 16
+"""Messages that a byte of a compressed chunk may stand for at most: each has a number of its own (`sequence`), so that
+no compressor gets far below a byte a message."""
+
+_PIECE = 1 << 20
+_MOST_TEXT = 1 << 17  # bytes of name and media type of an attachment
+_KEY = "crc"
+_PARSERS: dict[int, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.STATISTICS: Statistics,
+    Opcode.METADATA: Metadata,
+}
+_STRINGS_BEFORE_MAP: dict[int, tuple[int, int]] = {  # where the first begins, and how many
+    Opcode.CHANNEL: (4, 2),
+    Opcode.METADATA: (0, 1),
+}
+
+
+def records(data: bytes | memoryview, base: int, name: str) -> Iterator[tuple[int, int, memoryview]]:
+    """(opcode, file offset, body) of the records in `data`, which starts at file offset `base`."""
+    view, position = memoryview(data), 0
+    while position < len(view):
+        if position + 9 > len(view):
+            raise FormatError(
+                f"{name}: expected a record at offset {base + position}, found {len(view) - position} bytes"
+            )
+        opcode, length = RECORD.unpack_from(view, position)
+        start, end = position + 9, position + 9 + length
+        if end > len(view):
+            raise FormatError(
+                f"{name}: the record at offset {base + position} claims {length} bytes, beyond its section"
+            )
+        yield opcode, base + position, view[start:end]
+        position = end
+
+
+def parse_record(opcode: int, body: memoryview, offset: int, name: str) -> Any:
+    """A record parsed by the `mcap` package; every defect is a FormatError."""
+    if opcode not in _PARSERS:
+        raise FormatError(f"{name}: expected another record at offset {offset}, found opcode {opcode}")
+    stream = _Exact(body)
+    try:
+        parsed = _PARSERS[opcode].read(ReadDataStream(stream))
+    except (
+        McapError,
+        struct.error,
+        UnicodeDecodeError,
+        EOFError,
+        ValueError,
+        MemoryError,
+        OverflowError,
+    ) as err:
+        raise FormatError(
+            f"{name}: the record with opcode {opcode} at offset {offset} is damaged: {err}"
+        ) from err
+    if stream.tell() != len(body):
+        raise FormatError(
+            f"{name}: the record with opcode {opcode} at offset {offset} has {len(body)} bytes, not {stream.tell()}"
+        )
+    if opcode in _STRINGS_BEFORE_MAP and not _map_fits(opcode, body):
+        raise FormatError(
+            f"{name}: the record with opcode {opcode} at offset {offset} is damaged: its map has another length"
+        )
+    return parsed
+
+
+def _map_fits(opcode: int, body: memoryview) -> bool:
+    """Whether the map that ends a record has the length it says: the package reads pairs beyond it."""
+    at, strings = _STRINGS_BEFORE_MAP[opcode]
+    for _ in range(strings):
+        at += 4 + int.from_bytes(body[at : at + 4], "little")
+    return int.from_bytes(body[at : at + 4], "little") == len(body) - at - 4
+
+
+class _Exact(io.BytesIO):
+    """Bytes that are not read beyond their end: the package would take what is left for a longer text."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        if size is not None and len(data) < size:
+            raise EOFError(f"expected {size} bytes, found {len(data)}")
+        return data
+
+
+def read_metadata(source: Source, index: MetadataIndex) -> dict[str, str]:
+    """The values of a Metadata record."""
+    record = source.read(index.offset, index.length)
+    if len(record) < 9 or record[0] != Opcode.METADATA:
+        raise FormatError(f"{source.name}: expected the metadata {index.name!r} at offset {index.offset}")
+    metadata: Metadata = parse_record(Opcode.METADATA, memoryview(record)[9:], index.offset, source.name)
+    return metadata.metadata
+
+
+def with_crc(values: Mapping[str, str]) -> dict[str, str]:
+    """The pairs and, as the last one, `crc`: the CRC-32 of the others in 8 hexadecimal digits."""
+    pairs = {key: value for key, value in values.items() if key != _KEY}
+    return {**pairs, _KEY: _crc(pairs)}
+
+
+def check_crc(values: Mapping[str, str], known: Collection[str], where: str) -> dict[str, str]:
+    """The pairs without `crc`.
+
+    Raises:
+        FormatError: `crc` differs, or is missing where there are others than the `known` keys: the first recordings
+            had none, but a damaged key must not pass for a missing one.
+    """
+    pairs = {key: value for key, value in values.items() if key != _KEY}
+    if _KEY not in values:
+        # A damaged length may have made the key part of a value: the bytes of a length in it are seen by their zeros.
+        other = sorted(pairs.keys() - set(known)) or [key for key, value in pairs.items() if "\0" in value]
+        if other:
+            raise FormatError(
+                f"{where}: expected a key 'crc' beside {other!r:.80}, found none; the file is damaged"
+            )
+    elif values[_KEY] != _crc(pairs):
+        raise FormatError(f"{where} is damaged: expected crc {_crc(pairs)}, found {values[_KEY]!r:.20}")
+    return pairs
+
+
+def _crc(pairs: Mapping[str, str]) -> str:
+    """In the order of the keys, each text as MCAP stores it: its length (u32) and its bytes."""
+    texts = [text.encode() for pair in sorted(pairs.items()) for text in pair]
+    return f"{zlib.crc32(b''.join(len(text).to_bytes(4, 'little') + text for text in texts)):08x}"
+
+
+def message_index(body: memoryview) -> tuple[int, np.ndarray[Any, np.dtype[np.uint64]]]:
+    """The channel and the entries (log_time, offset) of a MessageIndex record.
+
+    Raises:
+        FormatError: its sizes do not add up.
+    """
+    channel, size = int.from_bytes(body[:2], "little"), int.from_bytes(body[2:6], "little")
+    if len(body) != 6 + size or size % 16:
+        raise FormatError(f"expected a message index of {len(body) - 6} bytes, it says {size}")
+    return channel, np.frombuffer(body[6:], "<u8").reshape(-1, 2)
+
+
+def attachment_index(source: Source, offset: int, length: int) -> AttachmentIndex:
+    """What an attachment's header says; FormatError if it does not add up to its length.
+
+    The sizes are read before the texts: where many places look like an attachment, each takes a few bytes.
+    """
+    left = 9 + length - ATTACHMENT_HEAD.size - 4 - 8 - 4  # for the texts and the data
+    if left < 0:
+        raise FormatError("the attachment's header is damaged")
+    head = source.read(offset, ATTACHMENT_HEAD.size)
+    _, _, log_time, create_time, name_size = ATTACHMENT_HEAD.unpack(head)
+    if name_size > min(left, _MOST_TEXT):
+        raise FormatError("the attachment's sizes do not add up")
+    at = offset + ATTACHMENT_HEAD.size + name_size
+    type_size = int.from_bytes(source.read(at, 4), "little")
+    if name_size + type_size > min(left, _MOST_TEXT):
+        raise FormatError("the attachment's sizes do not add up")
+    data_size = int.from_bytes(source.read(at + 4 + type_size, 8), "little")
+    if name_size + type_size + data_size != left:
+        raise FormatError("the attachment's sizes do not add up")
+    try:
+        name = bytes(source.read(at - name_size, name_size)).decode()
+        media_type = bytes(source.read(at + 4, type_size)).decode()
+    except UnicodeDecodeError as err:
+        raise FormatError("the attachment's header is damaged") from err
+    return AttachmentIndex(offset, 9 + length, log_time, create_time, data_size, name, media_type)
+
+
+def checked_attachment(source: Source, offset: int, length: int) -> AttachmentIndex:
+    """The facts of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    found = attachment_index(source, offset, length)
+    crc, position, end = 0, offset + 9, offset + 9 + length - 4
+    expected = int.from_bytes(source.read(end, 4), "little")
+    while position < end:
+        piece = source.read(position, min(_PIECE, end - position))
+        crc = zlib.crc32(piece, crc)
+        position += len(piece)
+    if crc != expected:
+        raise FormatError(f"the attachment {found.name!r:.80} is damaged (its CRC differs)")
+    return found
+
+
+def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
+    """The data of an attachment, its CRC checked."""
+    record = source.read(index.offset, index.length)
+    fixed = ATTACHMENT_HEAD.size + len(index.name.encode()) + 4 + len(index.media_type.encode()) + 8
+    data = record[fixed : fixed + index.data_size]
+    if record[:1] != bytes([Opcode.ATTACHMENT]) or fixed + index.data_size + 4 != len(record):
+        raise FormatError(f"{source.name}: expected the attachment {index.name!r} at offset {index.offset}")
+    crc = int.from_bytes(record[-4:], "little")
+    if crc32(memoryview(record)[9:-4]) != crc:
+        raise FormatError(
+            f"{source.name}: the attachment {index.name!r} at offset {index.offset} is damaged (its CRC differs)"
+        )
+    return data
 
 
 def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:

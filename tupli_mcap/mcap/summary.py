@@ -2,61 +2,34 @@
 
 from __future__ import annotations
 
-import io
 import struct
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
     Channel,
-    ChunkIndex,
-    Header,
-    Metadata,
     MetadataIndex,
     Schema,
-    Statistics,
 )
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import MAGIC, PROFILE
 from tupli_mcap.mcap.crc import crc32
+from tupli_mcap.mcap.records import parse_record, records
 from tupli_mcap.mcap.source import Source
 
 __all__ = [
     "OTHER_TOOLS",
     "Summary",
     "has_summary",
-    "parse_record",
-    "read_attachment",
-    "read_metadata",
     "read_summary",
-    "records",
 ]
 
 FOOTER_SIZE = 9 + 20
 OTHER_TOOLS = '"mcap doctor" checks other MCAP files, "mcap recover" saves what is good in them'
 _FOOTER = struct.Struct("<BQQQI")
-_RECORD = struct.Struct("<BQ")
 _MAX_SUMMARY = 1 << 31
-
-_PARSERS: dict[int, Any] = {
-    Opcode.HEADER: Header,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.CHUNK_INDEX: ChunkIndex,
-    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
-    Opcode.METADATA_INDEX: MetadataIndex,
-    Opcode.STATISTICS: Statistics,
-    Opcode.METADATA: Metadata,
-}
-_STRINGS_BEFORE_MAP: dict[int, tuple[int, int]] = {  # where the first begins, and how many
-    Opcode.CHANNEL: (4, 2),
-    Opcode.METADATA: (0, 1),
-}
 
 
 class Summary(NamedTuple):
@@ -136,96 +109,6 @@ def _once(found: dict[int, Any], number: int, value: Any, what: str, name: str) 
     """Keeps a definition; FormatError where there is another one of that number."""
     if found.setdefault(number, value) != value:
         raise FormatError(f"{name}: expected {what} once in the summary, found another one")
-
-
-def records(data: bytes | memoryview, base: int, name: str) -> Iterator[tuple[int, int, memoryview]]:
-    """(opcode, file offset, body) of the records in `data`, which starts at file offset `base`."""
-    view, position = memoryview(data), 0
-    while position < len(view):
-        if position + 9 > len(view):
-            raise FormatError(
-                f"{name}: expected a record at offset {base + position}, found {len(view) - position} bytes"
-            )
-        opcode, length = _RECORD.unpack_from(view, position)
-        start, end = position + 9, position + 9 + length
-        if end > len(view):
-            raise FormatError(
-                f"{name}: the record at offset {base + position} claims {length} bytes, beyond its section"
-            )
-        yield opcode, base + position, view[start:end]
-        position = end
-
-
-class _Exact(io.BytesIO):
-    """Bytes that are not read beyond their end: the package would take what is left for a longer text."""
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        data = super().read(size)
-        if size is not None and len(data) < size:
-            raise EOFError(f"expected {size} bytes, found {len(data)}")
-        return data
-
-
-def parse_record(opcode: int, body: memoryview, offset: int, name: str) -> Any:
-    """A record parsed by the `mcap` package; every defect is a FormatError."""
-    if opcode not in _PARSERS:
-        raise FormatError(f"{name}: expected another record at offset {offset}, found opcode {opcode}")
-    stream = _Exact(body)
-    try:
-        parsed = _PARSERS[opcode].read(ReadDataStream(stream))
-    except (
-        McapError,
-        struct.error,
-        UnicodeDecodeError,
-        EOFError,
-        ValueError,
-        MemoryError,
-        OverflowError,
-    ) as err:
-        raise FormatError(
-            f"{name}: the record with opcode {opcode} at offset {offset} is damaged: {err}"
-        ) from err
-    if stream.tell() != len(body):
-        raise FormatError(
-            f"{name}: the record with opcode {opcode} at offset {offset} has {len(body)} bytes, not {stream.tell()}"
-        )
-    if opcode in _STRINGS_BEFORE_MAP and not _map_fits(opcode, body):
-        raise FormatError(
-            f"{name}: the record with opcode {opcode} at offset {offset} is damaged: its map has another length"
-        )
-    return parsed
-
-
-def _map_fits(opcode: int, body: memoryview) -> bool:
-    """Whether the map that ends a record has the length it says: the package reads pairs beyond it."""
-    at, strings = _STRINGS_BEFORE_MAP[opcode]
-    for _ in range(strings):
-        at += 4 + int.from_bytes(body[at : at + 4], "little")
-    return int.from_bytes(body[at : at + 4], "little") == len(body) - at - 4
-
-
-def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
-    """The data of an attachment, its CRC checked."""
-    record = source.read(index.offset, index.length)
-    fixed = 9 + 16 + 4 + len(index.name.encode()) + 4 + len(index.media_type.encode()) + 8
-    data = record[fixed : fixed + index.data_size]
-    if record[:1] != bytes([Opcode.ATTACHMENT]) or fixed + index.data_size + 4 != len(record):
-        raise FormatError(f"{source.name}: expected the attachment {index.name!r} at offset {index.offset}")
-    crc = int.from_bytes(record[-4:], "little")
-    if crc32(memoryview(record)[9:-4]) != crc:
-        raise FormatError(
-            f"{source.name}: the attachment {index.name!r} at offset {index.offset} is damaged (its CRC differs)"
-        )
-    return data
-
-
-def read_metadata(source: Source, index: MetadataIndex) -> dict[str, str]:
-    """The values of a Metadata record."""
-    record = source.read(index.offset, index.length)
-    if len(record) < 9 or record[0] != Opcode.METADATA:
-        raise FormatError(f"{source.name}: expected the metadata {index.name!r} at offset {index.offset}")
-    metadata: Metadata = parse_record(Opcode.METADATA, memoryview(record)[9:], index.offset, source.name)
-    return metadata.metadata
 
 
 def foreign(source: Source, why: str) -> FormatError:

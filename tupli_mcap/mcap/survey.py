@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import bisect
 import re
-import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -18,17 +17,21 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.checked_records import attachment_index, checked_attachment, message_index
 from tupli_mcap.mcap.compression import MAX_RATIO, decompress
 from tupli_mcap.mcap.container import MAGIC
-from tupli_mcap.mcap.records import MAX_CHUNK
+from tupli_mcap.mcap.records import (
+    CHUNK_HEAD,
+    MAX_CHUNK,
+    RECORD,
+    attachment_index,
+    checked_attachment,
+    message_index,
+    parse_record,
+)
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import parse_record
 
 __all__ = ["Chunk", "Damage", "Found", "KnownChunk", "Survey", "attachment_name"]
 
-_RECORD = struct.Struct("<BQ")
-_CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
 _PIECE = 1 << 20
 _FIRST_PIECE = 1 << 12
 _PARSING = 16  # times as long as a checksum of as many bytes takes
@@ -135,10 +138,10 @@ class Survey:
 
     def at(self, position: int, *, searching: bool = False) -> Found | str:
         """The record at an offset, or why there is none; `searching` asks for more evidence."""
-        left = self._end - position - _RECORD.size
+        left = self._end - position - RECORD.size
         if left < 0:
-            return f"expected a record, found {left + _RECORD.size} bytes"
-        opcode, length = _RECORD.unpack(self._source.read(position, _RECORD.size))
+            return f"expected a record, found {left + RECORD.size} bytes"
+        opcode, length = RECORD.unpack(self._source.read(position, RECORD.size))
         if opcode == Opcode.CHUNK or position in self._known:
             return self._chunk(position)
         if length > left:
@@ -186,11 +189,11 @@ class Survey:
 
     def _chunk(self, position: int) -> Found | str:
         known = self._known.get(position)
-        fixed = 9 + _CHUNK_HEAD.size
+        fixed = CHUNK_HEAD.size
         if position + fixed + 8 > self._end:
             return "a chunk is cut off"
-        opcode, claimed = _RECORD.unpack(self._source.read(position, 9))
-        start, end, size, crc, name_size = _CHUNK_HEAD.unpack(self._source.read(position + 9, fixed - 9))
+        head = self._source.read(position, fixed)
+        opcode, claimed, start, end, size, crc, name_size = CHUNK_HEAD.unpack(head)
         why = "the chunk's header is damaged"
         if known is not None:
             packed = known.length - fixed - len(known.compression) - 8
@@ -236,7 +239,7 @@ class Survey:
         return why
 
     def _name_and_size(self, position: int, name: str, packed: int) -> str:
-        at = position + 9 + _CHUNK_HEAD.size
+        at = position + CHUNK_HEAD.size
         expected = name.encode() + packed.to_bytes(8, "little")
         return "" if self._source.read(at, len(expected)) == expected else "its header is damaged"
 
@@ -258,7 +261,7 @@ class Survey:
         """The records of a chunk, or why they are damaged."""
         if packed < 0 or size > MAX_CHUNK or size > MAX_RATIO.get(name, 0) * packed or self._budget < 0:
             return f"the chunk claims {size} bytes in {packed}"
-        start = position + 9 + _CHUNK_HEAD.size + len(name) + 8
+        start = position + CHUNK_HEAD.size + len(name) + 8
         if start + packed > self._end:
             return "the chunk is cut off"
         try:
@@ -273,15 +276,14 @@ class Survey:
 
     def _adds_up(self, position: int) -> bool:
         """Whether the sizes in the header of a chunk or an attachment make up its length."""
-        opcode, length = _RECORD.unpack(self._source.read(position, 9))
+        opcode, length = RECORD.unpack(self._source.read(position, 9))
         if opcode == Opcode.CHUNK:
-            at = _CHUNK_HEAD.size
-            *_, crc, size = _CHUNK_HEAD.unpack(self._source.read(position + 9, at))
-            if size > 4 or at + size + 8 > length or not crc:
+            *_, crc, size = CHUNK_HEAD.unpack(self._source.read(position, CHUNK_HEAD.size))
+            packed = 9 + length - CHUNK_HEAD.size - size - 8
+            if size > 4 or packed < 0 or not crc:
                 return False
-            rest = self._source.read(position + 9 + at, size + 8)
-            known = rest[:size] in (b"", b"zstd", b"lz4")
-            return known and at + size + 8 + int.from_bytes(rest[size:], "little") == length
+            rest = self._source.read(position + CHUNK_HEAD.size, size + 8)
+            return rest[:size] in (b"", b"zstd", b"lz4") and int.from_bytes(rest[size:], "little") == packed
         if opcode != Opcode.ATTACHMENT:
             return False
         try:
@@ -300,7 +302,7 @@ class Survey:
             return False
         if position in self._known:
             return True
-        opcode, length = _RECORD.unpack(self._source.read(position, 9))
+        opcode, length = RECORD.unpack(self._source.read(position, 9))
         least = _LEAST.get(opcode)
         fits = least is not None and least <= length <= self._end - position - 9
         return fits and length == _SIZES.get(opcode, length)

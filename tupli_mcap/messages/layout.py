@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
 
 from tupli_mcap.arrays import DType
-from tupli_mcap.mcap.records import _OPCODE_MESSAGE, BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
 from tupli_mcap.spaces.leaves import Leaf, ros_type
 
 __all__ = [
@@ -84,7 +85,7 @@ class MessageLayout:
     def header(self, channel: int, sequence: int = 0, time: int = 0) -> bytes:
         """The record's bytes before the CDR body."""
         length = self.record_size - 9
-        return RECORD_HEADER.pack(_OPCODE_MESSAGE, length, channel, sequence, time, time) + CDR_HEADER
+        return RECORD_HEADER.pack(Opcode.MESSAGE, length, channel, sequence, time, time) + CDR_HEADER
 
 
 def record_dtype(fields: Sequence[Field], body_size: int) -> DType:

@@ -10,8 +10,8 @@ import numpy as np
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.checksums import check_crc
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
+from tupli_mcap.mcap.records import check_crc
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.index import EPISODE_ROWS, EpisodeIndex
 

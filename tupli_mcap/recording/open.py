@@ -6,15 +6,9 @@ import time
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.records import read_attachment, read_metadata
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import (
-    check_magic,
-    foreign,
-    has_summary,
-    read_attachment,
-    read_metadata,
-    read_summary,
-)
+from tupli_mcap.mcap.summary import check_magic, foreign, has_summary, read_summary
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeIndex
 from tupli_mcap.recording.limits import check_chunks

@@ -15,9 +15,8 @@ from mcap.records import Channel
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
 from tupli_mcap.errors import FormatError, RecordingError, memory_for
-from tupli_mcap.mcap.records import BODY
+from tupli_mcap.mcap.records import BODY, read_attachment
 from tupli_mcap.mcap.source import open_source
-from tupli_mcap.mcap.summary import read_attachment
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA, EpisodeStart
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec

@@ -10,13 +10,11 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.checked_records import message_index
-from tupli_mcap.mcap.checksums import check_crc
 from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records
 from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, MAGIC, PROFILE
-from tupli_mcap.mcap.records import CDR_HEADER
+from tupli_mcap.mcap.records import CDR_HEADER, check_crc, message_index, parse_record, records
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import FOOTER_SIZE, parse_record, records
+from tupli_mcap.mcap.summary import FOOTER_SIZE
 from tupli_mcap.mcap.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.contents import (

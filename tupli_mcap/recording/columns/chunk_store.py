@@ -23,17 +23,13 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.crc import crc32
-from tupli_mcap.mcap.records import BODY, MAX_CHUNK, iter_records
+from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAX_CHUNK, iter_records
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.limits import StepClaims
 
 __all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Span"]
 
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
-_CHUNK_HEAD = struct.Struct(
-    "<BQQQQII"
-)  # opcode, length, start, end, uncompressed size, crc, compression length
-
 _LENGTH = struct.Struct("<Q")  # of a record, after its opcode
 _MESSAGE_HEAD = np.dtype(
     {
@@ -307,7 +303,7 @@ class ChunkStore:
             return self._memory[offset - IN_MEMORY]
         where = f"{self._source.name}: chunk at offset {offset}"
         if (
-            length < _CHUNK_HEAD.size + 8
+            length < CHUNK_HEAD.size + 8
             or size > MAX_CHUNK
             or skip > size
             or compression >= len(COMPRESSIONS)
@@ -318,10 +314,10 @@ class ChunkStore:
         name = COMPRESSIONS[compression].replace("none", "")
         # what is not compressed is used where it is
         record = self._source.lend(offset, length) if name else self._source.view(offset, length)
-        opcode, claimed, _, _, found_size, crc, name_length = _CHUNK_HEAD.unpack_from(record)
-        start = _CHUNK_HEAD.size + name_length + 8
+        opcode, claimed, _, _, found_size, crc, name_length = CHUNK_HEAD.unpack_from(record)
+        start = CHUNK_HEAD.size + name_length + 8
         head_ok = opcode == 6 and claimed + 9 == length and found_size == size and name_length == len(name)
-        if not head_ok or record[_CHUNK_HEAD.size : start - 8] != name.encode():
+        if not head_ok or record[CHUNK_HEAD.size : start - 8] != name.encode():
             raise FormatError(
                 f"{where}: expected a chunk of {size} bytes ({name or 'none'}), found another record"
             )

@@ -14,12 +14,11 @@ import numpy as np
 from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows
+from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 
 __all__ = ["first_chunks"]
-
-_BEFORE_NAME = 9 + 3 * 8 + 4 + 4  # of a Chunk record: opcode, length, times, size, CRC, length of the name
 
 
 def first_chunks(
@@ -51,7 +50,7 @@ def first_chunks(
             return
         data = store.load(chunk, keep=False)
         method = name.replace("none", "")
-        packed = source.read(offset, length)[_BEFORE_NAME + len(method) + 8 :]
+        packed = source.read(offset, length)[CHUNK_HEAD.size + len(method) + 8 :]
         definitions = container.definitions(channel) if int(row["first"]) == 0 else b""
         size = int(row["uncompressed"])
         whole = decompress(method, memoryview(packed), size, source.name) if skip else data

@@ -14,13 +14,10 @@ from mcap.records import AttachmentIndex, Channel, Metadata, Schema
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
-from tupli_mcap.mcap.checked_records import message_index
-from tupli_mcap.mcap.checksums import check_crc
 from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records, message_headers
 from tupli_mcap.mcap.container import CHUNK_ROWS, MAGIC, PROFILE
-from tupli_mcap.mcap.records import BODY
+from tupli_mcap.mcap.records import BODY, check_crc, message_index, parse_record
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import parse_record
 from tupli_mcap.mcap.survey import Chunk, Damage, Found, Survey
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore, Span
 from tupli_mcap.recording.contents import (

@@ -9,18 +9,16 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.checked_records import attachment_index, checked_attachment
 from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC
-from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import (
-    FOOTER_SIZE,
-    Summary,
-    has_summary,
+from tupli_mcap.mcap.records import (
+    attachment_index,
+    checked_attachment,
     parse_record,
     read_attachment,
-    read_summary,
     records,
 )
+from tupli_mcap.mcap.source import Source
+from tupli_mcap.mcap.summary import FOOTER_SIZE, Summary, has_summary, read_summary
 from tupli_mcap.mcap.survey import KnownChunk
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
 

@@ -15,9 +15,9 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC, PROFILE, Rows
-from tupli_mcap.mcap.records import MAX_CHUNK
+from tupli_mcap.mcap.records import MAX_CHUNK, parse_record
 from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.summary import foreign, parse_record
+from tupli_mcap.mcap.summary import foreign
 from tupli_mcap.recording.contents import RECORDING_METADATA, check_metadata
 from tupli_mcap.recording.index import INDEX_NAME
 

@@ -34,8 +34,9 @@ from tupli_mcap.journal.file import (
     read_journal,
     recorded_journal,
 )
+from tupli_mcap.mcap.records import parse_record, records
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import has_summary, parse_record, records
+from tupli_mcap.mcap.summary import has_summary
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import Contents, step_channels

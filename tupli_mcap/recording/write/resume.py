@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import journal_info, journal_path, recorded_journal
 from tupli_mcap.journal.seals import sync_file
 from tupli_mcap.mcap.container import Container
+from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import check_magic, has_summary
 from tupli_mcap.messages.images.codecs import image_codecs
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 __all__ = ["restore_container", "resume"]
 
 _ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
-
-_TIMES = struct.Struct("<QQ")  # of the first and the last message: what a chunk begins with
 
 
 def resume(writer: RecordingWriter) -> None:
@@ -221,4 +219,6 @@ def restore_container(container: Container, contents: Contents, source: Source) 
     container.attachment_indexes = list(contents.attachments.values())
     container.metadata_indexes = contents.metadata_indexes
     for row in contents.table[contents.table["offset"] < IN_MEMORY].tolist():
-        container.note_chunk(row, *_TIMES.unpack(source.read(row[0] + 9, _TIMES.size)))
+        head = source.read(row[0], CHUNK_HEAD.size)
+        _, _, start, end, *_ = CHUNK_HEAD.unpack(head)
+        container.note_chunk(row, start, end)
