@@ -37,7 +37,7 @@ from tupli_mcap.cli.app import app
 from tupli_mcap.mcap.chunk_records import message_headers
 from tupli_mcap.mcap.container import MAGIC
 from tupli_mcap.mcap.source import PathSource
-from tupli_mcap.mcap.survey import Damage, Found, Survey
+from tupli_mcap.mcap.walk import Damage, Found, Walk
 from tupli_mcap.recording import RecoveryReport
 from tupli_mcap.recording.check.signature import check_signature
 from tupli_mcap.recording.edit.attach import add_attachments
@@ -68,7 +68,7 @@ def steps_of(recording: Recording, *, infos: bool = False) -> Steps:
 def places(path: Path) -> list[Found]:
     source = PathSource(path)
     try:
-        found = [item for item in Survey(source) if not isinstance(item, Damage)]
+        found = [item for item in Walk(source) if not isinstance(item, Damage)]
     finally:
         source.close()
     return found

@@ -4,8 +4,8 @@ source                      where bytes come from: a path, an open file, a URL
 lock                        whether the process that writes a file is alive
 container                   writes: header, metadata, attachments, chunks, summary; writer_name goes to the header
 records                     the records, how they lie in bytes: parsed, and checked
-summary                     reads the footer and the summary
+walk                        over the records of a file, behind damage too
 chunk_records               the messages of a chunk, as arrays
-survey                      walks over the records of a damaged file, from one good one to the next
+summary                     reads the footer and the summary
 compression, crc            bytes made small, and checked
 """

@@ -11,7 +11,9 @@ from mcap.records import Channel, Schema
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, RECORD, iter_records, parse_record
+from tupli_mcap.mcap.walk import Chunk
 
 __all__ = ["HEADERS", "ChunkRecords", "chunk_records", "message_headers"]
 
@@ -44,6 +46,12 @@ class ChunkRecords(NamedTuple):
     def first(self) -> int:
         """The row number of the first message."""
         return int(self.headers["#sequence"][0])
+
+    def row(self, offset: int, length: int, chunk: Chunk) -> tuple[int, ...]:
+        """What the episode index says of the chunk at `offset`, `length` bytes long, as CHUNK_ROWS."""
+        compression = COMPRESSIONS.index(chunk.compression or "none")
+        counts = self.first, len(self.headers), self.skip
+        return offset, length, len(chunk.data), *counts, chunk.crc, self.channel, compression, 0
 
 
 def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:

@@ -11,11 +11,11 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records
-from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, MAGIC, PROFILE
+from tupli_mcap.mcap.container import CHUNK_ROWS, MAGIC, PROFILE
 from tupli_mcap.mcap.records import CDR_HEADER, check_crc, message_index, parse_record, records
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import FOOTER_SIZE
-from tupli_mcap.mcap.survey import Chunk, Damage, Found, Survey
+from tupli_mcap.mcap.walk import Chunk, Damage, Found, Walk
 from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
@@ -92,8 +92,8 @@ class Structure:
         """
         if self._source.read(0, min(len(MAGIC), self._source.size)) != MAGIC:
             self._findings.error("file", "expected the magic of MCAP at the start", offset=0)
-        survey = Survey(self._source, known=self._tail.known_chunks(), end=self._tail.data_end)
-        for item in survey:
+        walk = Walk(self._source, known=self._tail.known_chunks(), end=self._tail.data_end)
+        for item in walk:
             self._records += 1
             if isinstance(item, Damage):
                 self._damaged(item)
@@ -223,11 +223,7 @@ class Structure:
         self._waiting = _Waiting(found.offset, content)
         self._rows(found, chunk, content)
         number, headers = content.channel, content.headers
-        compression = COMPRESSIONS.index(chunk.compression or "none")
-        self._table.append(
-            (found.offset, found.length, len(chunk.data), content.first, len(headers), content.skip, chunk.crc,
-             number, compression, 0)
-        )  # fmt: skip
+        self._table.append(content.row(found.offset, found.length, chunk))
         at = found.offset + found.length
         self._chunk_indexes.append(
             ChunkIndex(

@@ -14,7 +14,7 @@ from tupli_mcap.mcap.container import MAGIC, Container
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import OTHER_TOOLS
-from tupli_mcap.mcap.survey import Damage, attachment_name
+from tupli_mcap.mcap.walk import Damage, attachment_name
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels

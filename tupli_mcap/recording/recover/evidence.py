@@ -18,7 +18,7 @@ from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records, message_h
 from tupli_mcap.mcap.container import CHUNK_ROWS, MAGIC, PROFILE
 from tupli_mcap.mcap.records import BODY, check_crc, message_index, parse_record
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.survey import Chunk, Damage, Found, Survey
+from tupli_mcap.mcap.walk import Chunk, ChunkClaim, Damage, Found, Walk
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore, Span
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
@@ -66,7 +66,7 @@ class Pieces(Sequence[bytes]):
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self._survey = Survey(source)
+        self._walk = Walk(source)
         self._places: list[_Place | bytes] = []
 
     def add(self, place: _Place | bytes) -> int:
@@ -93,8 +93,8 @@ class Pieces(Sequence[bytes]):
         place = self._places[i]
         if isinstance(place, bytes):
             return place
-        chunk = place.chunk
-        data = self._survey.unpack(place.offset, chunk.packed, chunk.compression, place.size, chunk.crc)
+        claim = ChunkClaim(place.length, place.size, place.chunk.compression, place.chunk.crc)
+        data = self._walk.unpack(place.offset, claim)
         if isinstance(data, str):
             raise FormatError(f"{self._source.name}: chunk at offset {place.offset}: {data}")
         return memoryview(data)[place.skip :]
@@ -213,7 +213,7 @@ def gather(source: Source, tail: Tail) -> Gathered:
         gathered.schemas |= tail.summary.schemas
         gathered.channels |= tail.summary.channels
     pieces: dict[int, list[Piece]] = {}
-    for found in Survey(source, known=tail.known_chunks(), end=tail.data_end):
+    for found in Walk(source, known=tail.known_chunks(), end=tail.data_end):
         if isinstance(found, Damage):
             gathered.damages.append(found)
         elif found.chunk is not None:
@@ -319,7 +319,7 @@ def may_be_recording(source: Source, tail: Tail) -> bool:
         return True
     if RECORDING_METADATA.encode() in source.read(0, min(source.size, _HEAD)):
         return True
-    header = Survey(source).at(len(MAGIC))
+    header = Walk(source).at(len(MAGIC))
     if isinstance(header, str) or header.opcode != Opcode.HEADER:
         return True
     profile: str = parse_record(header.opcode, header.body, header.offset, source.name).profile

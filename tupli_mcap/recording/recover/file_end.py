@@ -19,7 +19,7 @@ from tupli_mcap.mcap.records import (
 )
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import FOOTER_SIZE, Summary, has_summary, read_summary
-from tupli_mcap.mcap.survey import KnownChunk
+from tupli_mcap.mcap.walk import ChunkClaim
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
 
 __all__ = ["Tail", "read_tail"]
@@ -47,12 +47,12 @@ class Tail:
     def data_end(self) -> int | None:
         return None if self.summary is None else self.summary.start
 
-    def known_chunks(self) -> dict[int, KnownChunk]:
+    def known_chunks(self) -> dict[int, ChunkClaim]:
         """What the index says of the chunks, by offset."""
         if self.index is None:
             return {}
         return {
-            int(row["offset"]): KnownChunk(
+            int(row["offset"]): ChunkClaim(
                 int(row["length"]),
                 int(row["uncompressed"]),
                 COMPRESSIONS[row["compression"]].replace("none", ""),

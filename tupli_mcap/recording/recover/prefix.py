@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import struct
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
+from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.logs import group_records
-from tupli_mcap.mcap.compression import decompress
-from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC, PROFILE, Rows
-from tupli_mcap.mcap.records import MAX_CHUNK, parse_record
+from tupli_mcap.mcap.chunk_records import chunk_records
+from tupli_mcap.mcap.container import MAGIC, PROFILE, Rows
+from tupli_mcap.mcap.records import parse_record
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import foreign
+from tupli_mcap.mcap.walk import Chunk, Found, Walk
 from tupli_mcap.recording.contents import RECORDING_METADATA, check_metadata
 from tupli_mcap.recording.index import INDEX_NAME
 
@@ -27,10 +25,6 @@ __all__ = [
     "metadata_at",
     "scan",
 ]
-
-_RECORD = struct.Struct("<BQ")
-_CHUNK_HEAD = struct.Struct("<QQQII")
-_ATTACHMENT_HEAD = struct.Struct("<QQI")
 
 
 @dataclass
@@ -52,126 +46,73 @@ class Scan:
 def scan(source: Source, *, only_metadata: bool = False) -> Scan:
     """Reads records until the file ends, is damaged, or its data section ends. Executes nothing, raises nothing
     for a damaged tail."""
-    found = Scan()
-    position = len(MAGIC)
+    found, walk = Scan(), Walk(source)
     waiting: tuple[tuple[int, ...], Rows] | None = None
-    while position + 9 <= source.size:
-        opcode, length = _RECORD.unpack(source.read(position, 9))
-        end = position + 9 + length
-        if end > source.size or length > MAX_CHUNK:
-            break
-        try:
-            if opcode == Opcode.CHUNK:
-                if only_metadata or waiting is not None:
-                    break
-                waiting = _chunk(source, position, length, found)
-            elif opcode == Opcode.MESSAGE_INDEX:
-                if waiting is None:
-                    break
-                found.chunks.append(waiting[0])
-                channel, rows = waiting[0][7], waiting[0][4]
-                found.counts[channel] = found.counts.get(channel, 0) + rows
-                waiting = None
-            elif waiting is not None or not _other(source, opcode, position, length, found):
+    for opcode, position, length in walk.places():
+        if opcode == Opcode.MESSAGE_INDEX:
+            if waiting is None:
                 break
-        except FormatError:
+            found.chunks.append(waiting[0])
+            channel, rows = waiting[0][7], waiting[0][4]
+            found.counts[channel] = found.counts.get(channel, 0) + rows
+            waiting = None
+        elif waiting is not None or (opcode == Opcode.CHUNK and only_metadata):
             break
-        position = end
+        elif opcode == Opcode.HEADER:  # whatever it says is no part of the recording
+            found.profile = _profile(source, position, length)
+        else:
+            record = walk.at(position)
+            if isinstance(record, str) or record.repaired:
+                break
+            if record.chunk is not None:
+                waiting = _chunk(source, record, record.chunk, found)
+            if waiting is None and not _take(source, record, found):
+                break
         if waiting is None:
-            found.end = position
+            found.end = position + length
     if waiting is not None:
         found.unindexed = waiting[1]
     return found
 
 
-def _other(source: Source, opcode: int, position: int, length: int, found: Scan) -> bool:
-    """A record outside chunks; False where the data ends."""
-    body = memoryview(source.read(position + 9, length))
-    if opcode == Opcode.HEADER:
-        size = int.from_bytes(body[:4], "little")
-        found.profile = bytes(body[4 : 4 + size]).decode(errors="replace")
-    elif opcode == Opcode.METADATA:
-        record = parse_record(opcode, body, position, source.name)
-        found.metadata[record.name] = record.metadata
-        found.metadata_indexes.append(MetadataIndex(position, length + 9, record.name))
-    elif opcode == Opcode.ATTACHMENT:
-        index = _attachment(body, position)
-        if index.name == INDEX_NAME:
+def _profile(source: Source, position: int, length: int) -> str:
+    body = source.read(position + 9, length - 9)
+    return body[4 : 4 + int.from_bytes(body[:4], "little")].decode(errors="replace")
+
+
+def _take(source: Source, record: Found, found: Scan) -> bool:
+    """Takes a record outside of chunks; False where the data ends."""
+    if record.attachment is not None:
+        if record.attachment.name == INDEX_NAME:
             return False
-        found.attachments[index.name] = index
-    elif opcode == Opcode.SCHEMA:
-        schema: Schema = parse_record(opcode, body, position, source.name)
-        found.schemas[schema.id] = schema
-    elif opcode == Opcode.CHANNEL:
-        channel: Channel = parse_record(opcode, body, position, source.name)
-        found.channels[channel.id] = channel
-    else:
+        found.attachments[record.attachment.name] = record.attachment
+        return True
+    if record.opcode not in (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL):
         return False
+    parsed = parse_record(record.opcode, record.body, record.offset, source.name)
+    if isinstance(parsed, Metadata):
+        found.metadata[parsed.name] = parsed.metadata
+        found.metadata_indexes.append(MetadataIndex(record.offset, record.length, parsed.name))
+    elif isinstance(parsed, Schema):
+        found.schemas[parsed.id] = parsed
+    else:
+        found.channels[parsed.id] = parsed
     return True
 
 
-def _attachment(body: memoryview, position: int) -> AttachmentIndex:
+def _chunk(source: Source, record: Found, chunk: Chunk, found: Scan) -> tuple[tuple[int, ...], Rows] | None:
+    """A chunk's row of the chunk table, and its rows; None if they are no good. Definitions in it are remembered: they
+    are under the chunk's CRC, which those outside of chunks have not."""
     try:
-        log_time, create_time, size = _ATTACHMENT_HEAD.unpack_from(body)
-        at = _ATTACHMENT_HEAD.size
-        name = bytes(body[at : at + size]).decode()
-        at += size
-        size = int.from_bytes(body[at : at + 4], "little")
-        media_type = bytes(body[at + 4 : at + 4 + size]).decode()
-        at += 4 + size
-        data_size = int.from_bytes(body[at : at + 8], "little")
-    except (struct.error, UnicodeDecodeError) as err:
-        raise FormatError(f"damaged attachment at offset {position}") from err
-    crc = int.from_bytes(body[-4:], "little")
-    if at + 8 + data_size + 4 != len(body) or zlib.crc32(body[:-4]) != crc:
-        raise FormatError(f"damaged attachment at offset {position}")
-    return AttachmentIndex(position, len(body) + 9, log_time, create_time, data_size, name, media_type)
-
-
-def _chunk(source: Source, position: int, length: int, found: Scan) -> tuple[tuple[int, ...], Rows]:
-    """A chunk's row of the chunk table, and its records; definitions in it are remembered."""
-    record = memoryview(source.read(position + 9, length))
-    where = f"{source.name}: chunk at offset {position}"
-    try:
-        _, _, size, crc, name_length = _CHUNK_HEAD.unpack_from(record)
-    except struct.error as err:
-        raise FormatError(f"{where}: too short") from err
-    at = _CHUNK_HEAD.size
-    name = bytes(record[at : at + name_length]).decode(errors="replace")
-    at += name_length
-    packed = int.from_bytes(record[at : at + 8], "little")
-    if at + 8 + packed != len(record) or size > MAX_CHUNK:
-        raise FormatError(f"{where}: its sizes do not add up")
-    data = memoryview(decompress(name, record[at + 8 :], size, where))
-    if zlib.crc32(data) != crc:
-        raise FormatError(f"{where}: its CRC differs")
-    skip = _definitions(source, data, found)
-    groups = group_records(data[skip:])
-    if len(groups) != 1:
-        raise FormatError(f"{where}: expected messages of one channel, found {len(groups)}")
-    (rows,) = groups
-    compression = COMPRESSIONS.index(name or "none")
-    row = (position, length + 9, size, rows.first, len(rows.offsets), skip, crc, rows.channel, compression, 0)
-    return row, rows
-
-
-def _definitions(source: Source, data: memoryview, found: Scan) -> int:
-    """Takes the Schema and Channel records a chunk starts with; returns their size."""
-    position = 0
-    while position + 9 <= len(data) and data[position] in (Opcode.SCHEMA, Opcode.CHANNEL):
-        opcode, length = _RECORD.unpack_from(data, position)
-        end = position + 9 + length
-        if end > len(data):
-            raise FormatError(f"{source.name}: a record in a chunk claims {length} bytes")
-        _other_definition(source, opcode, data[position + 9 : end], found)
-        position = end
-    return position
-
-
-def _other_definition(source: Source, opcode: int, body: memoryview, found: Scan) -> None:
-    parsed = parse_record(opcode, body, 0, source.name)
-    target: dict[int, object] = found.schemas if opcode == Opcode.SCHEMA else found.channels  # type: ignore[assignment]
-    target[parsed.id] = parsed  # under the chunk's CRC, which a definition outside of chunks has not
+        content = chunk_records(chunk.data, source.name, chunk.packed)
+    except FormatError:
+        return None
+    found.schemas |= {schema.id: schema for schema in content.schemas}
+    found.channels |= {channel.id: channel for channel in content.channels}
+    headers = content.headers
+    data = bytes(chunk.data[content.skip :])
+    rows = Rows(content.channel, content.first, data, headers["#offset"], headers["#log_time"])
+    return content.row(record.offset, record.length, chunk), rows
 
 
 def is_ours(found: Scan) -> bool:

@@ -1,4 +1,4 @@
-"""A walk over the records of a file, good or bad: what is whole, what is damaged, and where it goes on.
+"""Walks over the records of a file, good or bad: what is whole, what is damaged, and where it goes on.
 
 Nothing is believed: a chunk counts if its CRC is right, an attachment too, any other record if it parses to its last
 byte. After a damaged record the walk goes on at the next place where a record stands; a chunk whose header is damaged
@@ -30,7 +30,7 @@ from tupli_mcap.mcap.records import (
 )
 from tupli_mcap.mcap.source import Source
 
-__all__ = ["Chunk", "Damage", "Found", "KnownChunk", "Survey", "attachment_name"]
+__all__ = ["Chunk", "ChunkClaim", "Damage", "Found", "Walk", "attachment_name"]
 
 _PIECE = 1 << 20
 _FIRST_PIECE = 1 << 12
@@ -52,13 +52,18 @@ _LEAST: dict[int, int] = {
 _CANDIDATE = re.compile(rb"(?=[\x01-\x0f].{5}\x00\x00\x00)", re.DOTALL)
 
 
-class KnownChunk(NamedTuple):
-    """What an index says of the chunk at an offset; `crc` None: not said."""
+class ChunkClaim(NamedTuple):
+    """What an index, or its header, says of a chunk: `length` bytes in the file hold `size` bytes of records."""
 
     length: int
     size: int
     compression: str
-    crc: int | None
+    crc: int  # 0: not said
+
+    @property
+    def packed(self) -> int:
+        """The length of what is compressed."""
+        return self.length - CHUNK_HEAD.size - len(self.compression) - 8
 
 
 class Chunk(NamedTuple):
@@ -96,7 +101,7 @@ class Damage(NamedTuple):
     opcode: int
 
 
-class Survey:
+class Walk:
     """Iterating gives every record of the data section, DataEnd included, and every damage, in the file's order.
 
     Args:
@@ -108,7 +113,7 @@ class Survey:
         self,
         source: Source,
         *,
-        known: Mapping[int, KnownChunk] | None = None,
+        known: Mapping[int, ChunkClaim] | None = None,
         end: int | None = None,
     ) -> None:
         self._source = source
@@ -133,6 +138,16 @@ class Survey:
             opcode = self._source.read(position, 1)[0]
             yield Damage(position, following, found, opcode)
             position = following
+
+    def places(self) -> Iterator[tuple[int, int, int]]:
+        """(opcode, offset, length) of the records up to the first that is cut off; what is in them is not looked at."""
+        position = len(MAGIC)
+        while position + RECORD.size <= self._end:
+            opcode, length = RECORD.unpack(self._source.read(position, RECORD.size))
+            if length > self._end - position - RECORD.size:
+                return
+            yield opcode, position, RECORD.size + length
+            position += RECORD.size + length
 
     # ---- one record
 
@@ -188,88 +203,64 @@ class Survey:
         return Found(Opcode.ATTACHMENT, position, 9 + length, memoryview(b""), attachment=index)
 
     def _chunk(self, position: int) -> Found | str:
-        known = self._known.get(position)
-        fixed = CHUNK_HEAD.size
-        if position + fixed + 8 > self._end:
+        """By what the index says of it, then by its own header."""
+        if position + CHUNK_HEAD.size + 8 > self._end:
             return "a chunk is cut off"
-        head = self._source.read(position, fixed)
-        opcode, claimed, start, end, size, crc, name_size = CHUNK_HEAD.unpack(head)
+        head = self._source.read(position, CHUNK_HEAD.size)
+        _, _, start, end, *_ = CHUNK_HEAD.unpack(head)
         why = "the chunk's header is damaged"
-        if known is not None:
-            packed = known.length - fixed - len(known.compression) - 8
-            data = self.unpack(position, packed, known.compression, known.size, known.crc or crc)
+        for claim, repaired in self._claims(position, head):
+            data = self.unpack(position, claim)
             if not isinstance(data, str):
-                header = (opcode, claimed, size, crc, name_size)
-                right = (
-                    Opcode.CHUNK, known.length - 9, known.size, known.crc or crc, len(known.compression)
-                )  # fmt: skip
-                wrong = "" if header == right else "its header is damaged"
-                wrong = wrong or self._name_and_size(position, known.compression, packed)
-                return self._found(
-                    position,
-                    known.length,
-                    (start, end),
-                    known.crc or crc,
-                    known.compression,
-                    data,
-                    packed,
-                    wrong,
-                )
-            why = data
-        if name_size > 4:
-            return why
-        tail = self._source.read(position + fixed, min(name_size + 8, self._end - position - fixed))
-        name = bytes(tail[:name_size]).decode(errors="replace")
-        if len(tail) < name_size + 8 or name not in ("", "zstd", "lz4"):
-            return why
-        before = fixed + name_size + 8
-        told = int.from_bytes(tail[name_size:], "little")
-        for packed in dict.fromkeys((told, claimed + 9 - before)):
-            agreed = packed + before == claimed + 9 and told == packed and opcode == Opcode.CHUNK
-            if not 0 <= packed <= self._end - position - before:
-                why = f"the chunk claims {packed} bytes, but {self._end - position - before} are left"
-                continue
-            if not agreed and not self._stands_at(position + before + packed):
-                continue
-            data = self.unpack(position, packed, name, size, crc)
-            if not isinstance(data, str):
-                wrong = "" if agreed else "its opcode or length is damaged"
-                return self._found(position, before + packed, (start, end), crc, name, data, packed, wrong)
+                chunk = Chunk(start, end, claim.crc, claim.compression, claim.packed, memoryview(data))
+                return Found(Opcode.CHUNK, position, claim.length, memoryview(b""), chunk, repaired=repaired)
             why = data
         return why
 
-    def _name_and_size(self, position: int, name: str, packed: int) -> str:
-        at = position + CHUNK_HEAD.size
-        expected = name.encode() + packed.to_bytes(8, "little")
-        return "" if self._source.read(at, len(expected)) == expected else "its header is damaged"
+    def _claims(self, position: int, head: bytes) -> Iterator[tuple[ChunkClaim, str]]:
+        """What a chunk may be, and what is wrong with its header if it is that."""
+        opcode, claimed, _, _, size, crc, name_size = CHUNK_HEAD.unpack(head)
+        known = self._known.get(position)
+        if known is not None:
+            known = known._replace(crc=known.crc or crc)
+            name = known.compression.encode()
+            right = Opcode.CHUNK, known.length - 9, known.size, known.crc, len(name)
+            behind = self._source.read(
+                position + len(head), min(len(name) + 8, self._end - position - len(head))
+            )
+            whole = (opcode, claimed, size, crc, name_size) == right
+            whole = whole and behind == name + known.packed.to_bytes(8, "little")
+            yield known, "" if whole else "its header is damaged"
+        if name_size > 4:
+            return
+        tail = self._source.read(position + len(head), min(name_size + 8, self._end - position - len(head)))
+        compression = bytes(tail[:name_size]).decode(errors="replace")
+        if len(tail) < name_size + 8 or compression not in ("", "zstd", "lz4"):
+            return
+        told = len(head) + name_size + 8 + int.from_bytes(tail[name_size:], "little")
+        for length in dict.fromkeys((told, claimed + 9)):
+            claim = ChunkClaim(length, size, compression, crc)
+            agreed = length == told == claimed + 9 and opcode == Opcode.CHUNK
+            fits = claim.packed >= 0 and position + length <= self._end
+            if agreed or not fits or self._stands_at(position + length):
+                yield claim, "" if agreed else "its opcode or length is damaged"
 
-    def _found(
-        self,
-        position: int,
-        length: int,
-        times: tuple[int, int],
-        crc: int,
-        name: str,
-        data: Any,
-        packed: int,
-        wrong: str,
-    ) -> Found:
-        chunk = Chunk(*times, crc, name, packed, memoryview(data))
-        return Found(Opcode.CHUNK, position, length, memoryview(b""), chunk, repaired=wrong)
-
-    def unpack(self, position: int, packed: int, name: str, size: int, crc: int) -> Any:
+    def unpack(self, position: int, claim: ChunkClaim) -> Any:
         """The records of a chunk, or why they are damaged."""
-        if packed < 0 or size > MAX_CHUNK or size > MAX_RATIO.get(name, 0) * packed or self._budget < 0:
+        size, packed = claim.size, claim.packed
+        start, left = position + claim.length - packed, self._end - position - claim.length + packed
+        if not 0 <= packed <= left:
+            return f"the chunk claims {packed} bytes, but {left} are left"
+        if size > MAX_CHUNK or size > MAX_RATIO.get(claim.compression, 0) * packed or self._budget < 0:
             return f"the chunk claims {size} bytes in {packed}"
-        start = position + CHUNK_HEAD.size + len(name) + 8
-        if start + packed > self._end:
-            return "the chunk is cut off"
         try:
-            data = decompress(name, memoryview(self._source.read(start, packed)), size, "the chunk")
+            data = decompress(
+                claim.compression, memoryview(self._source.read(start, packed)), size, "the chunk"
+            )
         except FormatError as err:
             self._budget -= packed
             return str(err)
-        if zlib.crc32(data) != crc:
+        if zlib.crc32(data) != claim.crc:
             self._budget -= packed + size
             return "the chunk's CRC differs"
         return data
