@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import struct
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -15,8 +17,9 @@ from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, RECORD, iter_records, parse_record
 from tupli_mcap.mcap.walk import Chunk
 
-__all__ = ["HEADERS", "ChunkRecords", "chunk_records", "message_headers"]
+__all__ = ["HEADERS", "ChunkRecords", "chunk_records", "message_headers", "message_places", "messages"]
 
+_LENGTH = struct.Struct("<Q")  # of a record, after its opcode
 _BLOCK = 1 << 16  # records whose headers are looked at together
 HEADERS = np.dtype([(name, kind) for name, kind, _ in HEADER_FIELDS] + [("#offset", "<u8")])
 
@@ -86,7 +89,7 @@ def message_headers(data: memoryview, most: int | None = None) -> Array:
     even = _even(data, most)
     if even is not None:
         return even
-    offsets = np.fromiter(_starts(data, most), np.int64)
+    offsets = message_places(data, most)[:, 0]
     found = np.empty(len(offsets), HEADERS)
     for begin in range(0, len(offsets), _BLOCK):
         part = slice(begin, begin + _BLOCK)
@@ -97,13 +100,34 @@ def message_headers(data: memoryview, most: int | None = None) -> Array:
     return found
 
 
-def _starts(data: memoryview, most: int | None) -> Iterator[int]:
-    for i, (start, *_) in enumerate(iter_records(data)):
-        if i == most:
-            raise FormatError(
-                f"expected at most {most} messages in the compressed bytes of a chunk, found more"
-            )
-        yield start
+def message_places(data: Any, most: int | None = None) -> Array:
+    """Where consecutive Message records begin and end: int64 (records, 2). FormatError as `message_headers`."""
+    starts, at, size, length_at = [], 0, len(data), _LENGTH.unpack_from
+    for _ in itertools.count() if most is None else range(most):
+        if at + BODY > size:
+            break
+        starts.append(at)
+        at += 9 + length_at(data, at + 1)[0]
+    else:
+        if at + BODY <= size:
+            raise _too_many(most)
+    if at == size:
+        places = np.array([starts, [*starts[1:], at][: len(starts)]], np.int64).T
+        opcodes = np.frombuffer(data, np.uint8)[places[:, 0]]
+        if (opcodes == Opcode.MESSAGE).all() and (places[:, 1] - places[:, 0] >= BODY).all():
+            return places
+    return np.array([place[:2] for place in iter_records(data)], np.int64)  # says which one is none
+
+
+def messages(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """(log_time, CDR body) of consecutive Message records; FormatError before the first one for bytes that are none."""
+    for header in message_headers(data):
+        start = int(header["#offset"])
+        yield int(header["#log_time"]), data[start + BODY : start + 9 + int(header["#length"])]
+
+
+def _too_many(most: int | None) -> FormatError:
+    return FormatError(f"expected at most {most} messages, found more")
 
 
 def _packed(size: int) -> np.dtype[Any]:
@@ -126,7 +150,7 @@ def _even(data: memoryview, most: int | None) -> Array | None:
     if size < BODY or len(data) % size:
         return None
     if most is not None and len(data) // size > most:
-        raise FormatError(f"expected at most {most} messages in the compressed bytes of a chunk, found more")
+        raise _too_many(most)
     rows = np.frombuffer(data, _packed(size))
     if (rows["#opcode"] != Opcode.MESSAGE).any() or (rows["#length"] != size - 9).any():
         return None

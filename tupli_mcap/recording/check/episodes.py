@@ -11,8 +11,7 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import message_headers
-from tupli_mcap.mcap.records import BODY
+from tupli_mcap.mcap.chunk_records import messages
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
@@ -178,13 +177,8 @@ class _Checker:
         try:
             for chunk in self._store.chunks(channel):
                 data = memoryview(self._store.load(chunk, keep=False))
-                for header in message_headers(data):
-                    start = int(header["#offset"])
-                    yield (
-                        row,
-                        int(header["#log_time"]),
-                        data[start + BODY : start + 9 + int(header["#length"])],
-                    )
+                for time, body in messages(data):
+                    yield row, time, body
                     row += 1
         except FormatError as err:
             self._error("rows", _plain(err, self._recording), channel=topic)

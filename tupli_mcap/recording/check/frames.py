@@ -6,8 +6,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import message_headers
-from tupli_mcap.mcap.records import BODY
+from tupli_mcap.mcap.chunk_records import messages
 from tupli_mcap.messages.frames import FRAME_LAYOUT, CameraTopics, decode_frame
 from tupli_mcap.messages.images.pictures import format_of
 from tupli_mcap.recording.check.report import Findings
@@ -85,13 +84,8 @@ class _Pair:
         row = 0
         for chunk in self._store.chunks(channel):
             data = memoryview(self._store.load(chunk, keep=False))
-            for header in message_headers(data):
-                start = int(header["#offset"])
-                why = self._defect(
-                    data[start + BODY : start + 9 + int(header["#length"])],
-                    int(header["#log_time"]),
-                    int(times[row]) if row < len(times) else None,
-                )
+            for time, body in messages(data):
+                why = self._defect(body, time, int(times[row]) if row < len(times) else None)
                 if why:
                     self._error(f"row {row} {why}", self._topics.camera)
                 row += 1

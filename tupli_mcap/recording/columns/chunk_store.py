@@ -20,22 +20,22 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.chunk_records import message_places
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.crc import crc32
-from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAX_CHUNK, iter_records
+from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAX_CHUNK
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.limits import StepClaims
 
 __all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Span"]
 
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
-_LENGTH = struct.Struct("<Q")  # of a record, after its opcode
 _MESSAGE_HEAD = np.dtype(
     {
-        "names": ["opcode", "channel", "sequence"],
-        "formats": ["u1", "<u2", "<u4"],
-        "offsets": [0, 9, 11],
+        "names": ["channel", "sequence"],
+        "formats": ["<u2", "<u4"],
+        "offsets": [9, 11],
         "itemsize": 15,
     }
 )
@@ -393,24 +393,21 @@ class ChunkStore:
         return kept.data, kept.records
 
     def _find_records(self, i: int, data: Any) -> Array:
-        rows, channel, size = int(self.table["rows"][i]), int(self.table["channel"][i]), len(data)
+        rows, channel = int(self.table["rows"][i]), int(self.table["channel"][i])
         where = f"{self._source.name}: chunk {i}"
-        starts, at, length_at = [], 0, _LENGTH.unpack_from
-        while at + BODY <= size:
-            starts.append(at)
-            at += 9 + length_at(data, at + 1)[0]
-        if at == size and len(starts) == rows:
-            found = np.array([starts, [*starts[1:], at][:rows]], np.int64).T
-            heads = np.ndarray(max(0, size - 14), _MESSAGE_HEAD, data, 0, (1,))[found[:, 0]]
-            sound = (heads["opcode"] == 5).all() and (found[:, 1] - found[:, 0] >= BODY).all()
-            if sound and (heads["channel"] == channel).all():
-                if self.claims is not None:
-                    _check_sequence(heads["sequence"], int(self.table["first"][i]), where)
-                return found
-        for _, _, other, _, _ in iter_records(memoryview(data)):
-            if other != channel:
-                raise FormatError(f"{where} holds a message of channel {other}")
-        raise FormatError(f"{where} expected {rows} messages, found {len(starts)}")
+        try:
+            found = message_places(data, rows)
+        except FormatError as err:
+            raise FormatError(f"{where}: {err}") from err
+        heads = np.ndarray(max(0, len(data) - 14), _MESSAGE_HEAD, data, 0, (1,))[found[:, 0]]
+        others = heads["channel"][heads["channel"] != channel]
+        if len(others):
+            raise FormatError(f"{where} holds a message of channel {others[0]}")
+        if len(found) != rows:
+            raise FormatError(f"{where} expected {rows} messages, found {len(found)}")
+        if self.claims is not None:
+            _check_sequence(heads["sequence"], int(self.table["first"][i]), where)
+        return found
 
     def messages(self, i: int) -> list[list[int]]:
         """The same as a list of [start, end]."""
