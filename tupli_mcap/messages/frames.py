@@ -12,6 +12,7 @@ import numpy as np
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.episodes import read_strings
 from tupli_mcap.messages.layout import IMAGE_SCHEMA, MessageLayout
+from tupli_mcap.messages.topics import Topics, parse
 
 __all__ = [
     "CAMERA_NAME",
@@ -39,7 +40,7 @@ FRAME_LAYOUT = MessageLayout.of([("episode", np.dtype(np.uint32), ()), ("step", 
 _STAMP = struct.Struct("<iI")
 _COUNT = struct.Struct("<I")
 _PAIR = struct.Struct("<II")
-_TOPIC = re.compile("(/env_0)?/frame/([a-z](?:_?[a-z0-9]+)*)")
+_NAME = re.compile("[a-z](?:_?[a-z0-9]+)*")  # of a camera
 
 
 class CameraTopics(NamedTuple):
@@ -51,14 +52,14 @@ class CameraTopics(NamedTuple):
     @classmethod
     def of(cls, name: str, env: int | None) -> CameraTopics:
         """`env` is the sub-environment of a vector recording, None in one of a single environment."""
-        top = "" if env is None else f"/env_{env}"
-        return cls(f"{top}/camera/{name}", f"{top}/frame/{name}")
+        topics = Topics.of(env)
+        return cls(topics.camera(name), topics.frame(name))
 
 
 def camera_names(topics: Mapping[str, int]) -> tuple[str, ...]:
     """The cameras of a recording, by its topics."""
-    found = (_TOPIC.fullmatch(topic) for topic in topics)
-    return tuple(sorted(match[2] for match in found if match is not None))
+    found = [topic for topic in map(parse, topics) if topic is not None and topic.kind == "frame"]
+    return tuple(sorted(topic.name for topic in found if topic.env == 0 and _NAME.fullmatch(topic.name)))
 
 
 class EncodedFrame(NamedTuple):

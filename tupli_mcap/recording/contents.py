@@ -13,6 +13,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
 from tupli_mcap.mcap.records import check_crc
 from tupli_mcap.mcap.source import Source
+from tupli_mcap.messages.topics import FINAL_STATE, INFO, Topic, parse
 from tupli_mcap.recording.index import EPISODE_ROWS, EpisodeIndex
 
 __all__ = [
@@ -30,7 +31,7 @@ CHANNEL_KEYS = (
     "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields", "camera",
 )  # fmt: skip
 _VERSIONS = ("1", "2")
-_PLACE = re.compile("(?:/env_([0-9]+))?/(image|frame)/(.+)", re.DOTALL)
+_KEYS = {"image": "leaf", "frame": "camera"}  # of the metadata of such a channel: of what it is
 _VALUES = (
     ("uuid", "32 hexadecimal digits", re.compile("[0-9a-f]{32}")),
     ("created_ns", "a time in decimal digits", re.compile("[0-9]{1,19}")),
@@ -79,11 +80,15 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
     Raises:
         FormatError: they are not numbered from 0, or the metadata of a channel is damaged.
     """
+    found = []
     for channel in channels.values():
         if is_ours(channel.topic):
             check_crc(channel.metadata, CHANNEL_KEYS, f"{name}: the metadata of channel {channel.topic}")
-            check_place(channel, name)
-    found = [channel for channel in channels.values() if channel.topic.endswith("/step")]
+        topic = parse(channel.topic)
+        if topic is not None and topic.kind in _KEYS:
+            _check_place(channel, topic, name)
+        elif topic is not None and topic.kind == "step":
+            found.append(channel)
     by_env = {channel.metadata.get("env", ""): channel for channel in found}
     numbers = [str(i) for i in range(len(found))]
     if sorted(by_env) != sorted(numbers):
@@ -93,13 +98,9 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
     return [by_env[number] for number in numbers]
 
 
-def check_place(channel: Channel, name: str) -> None:
+def _check_place(channel: Channel, topic: Topic, name: str) -> None:
     """Raises FormatError unless the metadata of a channel of images or frames says the place that its topic says."""
-    found = _PLACE.fullmatch(channel.topic)
-    if found is None:
-        return
-    key = "leaf" if found[2] == "image" else "camera"
-    expected = {"env": found[1] or "0", key: found[3]}
+    expected = {"env": str(topic.env), _KEYS[topic.kind]: topic.name}
     told = {key: channel.metadata.get(key) for key in expected}
     if told != expected:
         raise FormatError(
@@ -108,12 +109,11 @@ def check_place(channel: Channel, name: str) -> None:
 
 
 def is_ours(topic: str) -> bool:
-    return (
-        topic in ("/final_state", "/info")
-        or topic.endswith("/step")
-        or "/image/" in topic
-        or "/frame/" in topic
-    )
+    """Whether the metadata of a channel of that topic are ours."""
+    if topic in (FINAL_STATE, INFO):
+        return True
+    place = parse(topic)
+    return place is not None and place.kind != "camera"
 
 
 def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:

@@ -13,6 +13,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.compression import MAX_RATIO
 from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC
 from tupli_mcap.mcap.records import BODY, MAX_CHUNK, MAX_ROWS_A_BYTE
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 
 __all__ = [
     "EPISODE_TOPICS",
@@ -22,7 +23,7 @@ __all__ = [
     "check_rows",
 ]
 
-EPISODE_TOPICS = ("/episode_start", "/episode_end", "/final_state")
+EPISODE_TOPICS = (EPISODE_START, EPISODE_END, FINAL_STATE)
 _U32 = 2**32 - 1
 _CHUNK_FIXED = 9 + 40  # of a Chunk record, before and after the name of its compression
 _NAMED = np.array([_CHUNK_FIXED + len(name.replace("none", "")) for name in COMPRESSIONS], np.uint64)
@@ -108,8 +109,8 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
     limit = np.array([*steps, 0], np.uint64)[env]
     good &= (length >= 1) & (length <= limit) & (first <= limit)
     good &= length <= limit - np.minimum(first, limit)
-    good &= (start < others["/episode_start"]) & (end < others["/episode_end"])
-    good &= (final >= -1) & (final < others["/final_state"]) & (how <= 2)
+    good &= (start < others[EPISODE_START]) & (end < others[EPISODE_END])
+    good &= (final >= -1) & (final < others[FINAL_STATE]) & (how <= 2)
     if not good.all():
         row = rows[int(np.argmin(good))]
         raise FormatError(

@@ -21,6 +21,7 @@ from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.read import FIELDS, ColumnReader, Columns
 from tupli_mcap.recording.columns.runs import Runs, runs_of
@@ -135,13 +136,11 @@ class Recording:
                     raise FormatError(
                         f"{self.name}: {channel.topic} describes other spaces than {steps[0].topic}"
                     )
-            if "/final_state" in topics:
-                self._check_schema(topics["/final_state"], FINAL_STATE_SCHEMA, self._layout.final_schema)
+            if FINAL_STATE in topics:
+                self._check_schema(topics[FINAL_STATE], FINAL_STATE_SCHEMA, self._layout.final_schema)
             self._images = {
                 leaf.name: {
-                    channel.id: self._topics.get(
-                        f"{channel.topic.removesuffix('/step')}/image/{leaf.name}", 0
-                    )
+                    channel.id: self._topics.get(Topics.of_step(channel.topic).image(leaf.name), 0)
                     for channel in steps
                 }
                 for leaf in self._layout.images
@@ -158,7 +157,7 @@ class Recording:
     def _check_others(self, topics: Mapping[str, Channel]) -> None:
         """The messages of episodes are what their topics say."""
         for topic, name, text in (
-            ("/episode_start", START_NAME, START_SCHEMA), ("/episode_end", END_NAME, END_SCHEMA),
+            (EPISODE_START, START_NAME, START_SCHEMA), (EPISODE_END, END_NAME, END_SCHEMA),
         ):  # fmt: skip
             if topic in topics:
                 self._check_schema(topics[topic], name, text)
@@ -168,8 +167,8 @@ class Recording:
         least = BODY + 10 + sum(_stored_bytes(layout, leaf) for leaf in layout.step_leaves)
         step = (layout.step_message.record_size, True) if layout.constant else (least, False)
         sizes = dict.fromkeys(self._step_channels, step)
-        if layout.constant and "/final_state" in self._topics:
-            sizes[self._topics["/final_state"]] = (layout.final_message.record_size, True)
+        if layout.constant and FINAL_STATE in self._topics:
+            sizes[self._topics[FINAL_STATE]] = (layout.final_message.record_size, True)
         for leaf in layout.images:
             for count, channel in zip(steps, self._images[leaf.name].values(), strict=True):
                 if self._store.count(channel) != count:
@@ -236,7 +235,7 @@ class Recording:
     @property
     def is_vector(self) -> bool:
         """True if a vector environment was recorded, of one sub-environment or more."""
-        return "/env_0/step" in self._topics
+        return Topics.of(0).step in self._topics
 
     @property
     def num_steps(self) -> int:
@@ -312,7 +311,7 @@ class Recording:
     def episode_start(self, i: int) -> EpisodeStart:
         """The `/episode_start` message of episode `i`."""
         row = self.index[i]
-        (body,) = self._store.bodies(self._channel("/episode_start"), int(row["start_row"]), 1)
+        (body,) = self._store.bodies(self._channel(EPISODE_START), int(row["start_row"]), 1)
         start = EpisodeStart.decode(body)
         if start.episode != row["episode"]:
             raise FormatError(
@@ -327,7 +326,7 @@ class Recording:
             return []
         at = rows["start_row"].astype(np.int64)
         first = int(at.min())
-        bodies = list(self._store.bodies(self._channel("/episode_start"), first, int(at.max()) + 1 - first))
+        bodies = list(self._store.bodies(self._channel(EPISODE_START), first, int(at.max()) + 1 - first))
         starts = [EpisodeStart.decode(bodies[i]) for i in (at - first).tolist()]
         for start, episode in zip(starts, rows["episode"].tolist(), strict=True):
             if start.episode != episode:
@@ -345,7 +344,7 @@ class Recording:
         row = self.index[i]
         found: list[EpisodeStart] = []
         for at in range(int(row["start_row"]) - 1, -1, -1):
-            (body,) = self._store.bodies(self._channel("/episode_start"), at, 1)
+            (body,) = self._store.bodies(self._channel(EPISODE_START), at, 1)
             start = EpisodeStart.decode(body)
             if start.episode != row["episode"] or start.env != row["env"]:
                 break
@@ -378,7 +377,7 @@ class Recording:
             )
         if not len(rows):
             return self.read([], fields=["states"]).states
-        columns = self._reader.final_columns(self._channel("/final_state"), rows)
+        columns = self._reader.final_columns(self._channel(FINAL_STATE), rows)
         return self.layout.nest_state(columns)
 
     def _channel(self, topic: str) -> int:
@@ -396,7 +395,7 @@ class Recording:
 
     def infos(self, i: int) -> list[dict[str, Any] | None] | None:
         """The recorded infos of episode `i`, one a step; None if the recording has none."""
-        channel = self._topics.get("/info")
+        channel = self._topics.get(INFO)
         if channel is None:
             return None
         if self._infos is None:
@@ -525,7 +524,7 @@ class Recording:
         ends = np.cumsum(lengths) - 1
         finals: list[Any] = []
         if known.any():
-            finals = self._reader.final_columns(self._channel("/final_state"), rows[known])
+            finals = self._reader.final_columns(self._channel(FINAL_STATE), rows[known])
         columns = []
         for i, leaf in enumerate(layout.state):
             column = leaf.get(states)
@@ -546,7 +545,7 @@ class Recording:
     @property
     def stored(self) -> StoredSteps:
         """Where the steps lie; RecordingError if there is none yet."""
-        finals = self._topics.get("/final_state")
+        finals = self._topics.get(FINAL_STATE)
         where, source = self._reopen, self._source
         return StoredSteps(self.layout, self._store, self._step_channels, self._images, finals, where, source)
 

@@ -8,10 +8,11 @@ from typing import NamedTuple
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
-from tupli_mcap.messages.frames import CAMERA_NAME, CAMERA_SCHEMA, FRAME_NAME, FRAME_SCHEMA, CameraTopics
+from tupli_mcap.messages.frames import CAMERA_NAME, CAMERA_SCHEMA, FRAME_NAME, FRAME_SCHEMA
 from tupli_mcap.messages.images.codecs import CODEC, image_codecs
 from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 
 __all__ = [
     "Channels",
@@ -65,38 +66,37 @@ def register_channels(
         return container.add_channel(topic, schemas[schema], metadata)
 
     description = layout.to_metadata()
-    tops = [""] if sub_environments is None else [f"/env_{i}" for i in range(sub_environments)]
+    environments = [Topics.of(i) for i in ([None] if sub_environments is None else range(sub_environments))]
     steps = [
-        channel(f"{top}/step", STEP_SCHEMA, layout.step_schema, {**description, "env": str(i)})
-        for i, top in enumerate(tops)
+        channel(topics.step, STEP_SCHEMA, layout.step_schema, {**description, "env": str(i)})
+        for i, topics in enumerate(environments)
     ]
     images = [
         [
             channel(
-                f"{top}/image/{leaf.name}",
+                topics.image(leaf.name),
                 *((CAMERA_NAME, CAMERA_SCHEMA) if leaf.name in png else (IMAGE_NAME, IMAGE_SCHEMA)),
                 {"env": str(i), "leaf": leaf.name, **({CODEC: "png"} if leaf.name in png else {})},
             )
-            for i, top in enumerate(tops)
+            for i, topics in enumerate(environments)
         ]
         for leaf in layout.images
     ]
     others = (
-        channel("/final_state", FINAL_STATE_SCHEMA, layout.final_schema, description),
-        channel("/episode_start", START_NAME, START_SCHEMA, {}),
-        channel("/episode_end", END_NAME, END_SCHEMA, {}),
-        None if info is None else channel("/info", "tupli_mcap/msg/Info", info[0], info[1]),
+        channel(FINAL_STATE, FINAL_STATE_SCHEMA, layout.final_schema, description),
+        channel(EPISODE_START, START_NAME, START_SCHEMA, {}),
+        channel(EPISODE_END, END_NAME, END_SCHEMA, {}),
+        None if info is None else channel(INFO, "tupli_mcap/msg/Info", info[0], info[1]),
     )
     pairs: list[tuple[int, int]] = []
     for name in cameras:
         pairs = []
-        for i in range(len(tops)):
-            topics = CameraTopics.of(name, None if sub_environments is None else i)
+        for i, topics in enumerate(environments):
             about = {"env": str(i), "camera": name}
             pairs.append(
                 (
-                    channel(topics.camera, CAMERA_NAME, CAMERA_SCHEMA, {}),
-                    channel(topics.frame, FRAME_NAME, FRAME_SCHEMA, about),
+                    channel(topics.camera(name), CAMERA_NAME, CAMERA_SCHEMA, {}),
+                    channel(topics.frame(name), FRAME_NAME, FRAME_SCHEMA, about),
                 )
             )
     container.codecs = image_codecs(layout, container.channels)

@@ -26,6 +26,7 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import record
 from tupli_mcap.messages.layout import Field, record_dtype
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.rewrite import Follower, rewrite_recording
 from tupli_mcap.spaces.leaves import Leaf
@@ -89,8 +90,8 @@ def _followers(source: Recording) -> list[Follower]:
     layout, labels = source.layout, source.labels
     found = []
     for env in range(source.num_envs):
-        top = f"/env_{env}" if source.is_vector else ""
-        steps = f"{top}/step"
+        recorded = Topics.of(env if source.is_vector else None)
+        top, steps = recorded.top, recorded.step
         topics = companion_topics(layout, top)
         for leaf in layout.step_leaves:
             if _is_plotted(leaf):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.messages.topics import EPISODE_END, Topics
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.spaces.labels import Labels
@@ -48,7 +49,8 @@ def write_layout(recording: Recording, target: str | os.PathLike[str]) -> Path:
 
 def foxglove_layout(recording: Recording) -> dict[str, Any]:
     """States and actions on the left, pictures, reward and ends on the right; of the first sub-environment."""
-    top = "/env_0" if recording.is_vector else ""
+    recorded = Topics.of(0 if recording.is_vector else None)
+    top = recorded.top
     layout, labels = recording.layout, recording.labels
     panels: dict[str, dict[str, Any]] = {}
     left: list[str] = []
@@ -63,7 +65,7 @@ def foxglove_layout(recording: Recording) -> dict[str, Any]:
     for leaf in [*layout.state, *layout.action]:
         paths = _paths(leaf, top, labels, layout.dtypes.get(leaf.name), topics)
         if leaf.apart:
-            add(right, "Image", leaf.path, {"imageMode": {"imageTopic": f"{top}/image/{leaf.name}"}})
+            add(right, "Image", leaf.path, {"imageMode": {"imageTopic": recorded.image(leaf.name)}})
         elif type(leaf.space) is spaces.Discrete:
             add(left, "StateTransitions", leaf.path, {"isSynced": True, "paths": paths})
         elif type(leaf.space) is spaces.Text:
@@ -71,13 +73,13 @@ def foxglove_layout(recording: Recording) -> dict[str, Any]:
         elif paths:
             add(left, "Plot", leaf.path, {**_PLOT, "paths": paths})
     for camera in recording.cameras:
-        add(right, "Image", f"camera {camera}", {"imageMode": {"imageTopic": f"{top}/camera/{camera}"}})
+        add(right, "Image", f"camera {camera}", {"imageMode": {"imageTopic": recorded.camera(camera)}})
     rewards = [
         p for leaf in layout.reward for p in _paths(leaf, top, labels, layout.dtypes.get(leaf.name), topics)
     ]
     add(right, "Plot", "return", {**_PLOT, "paths": [_path(f"{top}/plot/return.data[0]", "return")]})
     add(right, "Plot", "reward", {**_PLOT, "paths": rewards})
-    add(right, "RawMessages", "last end of an episode", {"topicPath": "/episode_end"})
+    add(right, "RawMessages", "last end of an episode", {"topicPath": EPISODE_END})
     return {
         "configById": panels,
         "globalVariables": {},
@@ -95,7 +97,7 @@ def _paths(
         return []
     names = dimension_names(leaf, labels.dimensions.get(leaf.path))
     # a float16 is stored as its bits, which are no number to plot
-    place = f"{topics[leaf.name]}.data" if dtype == np.float16 else f"{top}/step.{leaf.name}"
+    place = f"{topics[leaf.name]}.data" if dtype == np.float16 else f"{Topics(top).step}.{leaf.name}"
     if leaf.shape == () and dtype != np.float16:
         return [_path(place, names[0])]
     return [_path(f"{place}[{i}]", name) for i, name in enumerate(names[:_MOST_LINES])]

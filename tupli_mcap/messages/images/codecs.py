@@ -17,6 +17,7 @@ from tupli_mcap.messages.images.png import PngCodec
 from tupli_mcap.messages.images.stack import StackCodec
 from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import parse
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["CODEC", "ImageCodec", "image_codecs", "png_leaves", "uses_codecs"]
@@ -46,7 +47,10 @@ def image_codecs(layout: StepLayout, channels: Mapping[int, Channel]) -> dict[in
     leaves = {leaf.name: leaf for leaf in layout.images}
     for number, channel in channels.items():
         leaf = leaves.get(channel.metadata.get("leaf", ""))
-        if leaf is None or "/image/" not in channel.topic:
+        if leaf is None:
+            continue
+        topic = parse(channel.topic)
+        if topic is None or topic.kind != "image":
             continue
         codec = _codec(channel, leaf, layout.image_messages[leaf.name])
         if codec is not None:

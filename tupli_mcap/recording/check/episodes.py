@@ -16,6 +16,7 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recording import Recording
@@ -36,7 +37,7 @@ def verify_episodes(recording: Recording, findings: Findings) -> None:
         checker.steps(env, channel)
         checker.images(env, channel)
         checker.bools(channel, recording.layout.step_leaves)
-    checker.bools(recording._topics.get("/final_state", 0), recording.layout.final_leaves)
+    checker.bools(recording._topics.get(FINAL_STATE, 0), recording.layout.final_leaves)
     checker.starts()
     checker.ends()
     checker.finals()
@@ -125,9 +126,9 @@ class _Checker:
 
     def images(self, env: int, channel: int) -> None:
         """Image channels have a row for each step, and the bytes that never change."""
-        top = self._recording._contents.channels[channel].topic.removesuffix("/step")
+        topics = Topics.of_step(self._recording._contents.channels[channel].topic)
         for leaf in self._layout.images:
-            topic = f"{top}/image/{leaf.name}"
+            topic = topics.image(leaf.name)
             number = self._topics.get(topic, 0)
             steps, found = self._store.count(channel), self._store.count(number)
             if steps != found:
@@ -186,8 +187,8 @@ class _Checker:
     def starts(self) -> None:
         """Every episode has one start, where the index says, and it says what the index says."""
         seen: set[int] = set()
-        for row, time, body in self._messages("/episode_start"):
-            place: dict[str, Any] = {"channel": "/episode_start"}
+        for row, time, body in self._messages(EPISODE_START):
+            place: dict[str, Any] = {"channel": EPISODE_START}
             try:
                 start = EpisodeStart.decode(body)
                 place["episode"] = start.episode
@@ -215,13 +216,13 @@ class _Checker:
             if facts != index or bytes(body[16:18]) not in (b"\0\0", b"\1\0", b"\0\1", b"\1\1"):
                 self._error("episode", f"its start and the index differ: {facts} and {index}", **place)
         for number in sorted(self._at.keys() - seen):
-            self._error("episode", "it has no start", episode=number, channel="/episode_start")
+            self._error("episode", "it has no start", episode=number, channel=EPISODE_START)
 
     def ends(self) -> None:
         """Every episode has one end, and it says what the index says."""
         seen: set[int] = set()
-        for row, time, body in self._messages("/episode_end"):
-            place: dict[str, Any] = {"channel": "/episode_end"}
+        for row, time, body in self._messages(EPISODE_END):
+            place: dict[str, Any] = {"channel": EPISODE_END}
             try:
                 end = EpisodeEnd.decode(body)
                 place["episode"] = end.episode
@@ -252,11 +253,11 @@ class _Checker:
             if end.metadata != self._recording._contents.index.metadata_text(i):
                 self._error("episode", "its metadata differ between its end and the index", **place)
         for number in sorted(self._at.keys() - seen):
-            self._error("episode", "it has no end", episode=number, channel="/episode_end")
+            self._error("episode", "it has no end", episode=number, channel=EPISODE_END)
 
     def finals(self) -> None:
         """Final states are those of episodes that say they have one."""
-        layout, topic = self._layout, "/final_state"
+        layout, topic = self._layout, FINAL_STATE
         rows = {int(row["final_row"]): row for row in self._rows if row["final_row"] >= 0}
         constant = all(leaf.kind != "variable" for leaf in layout.final_leaves)
         size = layout.final_message.body_size if constant else 0
@@ -297,13 +298,13 @@ class _Checker:
 
     def infos(self) -> None:
         """Infos are those of steps that are there, at most one each."""
-        channel = self._topics.get("/info")
+        channel = self._topics.get(INFO)
         if channel is None:
             return
         decoder = InfoCodec.from_metadata(self._recording._contents.channels[channel].metadata)
         last: dict[int, int] = {}
-        for row, _, body in self._messages("/info"):
-            place: dict[str, Any] = {"channel": "/info"}
+        for row, _, body in self._messages(INFO):
+            place: dict[str, Any] = {"channel": INFO}
             try:
                 number, step, _ = decoder.decode(body)
             except FormatError as err:

@@ -17,6 +17,7 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.infos import InfoCodec
+from tupli_mcap.messages.topics import INFO
 from tupli_mcap.recording.check.episodes import verify_episodes
 from tupli_mcap.recording.check.frames import verify_frames
 from tupli_mcap.recording.check.report import Findings, Problem, VerifyReport
@@ -159,9 +160,9 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
     if not recording.num_envs:
         return
     topics = {channel.topic: channel for channel in recording._contents.channels.values()}
-    info = topics.get("/info")
+    info = topics.get(INFO)
     wanted = Container(-1, recording.name, "none")
-    vector = None if "/step" in topics else recording.num_envs
+    vector = recording.num_envs if recording.is_vector else None
     try:
         infos = None if info is None else (InfoCodec.from_metadata(info.metadata).schema()[0], info.metadata)
         png = png_leaves(recording._contents.channels)

@@ -14,6 +14,7 @@ from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.recording import Recording
@@ -21,7 +22,6 @@ from tupli_mcap.recording.recording import Recording
 __all__ = ["Follower", "NewFrames", "Target", "Transfer"]
 
 _CHUNK = 256 * 1024
-_START, _END, _FINAL = "/episode_start", "/episode_end", "/final_state"
 
 
 class Follower(NamedTuple):
@@ -138,13 +138,13 @@ class Transfer:
             firsts[mine] = self._target.next_row(self._to(channel)) + np.cumsum(lengths) - lengths
             spans = _merged([(int(rows["first_row"][i]), int(rows["length"][i])) for i in mine])
             self._copy(channel, spans, layout.step_message.dtype if layout.constant else None)
-            topic = self._source._contents.channels[channel].topic.removesuffix("/step")
+            topics = Topics.of_step(self._source._contents.channels[channel].topic)
             for leaf in layout.images:
-                images = self._topics[f"{topic}/image/{leaf.name}"]
+                images = self._topics[topics.image(leaf.name)]
                 self._copy(images, spans, layout.image_messages[leaf.name].dtype)
         self._events(rows, firsts)
         self._frames(rows)
-        if "/info" in self._topics:
+        if INFO in self._topics:
             self._infos(rows["episode"])
 
     def _to(self, channel: int) -> int:
@@ -238,8 +238,11 @@ class Transfer:
     def _events(self, rows: Array, firsts: Array) -> None:
         """Starts, ends and final states, and the rows of the index."""
         target, topics = self._target, self._topics
-        begins = {topic: target.next_row(self._to(topics[topic])) for topic in (_START, _END, _FINAL)}
-        latest = {topic: target.latest(self._to(topics[topic])) for topic in (_START, _END)}
+        begins = {
+            topic: target.next_row(self._to(topics[topic]))
+            for topic in (EPISODE_START, EPISODE_END, FINAL_STATE)
+        }
+        latest = {topic: target.latest(self._to(topics[topic])) for topic in (EPISODE_START, EPISODE_END)}
         starts: list[tuple[int, bytes]] = []
         ends: list[tuple[int, bytes]] = []
         finals: list[tuple[int, bytes]] = []
@@ -250,26 +253,26 @@ class Transfer:
         for row, first in zip(rows, firsts, strict=True):
             last = int(row["start_row"])
             resets = len(self._source.resets_before(positions[int(row["episode"])]))
-            for start_time, body in self._messages(topics[_START], last - resets, resets + 1):
+            for start_time, body in self._messages(topics[EPISODE_START], last - resets, resets + 1):
                 start = EpisodeStart.decode(memoryview(body))
                 number = start.episode + self._shift
                 starts.append((start_time, start._replace(episode=number, first_row=int(first)).encode()))
-            ((end_time, body),) = self._messages(topics[_END], int(row["end_row"]), 1)
+            ((end_time, body),) = self._messages(topics[EPISODE_END], int(row["end_row"]), 1)
             end = EpisodeEnd.decode(memoryview(body))
             end = end._replace(episode=end.episode + self._shift, first_row=int(first))
             final = -1
             if row["final_row"] >= 0:
-                final = begins[_FINAL] + final_places[len(finals)]
-                finals += self._messages(topics[_FINAL], int(row["final_row"]), 1)
+                final = begins[FINAL_STATE] + final_places[len(finals)]
+                finals += self._messages(topics[FINAL_STATE], int(row["final_row"]), 1)
             target.index.add(
                 int(first),
                 end.length,
                 end.episode_return,
-                max(int(row["start_time"]), latest[_START]),
-                max(int(row["end_time"]), latest[_END]),
+                max(int(row["start_time"]), latest[EPISODE_START]),
+                max(int(row["end_time"]), latest[EPISODE_END]),
                 int(row["seed"]) if row["has_seed"] else None,
-                begins[_START] + len(starts) - 1,
-                begins[_END] + end_places[len(ends)],
+                begins[EPISODE_START] + len(starts) - 1,
+                begins[EPISODE_END] + end_places[len(ends)],
                 final,
                 end.episode,
                 end.env,
@@ -277,9 +280,9 @@ class Transfer:
                 end.metadata,
             )
             ends.append((end_time, end.encode()))
-        self._write(topics[_START], _in_time(starts))
-        self._write(topics[_END], _in_time(_in_order(ends, end_places)))
-        self._write(topics[_FINAL], _in_time(_in_order(finals, final_places)), numbered=True)
+        self._write(topics[EPISODE_START], _in_time(starts))
+        self._write(topics[EPISODE_END], _in_time(_in_order(ends, end_places)))
+        self._write(topics[FINAL_STATE], _in_time(_in_order(finals, final_places)), numbered=True)
 
     def _frames(self, rows: Array) -> None:
         """The frames of episodes: pictures, and what they show row by row."""
@@ -320,7 +323,7 @@ class Transfer:
                 yield from self._messages(channel, place, 1)
 
     def _infos(self, numbers: Array) -> None:
-        channel = self._topics["/info"]
+        channel = self._topics[INFO]
         everything = self._messages(channel, 0, self._store.count(channel))
         found = np.array([int.from_bytes(body[:4], "little") for _, body in everything], np.int64)
         self._copy_places(channel, np.flatnonzero(np.isin(found, numbers)), numbered=True)

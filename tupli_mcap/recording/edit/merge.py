@@ -18,6 +18,7 @@ from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
+from tupli_mcap.messages.topics import INFO
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.assemble import Target, Transfer
 from tupli_mcap.recording.edit.replacing import replacing, tidy
@@ -190,8 +191,8 @@ def _metadata(source: Recording, *, next_episode: int) -> dict[str, str]:
 def _define_missing(source: Recording, container: Container) -> None:
     """The channels of infos and cameras that the recordings before have not."""
     info = None
-    if "/info" in source._topics:
-        channel = source._contents.channels[source._topics["/info"]]
+    if INFO in source._topics:
+        channel = source._contents.channels[source._topics[INFO]]
         text = source._contents.schemas[channel.schema_id].data.decode()
         info = text, {key: value for key, value in channel.metadata.items() if key != "crc"}
     vector = source.num_envs if source.is_vector else None

@@ -16,6 +16,7 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import OTHER_TOOLS
 from tupli_mcap.mcap.walk import Damage, attachment_name
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.edit.repaired_frames import OldCameras, frames_lost
@@ -262,7 +263,7 @@ def _recover_ours(
         writer.steps(layout, channels, plan, store)
         _report_plan(report, plan)
         report.infos_lost = _infos_lost(gathered, channels)
-        vector = gathered.channels[channels.steps[0]].topic != "/step"
+        vector = Topics.of_step(gathered.channels[channels.steps[0]].topic).is_vector
         report.frames_lost = frames_lost(gathered, OldCameras.of(gathered, len(channels.steps), vector))
     writer.finish()
     if gathered.metadata is None:

@@ -22,6 +22,7 @@ from tupli_mcap.messages.episodes import record
 from tupli_mcap.messages.frames import CameraTopics
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.repaired_frames import OldCameras, kept_frames
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
@@ -91,7 +92,7 @@ class RepairWriter:
     def steps(self, layout: StepLayout, old: Channels, plan: Plan, store: PackedStore) -> None:
         """Every message of the episodes that are kept."""
         channels = self._gathered.channels
-        vector = channels[old.steps[0]].topic != "/step"
+        vector = Topics.of_step(channels[old.steps[0]].topic).is_vector
         info = None
         if old.info is not None:
             schema = self._gathered.schemas.get(channels[old.info].schema_id)

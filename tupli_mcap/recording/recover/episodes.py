@@ -17,6 +17,7 @@ from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.frames import FRAME_LAYOUT
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, Topics, parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
@@ -51,7 +52,7 @@ def chunk_table(found: Scan, memory: list[Rows]) -> np.ndarray[Any, Any]:
     return np.array([*found.chunks, *extra], CHUNK_ROWS)
 
 
-_START, _END, _FINAL = "/episode_start", "/episode_end", "/final_state"
+_START, _END, _FINAL = EPISODE_START, EPISODE_END, FINAL_STATE
 
 
 class _Episodes:
@@ -227,7 +228,7 @@ def _beyond_frames(store: ChunkStore, topics: dict[str, int]) -> int:
     """A number beyond those of the episodes that frames show: the steps of some may be lost."""
     beyond = 0
     for topic, channel in topics.items():
-        if "/frame/" in topic:
+        if (place := parse(topic)) is not None and place.kind == "frame":
             for chunk in store.chunks(channel):
                 beyond = max(beyond, int(store.rows(chunk, FRAME_LAYOUT.dtype)["episode"].max()) + 1)
     return beyond
@@ -252,6 +253,6 @@ def _index(episodes: _Episodes, table: np.ndarray[Any, Any]) -> EpisodeIndex:
 
 def _available(store: ChunkStore, topics: dict[str, int], layout: StepLayout, channel: Channel) -> int:
     """Steps of a sub-environment that are whole: of which all images are there."""
-    top = channel.topic.removesuffix("/step")
-    images = [topics.get(f"{top}/image/{leaf.name}", 0) for leaf in layout.images]
+    mine = Topics.of_step(channel.topic)
+    images = [topics.get(mine.image(leaf.name), 0) for leaf in layout.images]
     return min(store.count(one) for one in (channel.id, *images))

@@ -11,6 +11,7 @@ import numpy as np
 from tupli_mcap.mcap.chunk_records import message_headers
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.recover.evidence import Gathered, PackedStore
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts, sum_up
@@ -36,12 +37,10 @@ class Channels(NamedTuple):
         found = step_channels(gathered.channels, gathered.source.name)
         topics = {channel.topic: channel.id for channel in gathered.channels.values()}
         images = {
-            leaf.name: [
-                topics.get(f"{channel.topic.removesuffix('/step')}/image/{leaf.name}") for channel in found
-            ]
+            leaf.name: [topics.get(Topics.of_step(channel.topic).image(leaf.name)) for channel in found]
             for leaf in layout.images
         }
-        names = ("/episode_start", "/episode_end", "/final_state", "/info")
+        names = (EPISODE_START, EPISODE_END, FINAL_STATE, INFO)
         return cls([channel.id for channel in found], images, *(topics.get(name) for name in names))
 
 

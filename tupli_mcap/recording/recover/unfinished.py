@@ -38,6 +38,7 @@ from tupli_mcap.mcap.records import parse_record, records
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import has_summary
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.recover.episodes import Unwritten, chunk_table, complete
@@ -319,8 +320,8 @@ def _salvage(
             warnings.warn(
                 _gap(source, found.channels[channel].topic, known - total), UserWarning, stacklevel=7
             )
-        top = found.channels[channel].topic.removesuffix("/step")
-        images = [topics.get(f"{top}/image/{leaf.name}") for leaf in layout.images]
+        mine = Topics.of_step(found.channels[channel].topic)
+        images = [topics.get(mine.image(leaf.name)) for leaf in layout.images]
         _salvage_images(found, journal, layout, env, images, total, known, tail)
     for name in journal.areas:
         if name in _EVENTS or name.startswith(FRAMES_AREA):

@@ -18,8 +18,9 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.summary import check_magic, has_summary
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import Topics, parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
-from tupli_mcap.recording.contents import Contents
+from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.recover.prefix import head, metadata_at
 from tupli_mcap.recording.recover.unfinished import belongs, misplaced_journal
@@ -140,9 +141,10 @@ def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
     topics = {channel.topic: channel.id for channel in contents.channels.values()}
     _check_frames_aligned(writer, contents, counts)
     for channel in contents.channels.values():
-        if "leaf" not in channel.metadata:
+        topic = parse(channel.topic)
+        if topic is None or topic.kind != "image":
             continue
-        steps = topics.get(f"{channel.topic.partition('image/')[0]}step", 0)
+        steps = topics.get(topic.topics.step, 0)
         found, expected = counts.get(channel.id, 0), counts.get(steps, 0)
         if found != expected:
             raise RecordingError(
@@ -154,10 +156,11 @@ def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
 def _check_frames_aligned(writer: RecordingWriter, contents: Contents, counts: Mapping[int, int]) -> None:
     """What a frame shows is told by the row of the same number in another channel."""
     topics = {channel.topic: channel.id for channel in contents.channels.values()}
-    for topic, channel in topics.items():
-        if "/frame/" not in topic:
+    for name, channel in topics.items():
+        topic = parse(name)
+        if topic is None or topic.kind != "frame":
             continue
-        camera = topic.replace("/frame/", "/camera/", 1)
+        camera = topic.topics.camera(topic.name)
         found, expected = counts.get(topics.get(camera, 0), 0), counts.get(channel, 0)
         if found != expected:
             raise RecordingError(
@@ -190,12 +193,12 @@ def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> Non
     writer.index.metadata = bytearray(contents.index.metadata)
     writer.index.count = len(index_rows)
     writer.next_episode = contents.next_episode
-    steps = [c for c in writer.container.channels.values() if c.topic.endswith("/step")]
+    steps = step_channels(writer.container.channels, source.name)
     if steps:
         writer.layout = StepLayout.from_metadata(steps[0].metadata)
         writer.container.codecs = image_codecs(writer.layout, writer.container.channels)
         writer.recorded_envs = len(steps)
-        writer.recorded_vector = steps[0].topic != "/step"
+        writer.recorded_vector = Topics.of_step(steps[0].topic).is_vector
     elif contents.metadata["format_version"] < writer.format_version:
         raise RecordingError(
             f"{writer.path} was begun in format version {contents.metadata['format_version']}, holds no step, and "
