@@ -1,6 +1,7 @@
 """The messages of a recording, a kind a module: schema, encoding and decoding side by side.
 
 layout                 CDR offsets, ros2msg definitions and NumPy dtypes of a message of constant size
+topics                 what each channel is called
 step                   the layout of `/step`: where each leaf of state, action and reward lies
 encode_rows            the generated function that writes a step into a row
 decoder, batches       messages of variable size back to values: one, many

@@ -3,7 +3,7 @@
 recording, episode, frames    `Recording`, and what it gives
 open, contents                opening a file: everything that is known of it then
 index, limits                 the episode index, and whether it can be true
-topics, file_series           names of topics, and of files
+channels, file_series          the channels that a layout needs; the files of a series
 description, series           what `info` shows
 blocks                        whole episodes in bounded memory
 signature_file                the attachment that a signature is

@@ -18,6 +18,7 @@ from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import INFO
+from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.check.episodes import verify_episodes
 from tupli_mcap.recording.check.frames import verify_frames
 from tupli_mcap.recording.check.report import Findings, Problem, VerifyReport
@@ -30,7 +31,6 @@ from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.prefix import head
 from tupli_mcap.recording.recover.unfinished import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
-from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["Problem", "VerifyReport", "verify_recording"]
 

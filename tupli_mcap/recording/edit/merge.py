@@ -19,6 +19,7 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.topics import INFO
+from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.assemble import Target, Transfer
 from tupli_mcap.recording.edit.replacing import replacing, tidy
@@ -26,7 +27,6 @@ from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
 from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
-from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]
 

@@ -14,12 +14,12 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
+from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.assemble import Follower, NewFrames, Target, Transfer
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
-from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["Follower", "NewFrames", "camera_channels", "define", "rewrite_recording", "write"]
 

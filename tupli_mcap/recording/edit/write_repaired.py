@@ -23,13 +23,13 @@ from tupli_mcap.messages.frames import CameraTopics
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
+from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.repaired_frames import OldCameras, kept_frames
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.recover.evidence import Gathered, PackedStore
 from tupli_mcap.recording.recover.plan import IN_A_HOLE, RUNNING, NewPlaces, Plan, PlannedEpisode
 from tupli_mcap.recording.recover.segments import Channels, message_at, messages
-from tupli_mcap.recording.topics import register_channels
 
 __all__ = ["RECOVERED", "RepairWriter"]
 

@@ -31,7 +31,7 @@ from tupli_mcap.messages.episodes import (
 from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.topics import Channels
+    from tupli_mcap.recording.channels import Channels
 
 __all__ = ["EPISODE_AND_ENV", "EpisodeLog", "Foretold", "ResetFacts", "StartedEpisode"]
 

@@ -36,9 +36,9 @@ from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.recover.prefix import metadata_at
-from tupli_mcap.recording.topics import register_channels
 from tupli_mcap.recording.write.areas import plan_areas
 from tupli_mcap.recording.write.compressing import ChunkWorker
 from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode

@@ -11,8 +11,8 @@ from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.journal.rows import RowDeriver
 from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.channels import Channels
 from tupli_mcap.recording.index import IndexBuilder
-from tupli_mcap.recording.topics import Channels
 from tupli_mcap.recording.write.episodes import EpisodeLog
 from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.recording.write.rows.single import SingleRows

@@ -1,4 +1,4 @@
-"""Topics, and the channels that a layout needs."""
+"""The channels that a layout needs, and their ids."""
 
 from __future__ import annotations
 
