@@ -13,6 +13,7 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 from environments import same
+from recovered import differences
 
 from killing.check import Found, check_recording, found_in
 from killing.child import Job, Told, record_and_die
@@ -134,7 +135,7 @@ class _Chain:
         self._known = found
         if found and not problems and not self._kind.elsewhere and self._random.random() < 0.3:
             problems = [f"a copy, finished: {problem}" for problem in self._finish_copy()]
-        return steps, problems
+        return steps, problems or differences(self._path, self._path.parent, killed=True)
 
     def _compare(self, found: list[Found], told: Told) -> tuple[int, list[str]]:
         before, new = found[: len(self._known)], found[len(self._known) :]

@@ -236,7 +236,7 @@ class _Planner:
         ended = segment.terminal or segment.timeout
         running = closing and told is None
         # as in recovery: one that is here may be of a step that was not finished, the state of the next episode
-        unfinished = running and not ended and not self._gathered.tail.finished
+        unfinished = told is None and not ended and not self._gathered.tail.finished
         if segment.episode in self._told.finals and not unfinished:
             return self._told.finals[segment.episode]
         if ended and not self._images and (segment.env, segment.row + segment.steps) in self._gathered.finals:
