@@ -9,7 +9,7 @@ from typing import Any
 from environments import same
 
 from tupli_mcap import FormatError, Recording, journal_path, jsonvalue, recover_recording
-from tupli_mcap.journal.committed import log_records
+from tupli_mcap.journal.committed import committed_records
 from tupli_mcap.journal.file import LogArea, read_journal
 from tupli_mcap.recording.episode import Episode
 
@@ -58,9 +58,12 @@ def _is_behind_a_gap(path: Path, recording: Recording) -> bool:
         return False
     if journal.info.get("uuid") != recording.uuid:
         return False
-    logs = [area for area in journal.areas.values() if isinstance(area, LogArea)]
-    records = [record for log in logs for record in log_records(journal, log, None)]
-    return any(sequence >= recording._store.count(channel) for channel, sequence, *_ in records)
+    return any(
+        records.numbers[-1] >= recording._store.count(channel)
+        for name, area in journal.areas.items()
+        if isinstance(area, LogArea)
+        for channel, records in committed_records(journal, name).items()
+    )
 
 
 def everything(episode: Episode, recording: Recording) -> dict[str, Any]:

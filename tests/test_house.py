@@ -31,7 +31,7 @@ def test_no_module_is_named_in_a_string(path: Path) -> None:
 def test_each_folder_says_what_is_in_it(folder: Path) -> None:
     text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or ""
     assert text
-    assert len(text.splitlines()) <= 15
+    assert len(text.splitlines()) <= LONGEST.get(folder.name, 15)
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=name_of)
@@ -41,5 +41,7 @@ def test_a_folder_can_be_looked_over(folder: Path) -> None:
     )
 
 
-LARGEST = {"dataset": 18, "storage": 18, "viewer": 21, "cli": 16, "write": 15}
+LONGEST = {"journal": 35}
+"""A protocol is explained where one enters."""
+LARGEST = {"dataset": 17, "storage": 17, "viewer": 20, "cli": 16, "write": 15}
 """Folders that are still to be parted; these numbers only become smaller."""

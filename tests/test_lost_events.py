@@ -22,8 +22,8 @@ from test_recovery import killed
 
 from tupli_mcap import RecordEpisodes, Recording, journal_path, recover_recording, verify_recording
 from tupli_mcap.journal import file as journals
-from tupli_mcap.journal.committed import Salvage
-from tupli_mcap.journal.file import JournalContents, RowArea, read_journal
+from tupli_mcap.journal.committed import CommittedRows
+from tupli_mcap.journal.file import JournalContents, read_journal
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
@@ -143,10 +143,8 @@ def single(path: Path, steps: int, length: int, chunk_size: int = 32 * 77) -> Re
     return recorder
 
 
-def steps_in(journal: JournalContents, layout: StepLayout) -> Salvage:
-    area = journal.areas["steps"]
-    assert isinstance(area, RowArea)
-    return Salvage(journal, area, 0, layout.step_message.dtype, journal.info["channels"][0][0])
+def steps_in(journal: JournalContents, layout: StepLayout) -> CommittedRows:
+    return CommittedRows(journal, "steps", 0, layout.step_message.dtype, journal.info["channels"][0][0])
 
 
 @pytest.mark.parametrize("lost", [False, True])

@@ -31,7 +31,7 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
-from tupli_mcap.journal.committed import Salvage
+from tupli_mcap.journal.committed import CommittedRows
 from tupli_mcap.journal.file import JournalContents, RowArea, read_journal
 from tupli_mcap.journal.seals import checksum
 from tupli_mcap.mcap.container import Container
@@ -679,7 +679,7 @@ def test_a_journal_of_fewer_channels_is_refused() -> None:
     area = RowArea("steps", dtype.itemsize, rows=4, channels=0)
     contents = JournalContents({}, {"steps": area}, {"steps": np.empty(0, np.uint8)})
     with pytest.raises(FormatError, match="'steps' has rows of 0 channels, none of number 0"):
-        Salvage(contents, area, 0, dtype, 1)
+        CommittedRows(contents, "steps", 0, dtype, 1)
 
 
 @pytest.mark.parametrize(

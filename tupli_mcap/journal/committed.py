@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.file import JournalContents, LogArea, RowArea
-from tupli_mcap.journal.rows import RowDeriver, even_rows
+from tupli_mcap.journal.file import JournalContents, LogArea
+from tupli_mcap.journal.logs import as_rows
 from tupli_mcap.journal.seals import SECTOR, STATE, checksum, seal_of
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records
@@ -20,16 +20,20 @@ from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
 
 __all__ = [
+    "Committed",
+    "CommittedRecords",
+    "CommittedRows",
     "FinalHole",
-    "Salvage",
-    "committed_rows",
-    "image_rows",
-    "log_records",
+    "committed_records",
+    "rows_among",
+    "rows_of",
     "running_record",
     "size_behind",
-    "to_rows",
+    "torn_rows",
 ]
 
+Taken = TypeVar("Taken")
+Taken_co = TypeVar("Taken_co", covariant=True)
 SEQUENCE_END = 15  # of `sequence` in a Message record
 EPISODE_END = BODY + 4  # of `episode` in a step's
 
@@ -43,85 +47,107 @@ class FinalHole(NamedTuple):
     row: int
 
 
-class Salvage:
-    """The rows of one RowArea's channel block, in both halves.
+class Committed(Protocol[Taken_co]):
+    """The committed rows of one channel that a journal holds: their `numbers` (int64), ascending, each once.
 
-    Of a journal that may be torn, only rows count that prove to be whole: by their checksums, or by lying in
-    sectors that were written after them; the latter shows nothing where committed rows may be `rewritten`. `left_out`
-    counts the others that `after` met.
+    `whole` says which of them count: all, but those of a torn journal that do not prove to be whole.
+    """
+
+    numbers: Array
+    whole: Array
+
+    def take(self, places: Array) -> Taken_co:
+        """Copies of consecutive rows: those at `places` in `numbers`."""
+        ...
+
+
+def rows_of(committed: Committed[Taken], in_file: int) -> Taken:
+    """The reader's rule: of a channel with `in_file` rows in the file, those of the journal that go on with them.
+
+    Rows `in_file`, `in_file + 1`, … up to the first that is missing. All others are stale.
+    """
+    start = int(np.searchsorted(committed.numbers, in_file))
+    return committed.take(np.arange(start, start + _run(committed, start, in_file)))
+
+
+def _run(committed: Committed[Any], start: int, first: int, *, torn: bool = False) -> int:
+    """How many rows from place `start` on have the numbers from `first` on; also `torn` ones, if asked for."""
+    numbers = committed.numbers[start:]
+    good = numbers == first + np.arange(len(numbers))
+    if not torn:
+        good &= committed.whole[start:]
+    return int(np.argmin(np.append(good, False)))
+
+
+def torn_rows(committed: Committed[Any], in_file: int) -> int:
+    """How many rows more `rows_of` would give if none were torn."""
+    start = int(np.searchsorted(committed.numbers, in_file))
+    return _run(committed, start, in_file, torn=True) - _run(committed, start, in_file)
+
+
+def rows_among(committed: Committed[Taken], wanted: Array) -> list[Taken]:
+    """All rows of which the mask `wanted` says so, whichever are missing: in runs of consecutive ones."""
+    places = np.flatnonzero(wanted & committed.whole)
+    edges = np.flatnonzero(np.diff(committed.numbers[places]) != 1) + 1
+    return [committed.take(part) for part in np.split(places, edges) if len(part)]
+
+
+class CommittedRows:
+    """The committed rows of one channel in an area of rows, in both halves.
+
+    Of a journal that may be torn, those are whole that checksums show to be, or that lie in sectors which were written
+    after them; the latter shows nothing where committed rows may be `rewritten`.
     """
 
     def __init__(
         self,
-        contents: JournalContents,
-        area: RowArea,
+        journal: JournalContents,
+        name: str,
         block: int,
         dtype: np.dtype[Any],
         channel: int,
         *,
         rewritten: bool = False,
     ) -> None:
+        area = journal.row_area(name)
         shape = (2, area.channels, area.rows + 1, area.row_size)
-        if area.row_size != dtype.itemsize or contents.data[area.name].size != np.prod(shape):
+        if area.row_size != dtype.itemsize or journal.data[name].size != np.prod(shape):
             raise FormatError(
-                f"the journal's area {area.name!r} has rows of {area.row_size} bytes, not {dtype.itemsize}"
+                f"the journal's area {name!r} has rows of {area.row_size} bytes, not {dtype.itemsize}"
             )
         if block >= area.channels:
             raise FormatError(
-                f"the journal's area {area.name!r} has rows of {area.channels} channels, none of number {block}"
+                f"the journal's area {name!r} has rows of {area.channels} channels, none of number {block}"
             )
-        self._bytes = np.ascontiguousarray(contents.data[area.name].reshape(shape)[:, block])
+        self._bytes = np.ascontiguousarray(journal.data[name].reshape(shape)[:, block])
         self._area = area
         self._block = block
-        self.rows: Array = self._bytes.view(dtype)[..., 0]
-        committed = (
-            (self.rows["#opcode"] == 5) & (self.rows["#channel"] == channel) & (self.rows["#log_time"] != 0)
-        )
-        committed &= self.rows["#sequence"] != HOLE
+        self._torn, self._sealed, self._rewritten = journal.torn, journal.sealed_rows, rewritten
+        rows: Array = self._bytes.view(dtype)[..., 0]
+        committed = (rows["#opcode"] == 5) & (rows["#channel"] == channel) & (rows["#log_time"] != 0)
+        committed &= rows["#sequence"] != HOLE
         committed[:, area.rows] = False  # the spare row is never committed
         halves, places = np.nonzero(committed)
-        order = np.argsort(self.rows["#sequence"][halves, places], kind="stable")
+        self.rows = rows
+        self.numbers, order = np.unique(rows["#sequence"][halves, places].astype(np.int64), return_index=True)
         self._halves, self._places = halves[order], places[order]
-        self._sequences = self.rows["#sequence"][self._halves, self._places].astype(np.int64)
-        self._torn, self._sealed = contents.torn, contents.sealed_rows
-        self._rewritten = rewritten
-        self.left_out = 0
-
-    def after(self, first: int) -> Array:
-        """A copy of the rows with sequence `first`, `first + 1`, … until one is missing."""
-        start = int(np.searchsorted(self._sequences, first))
-        run = self._sequences[start:]
-        good = int(np.argmin(np.append(run == first + np.arange(len(run)), False)))
+        self.whole: Array = np.ones(len(order), np.bool_)
         if self._torn:
-            whole = next((i for i in range(good) if not self._is_whole(start + i)), good)
-            self.left_out, good = good - whole, whole
-        chosen = slice(start, start + good)
-        return self.rows[self._halves[chosen], self._places[chosen]].copy()
+            self.whole = np.fromiter(map(self._is_whole, range(len(order))), np.bool_)
 
-    def runs(self, wanted_of: Callable[[Array], Array]) -> list[Array]:
-        """Copies of committed rows, in runs of consecutive ones: those whose sequences `wanted_of` says (as a mask)."""
-        wanted = np.flatnonzero(wanted_of(self._sequences))
-        sequences, places = np.unique(self._sequences[wanted], return_index=True)
-        chosen = wanted[places]
-        if self._torn:
-            whole = np.array([self._is_whole(int(i)) for i in chosen], dtype=np.bool_)
-            chosen, sequences = chosen[whole], sequences[whole]
-        edges = np.flatnonzero(np.diff(sequences) != 1) + 1
-        return [
-            self.rows[self._halves[part], self._places[part]].copy()
-            for part in np.split(chosen, edges)
-            if len(part)
-        ]
+    def take(self, places: Array) -> Array:
+        """Copies of the rows at `places`, as they lie there."""
+        return self.rows[self._halves[places], self._places[places]].copy()
 
     @property
     def end(self) -> int:
-        """The sequence after the last committed one here; 0 if there is none."""
-        return int(self._sequences[-1]) + 1 if len(self._sequences) else 0
+        """The number after that of the last committed row; 0 if there is none."""
+        return int(self.numbers[-1]) + 1 if len(self.numbers) else 0
 
     def row(self, sequence: int) -> Array | None:
         """The committed row with `sequence`; None if it is not here."""
         found = self._find(sequence)
-        if found is None or (self._torn and not self._is_whole(found)):
+        if found is None or not self.whole[found]:
             return None
         row: Array = self.rows[self._halves[found], self._places[found]]
         return row
@@ -164,10 +190,8 @@ class Salvage:
         return [FinalHole(episode, state.tobytes(), time_ns, row) for episode, state, time_ns, row in found]
 
     def _find(self, sequence: int) -> int | None:
-        found = int(np.searchsorted(self._sequences, sequence))
-        if found == len(self._sequences) or self._sequences[found] != sequence:
-            return None
-        return found
+        found = int(np.searchsorted(self.numbers, sequence))
+        return found if found < len(self.numbers) and self.numbers[found] == sequence else None
 
     def _is_whole(self, i: int) -> bool:
         """Whether the i-th committed row was on the disk as it had been committed."""
@@ -184,7 +208,7 @@ class Salvage:
             return True
         # A row of less than a sector lies in two at most. The second one also holds the commitment of the next row,
         # which came later: where that is on the disk, so is the end of this row.
-        follows = i + 1 < len(self._sequences) and self._sequences[i + 1] == self._sequences[i] + 1
+        follows = i + 1 < len(self.numbers) and self.numbers[i + 1] == self.numbers[i] + 1
         beside = follows and (int(self._halves[i + 1]), int(self._places[i + 1])) == (half, place + 1)
         if beside:
             return size <= SECTOR - SEQUENCE_END
@@ -197,57 +221,37 @@ class Salvage:
         return bool(later and hole["episode"] == row["episode"] and (row["terminal"] or row["timeout"]))
 
 
-def committed_rows(
-    salvage: Salvage, first: int, channel: int, last: Array | None
-) -> tuple[Rows | None, Array]:
-    """Completed rows from sequence `first` on; `last` is the row before them in the file."""
-    rows = salvage.after(first)
-    if not len(rows):
-        return None, rows
-    deriver = RowDeriver()
-    if last is not None:
-        deriver = RowDeriver(int(last["episode"]), int(last["step"]), int(last["#log_time"]))
-    deriver.fill(rows)
-    return even_rows(channel, first, rows.view(np.uint8).tobytes(), rows), rows
+class CommittedRecords:
+    """The committed records of one channel in a log, in the order of `numbers`."""
+
+    def __init__(self, channel: int, records: Mapping[int, bytes]) -> None:
+        self._channel = channel
+        self.numbers: Array = np.array(sorted(records), np.int64)
+        self.whole: Array = np.ones(len(records), np.bool_)
+        self._records = [records[number] for number in self.numbers.tolist()]
+
+    def take(self, places: Array) -> Rows:
+        """The records at `places`."""
+        chosen = [self._records[i] for i in places.tolist()]
+        sizes = np.fromiter(map(len, chosen), np.uint64)
+        first = int(self.numbers[places[0]]) if chosen else 0
+        return as_rows(self._channel, first, bytearray().join(chosen), sizes, sealed=True)
+
+    @property
+    def end(self) -> int:
+        """The number after that of the last committed record; 0 if there is none."""
+        return int(self.numbers[-1]) + 1 if len(self.numbers) else 0
 
 
-def image_rows(salvage: Salvage, first: int, steps: int, channel: int) -> Rows | None:
-    """Images of committed steps: rows from `first` up to `steps`."""
-    rows = salvage.after(first)[: max(0, steps - first)]
-    rows["#publish_time"] = rows["#log_time"]
-    return even_rows(channel, first, rows.view(np.uint8).tobytes(), rows) if len(rows) else None
-
-
-def log_records(
-    contents: JournalContents, area: LogArea, counts: dict[int, int] | None
-) -> list[tuple[int, int, int, bytes]]:
-    """(channel, sequence, log_time, record) of the committed records that are not in the file, in order.
-
-    `counts` are the rows of each channel that are in the file; None: all committed records, each once.
-    A record whose checksum differs ends its half.
-    """
-    found: list[tuple[int, int, int, bytes]] = []
+def committed_records(journal: JournalContents, name: str) -> dict[int, CommittedRecords]:
+    """The committed records of a log, by channel. A record whose checksum differs ends its half."""
+    found: dict[int, dict[int, bytes]] = {}
+    area = journal.log_area(name)
     for half in range(area.halves):
-        data = _half(contents, area, half)
-        for start, end, channel, sequence, log_time in _whole_records(contents, data):
-            time = log_time.to_bytes(8, "little")
-            found.append(
-                (
-                    channel,
-                    sequence,
-                    log_time,
-                    b"".join((data[start : start + 23], time, data[start + 31 : end])),
-                )
-            )
-    found.sort(key=lambda entry: (entry[0], entry[1]))
-    if counts is None:
-        return list({entry[:2]: entry for entry in found}.values())
-    expected, kept = dict(counts), []
-    for entry in found:
-        if entry[1] == expected.get(entry[0], 0):
-            expected[entry[0]] = entry[1] + 1
-            kept.append(entry)
-    return kept
+        data = _half(journal, area, half)
+        for start, end, channel, sequence, _ in _whole_records(journal, data):
+            found.setdefault(channel, {})[sequence] = bytes(data[start:end])
+    return {channel: CommittedRecords(channel, found[channel]) for channel in sorted(found)}
 
 
 def _whole_records(contents: JournalContents, data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
@@ -260,9 +264,9 @@ def _whole_records(contents: JournalContents, data: memoryview) -> Iterator[tupl
         return
 
 
-def size_behind(contents: JournalContents, area: LogArea) -> int:
-    """Bytes the file had when it took up what a log of one half held before; 0 where the journal does not say."""
-    return int(contents.data[area.name][8:16].view("<u8")[0])
+def size_behind(journal: JournalContents) -> int:
+    """Bytes the file had when it took up the events that the journal held before; 0 where it does not say."""
+    return int(journal.data[journal.log_area("events").name][8:16].view("<u8")[0])
 
 
 def _half(contents: JournalContents, area: LogArea, half: int) -> memoryview:
@@ -274,25 +278,10 @@ def _half(contents: JournalContents, area: LogArea, half: int) -> memoryview:
     return memoryview(raw.data)[start + 64 : start + 64 + end]
 
 
-def to_rows(entries: Sequence[tuple[int, int, int, bytes]]) -> list[Rows]:
-    """Entries of `log_records` as rows by channel."""
-    groups: dict[int, list[tuple[int, int, int, bytes]]] = {}
-    for entry in entries:
-        groups.setdefault(entry[0], []).append(entry)
-    rows = []
-    for channel, group in groups.items():
-        sizes = np.array([len(entry[3]) for entry in group])
-        offsets = (np.cumsum(sizes) - sizes).astype(np.uint64)
-        times = np.array([entry[2] for entry in group], dtype=np.uint64)
-        rows.append(Rows(channel, group[0][1], b"".join(entry[3] for entry in group), offsets, times))
-    return rows
-
-
-def running_record(
-    contents: JournalContents, area: LogArea, sequence: int, layout: StepLayout
-) -> bytes | None:
+def running_record(contents: JournalContents, name: str, sequence: int, layout: StepLayout) -> bytes | None:
     """The state (CDR bytes after `episode` and `env`) of the running record, which will have `sequence`; None if it is
     not here."""
+    area = contents.log_area(name)
     for half in range(area.halves):
         start = half * area.half + 64 + len(_half(contents, area, half))
         raw = memoryview(contents.data[area.name].data)[start : (half + 1) * area.half]

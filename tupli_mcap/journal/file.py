@@ -310,6 +310,20 @@ class JournalContents(NamedTuple):
     areas: dict[str, Area]
     data: dict[str, np.ndarray[Any, np.dtype[np.uint8]]]
 
+    def row_area(self, name: str) -> RowArea:
+        """The area `name`; FormatError if there is none, or one of records."""
+        area = self.areas.get(name)
+        if not isinstance(area, RowArea):
+            raise FormatError(f"the journal has no rows {name!r}")
+        return area
+
+    def log_area(self, name: str) -> LogArea:
+        """The area `name`; FormatError if there is none, or one of rows."""
+        area = self.areas.get(name)
+        if not isinstance(area, LogArea):
+            raise FormatError(f"the journal has no records {name!r}")
+        return area
+
     @property
     def torn(self) -> bool:
         """True if rows in it may be torn: the machine has started anew since, or it is not the one that recorded."""

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import bisect
-import itertools
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.committed import Salvage, log_records, running_record, size_behind
-from tupli_mcap.journal.file import (
-    FRAMES_AREA,
-    JournalContents,
-    LogArea,
-    RowArea,
-    read_journal,
-    recorded_journal,
+from tupli_mcap.journal.committed import (
+    CommittedRows,
+    committed_records,
+    rows_among,
+    running_record,
+    size_behind,
 )
+from tupli_mcap.journal.file import FRAMES_AREA, JournalContents, read_journal, recorded_journal
 from tupli_mcap.journal.rows import RowDeriver
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
@@ -87,20 +84,17 @@ def _merge(gathered: Gathered, journal: JournalContents) -> None:
         return
     layout = StepLayout.from_metadata(steps[0].metadata)
     channels = Channels.of(gathered, layout)
-    for name, log in journal.areas.items():
-        if isinstance(log, LogArea) and (name in ("events", "info") or name.startswith(FRAMES_AREA)):
-            _add_log(gathered, journal, log)
+    for name in journal.areas:
+        if name in ("events", "info") or name.startswith(FRAMES_AREA):
+            _add_log(gathered, journal, name)
     starts = _starts(gathered, channels)
     gathered.final_lost = journal.torn and bool(journal.info.get("vector"))
     for env, channel in enumerate(channels.steps):
         if layout.constant:
             state, known = _add_rows(gathered, journal, layout, env, channel, starts)
         else:
-            steps_log = journal.areas.get(f"steps/{env}")
-            if not isinstance(steps_log, LogArea):
-                raise FormatError(f"the journal has no records 'steps/{env}'")
-            known = _add_log(gathered, journal, steps_log).get(channel, 0)
-            state = running_record(journal, steps_log, _stop(gathered, channel), layout)
+            known = _add_log(gathered, journal, f"steps/{env}").get(channel, 0)
+            state = running_record(journal, f"steps/{env}", _stop(gathered, channel), layout)
             known = known if state is None else max(known, _stop(gathered, channel))
         stop = _stop(gathered, channel)
         for leaf in layout.images:
@@ -108,17 +102,13 @@ def _merge(gathered: Gathered, journal: JournalContents) -> None:
             pending = None
             if image is not None:
                 dtype = layout.image_messages[leaf.name].dtype
-                area = journal.areas.get(f"{leaf.name}/{env}")
-                if not isinstance(area, RowArea):
-                    raise FormatError(f"the journal has no rows '{leaf.name}/{env}'")
-                salvage = Salvage(journal, area, 0, dtype, image, rewritten=True)
-                pending = _add_images(gathered, salvage, leaf, image, min(stop, known))
+                committed = CommittedRows(journal, f"{leaf.name}/{env}", 0, dtype, image, rewritten=True)
+                pending = _add_images(gathered, committed, leaf, image, min(stop, known))
                 pending = pending if known >= stop else None
             state = None if state is None or pending is None else state + pending
         if state is not None:
             gathered.states[env] = state
-    events = journal.areas.get("events")
-    if isinstance(events, LogArea) and size_behind(journal, events) > gathered.source.size:
+    if size_behind(journal) > gathered.source.size:
         gathered.states.clear()  # an end may be missing, and what runs be the episode after it
 
 
@@ -132,24 +122,15 @@ def _piece(gathered: Gathered, first: int, rows: int, data: bytes) -> Piece:
     return Piece(first, rows, len(data), gathered.loaded.add(data))
 
 
-def _add_log(gathered: Gathered, journal: JournalContents, area: LogArea) -> dict[int, int]:
+def _add_log(gathered: Gathered, journal: JournalContents, name: str) -> dict[int, int]:
     """Takes the records of a log; returns the row after its last one, by channel."""
-    stops: dict[int, int] = {}
-    for channel, group in itertools.groupby(log_records(journal, area, None), key=lambda entry: entry[0]):
-        mine = list(group)
-        numbers = np.array([entry[1] for entry in mine], np.int64)
-        stops[channel] = int(numbers[-1]) + 1
-        chosen = np.flatnonzero(gathered.lacks(channel, numbers))
-        runs = np.split(chosen, np.flatnonzero(np.diff(numbers[chosen]) != 1) + 1)
+    logs = committed_records(journal, name)
+    for channel, records in logs.items():
+        runs = rows_among(records, gathered.lacks(channel, records.numbers))
         gathered.add(
-            channel,
-            [
-                _piece(gathered, mine[run[0]][1], len(run), b"".join(mine[i][3] for i in run.tolist()))
-                for run in runs
-                if len(run)
-            ],
+            channel, [_piece(gathered, rows.first, len(rows.offsets), bytes(rows.data)) for rows in runs]
         )
-    return stops
+    return {channel: records.end for channel, records in logs.items()}
 
 
 def _starts(gathered: Gathered, channels: Channels) -> dict[tuple[int, int], int]:
@@ -174,13 +155,10 @@ def _add_rows(
     starts: dict[tuple[int, int], int],
 ) -> tuple[bytes | None, int]:
     """Takes the steps of a sub-environment; returns its running state, and the row after the last one committed."""
-    area = journal.areas.get("steps")
-    if not isinstance(area, RowArea):
-        raise FormatError("the journal has no rows 'steps'")
     dtype = layout.step_message.dtype
-    salvage = Salvage(journal, area, env, dtype, channel)
+    committed = CommittedRows(journal, "steps", env, dtype, channel)
     pieces = []
-    for rows in salvage.runs(partial(gathered.lacks, channel)):
+    for rows in rows_among(committed, gathered.lacks(channel, committed.numbers)):
         first = int(rows["#sequence"][0])
         last = _row_before(gathered, channel, first, dtype)
         RowDeriver(*last).fill(rows)
@@ -191,11 +169,11 @@ def _add_rows(
         pieces.append(_piece(gathered, first, len(rows), rows.view(np.uint8).tobytes()))
     gathered.add(channel, pieces)
     stop = _stop(gathered, channel)
-    finals = {(env, hole.row): hole for hole in salvage.finals(layout.state_end) if hole.row <= stop}
+    finals = {(env, hole.row): hole for hole in committed.finals(layout.state_end) if hole.row <= stop}
     gathered.finals |= finals
     if layout.images and (env, stop) in finals:  # the image that is running is the next state's
-        return None, salvage.end
-    return salvage.following(stop - 1, layout.state_end), salvage.end
+        return None, committed.end
+    return committed.following(stop - 1, layout.state_end), committed.end
 
 
 def _row_before(gathered: Gathered, channel: int, first: int, dtype: np.dtype[Any]) -> tuple[int, int, int]:
@@ -208,14 +186,17 @@ def _row_before(gathered: Gathered, channel: int, first: int, dtype: np.dtype[An
     return int(row["episode"]), int(row["step"]), int(row["#log_time"])
 
 
-def _add_images(gathered: Gathered, salvage: Salvage, leaf: Leaf, channel: int, stop: int) -> bytes | None:
+def _add_images(
+    gathered: Gathered, committed: CommittedRows, leaf: Leaf, channel: int, stop: int
+) -> bytes | None:
     """Takes the images of steps before `stop`; returns the running state's."""
     pieces = []
-    for rows in salvage.runs(lambda numbers: gathered.lacks(channel, numbers) & (numbers < stop)):
+    wanted = gathered.lacks(channel, committed.numbers) & (committed.numbers < stop)
+    for rows in rows_among(committed, wanted):
         rows["#publish_time"] = rows["#log_time"]
         first = int(rows["#sequence"][0])
         pieces.append(_piece(gathered, first, len(rows), rows.view(np.uint8).tobytes()))
     gathered.add(channel, pieces)
-    running = salvage.row(stop)
+    running = committed.row(stop)
     data: bytes | None = None if running is None else leaf.as_values(running["data"]).tobytes()
     return data

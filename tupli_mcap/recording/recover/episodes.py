@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel
 
-from tupli_mcap.journal.committed import FinalHole, to_rows
+from tupli_mcap.journal.committed import FinalHole
+from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.mcap.source import Source
@@ -56,13 +57,13 @@ _START, _END, _FINAL = EPISODE_START, EPISODE_END, FINAL_STATE
 
 
 class _Episodes:
-    """Starts and ends found so far, and those that are made, in `made` as `log_records` gives them."""
+    """Starts and ends found so far, and those that are made: `made` has (channel, row, record)."""
 
     def __init__(self, store: ChunkStore, topics: dict[str, int]) -> None:
         self.starts: dict[int, tuple[int, int, EpisodeStart]] = {}
         self.ends: dict[int, tuple[int, int, EpisodeEnd]] = {}
         self.finals: dict[int, int] = {}
-        self.made: list[tuple[int, int, int, bytes]] = []
+        self.made: list[tuple[int, int, bytes]] = []
         self._channels = {topic: topics[topic] for topic in (_START, _END, _FINAL)}
         self._counts = {topic: store.count(channel) for topic, channel in self._channels.items()}
         self._times = dict.fromkeys(self._channels, 0)
@@ -107,7 +108,7 @@ class _Episodes:
         """
         channel, row = self._channels[topic], self._counts[topic]
         time = max(time, self._times[topic])
-        self.made.append((channel, row, time, record(channel, row, time, body)))
+        self.made.append((channel, row, record(channel, row, time, body)))
         self._counts[topic], self._times[topic] = row + 1, time
         return row, time
 
@@ -134,7 +135,7 @@ def complete(
     found_runs = _Runs(store, layout, steps, available, episodes)
     _make_starts(episodes, found_runs, tail)
     _make_ends(episodes, found_runs, store, tail)
-    tail.rows += to_rows(episodes.made)
+    tail.rows += group_records(memoryview(b"".join(made for *_, made in sorted(episodes.made))))
     contents.memory = [bytes(rows.data) for rows in tail.rows]
     contents.table = chunk_table(found, tail.rows)
     contents.tail = tail.rows

@@ -12,28 +12,28 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.journal.committed import (
-    Salvage,
-    committed_rows,
-    image_rows,
-    log_records,
+    CommittedRecords,
+    CommittedRows,
+    committed_records,
+    rows_of,
     running_record,
     size_behind,
-    to_rows,
+    torn_rows,
 )
 from tupli_mcap.journal.file import (
     FRAMES_AREA,
     JournalContents,
-    LogArea,
-    RowArea,
     journal_info,
     read_journal,
     recorded_journal,
 )
+from tupli_mcap.journal.rows import RowDeriver, even_rows
 from tupli_mcap.mcap.records import parse_record, records
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import has_summary
@@ -110,7 +110,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
             # under same-step autoreset; and it is not known what else of that step was lost
             tail.final_lost = journal.torn and bool(journal.info.get("vector"))
             _salvage(source, found, journal, layout, [c.id for c in steps], tail)
-            missing = size_behind(journal, _log_area(journal, "events")) - found.end
+            missing = size_behind(journal) - found.end
             if missing > 0:  # with ends and final states: what runs may be the episode after them
                 warnings.warn(_older(source, missing), UserWarning, stacklevel=6)
                 tail.pending.clear()
@@ -289,32 +289,33 @@ def _salvage(
     for env, channel in enumerate(steps):
         first = counts.get(channel, 0)
         if layout.constant:
-            area = _rows_area(journal, "steps")
-            salvage = Salvage(journal, area, env, layout.step_message.dtype, channel)
-            last = None
+            committed = CommittedRows(journal, "steps", env, layout.step_message.dtype, channel)
+            taken = rows_of(committed, first)
+            deriver = RowDeriver()
             if first:
                 span = next(iter(store.spans(channel, first - 1, 1)))
                 last = store.rows(span.chunk, layout.step_message.dtype)[span.begin]
-            rows, _ = committed_rows(salvage, first, channel, last)
-            total = first + (0 if rows is None else len(rows.offsets))
-            known = salvage.end
-            tail.left_out += salvage.left_out
-            holes = {(env, hole.row): hole for hole in salvage.finals(layout.state_end) if hole.row <= total}
+                deriver = RowDeriver(int(last["episode"]), int(last["step"]), int(last["#log_time"]))
+            deriver.fill(taken)
+            rows = even_rows(channel, first, taken.view(np.uint8).tobytes(), taken)
+            total, known = first + len(taken), committed.end
+            tail.left_out += torn_rows(committed, first)
+            holes = {
+                (env, hole.row): hole for hole in committed.finals(layout.state_end) if hole.row <= total
+            }
             tail.finals |= holes
-            following = salvage.following(total - 1, layout.state_end)
+            following = committed.following(total - 1, layout.state_end)
             # behind a hole, the image that was running is the next state's
             if following is not None and not (layout.images and (env, total) in holes):
                 tail.pending[env] = following
         else:
-            log = _log_area(journal, f"steps/{env}")
-            entries = [e for e in log_records(journal, log, {channel: first}) if e[0] == channel]
-            rows = to_rows(entries)[0] if entries else None
-            total = first + len(entries)
-            known = max((e[1] + 1 for e in log_records(journal, log, None) if e[0] == channel), default=0)
-            state = running_record(journal, log, total, layout)
+            records = committed_records(journal, f"steps/{env}").get(channel, CommittedRecords(channel, {}))
+            rows = rows_of(records, first)
+            total, known = first + len(rows.offsets), records.end
+            state = running_record(journal, f"steps/{env}", total, layout)
             if state is not None:
                 tail.pending[env], known = state, max(known, total)
-        if rows is not None:
+        if total > first:
             tail.rows.append(rows)
         if known > total and not journal.torn:
             warnings.warn(
@@ -325,21 +326,9 @@ def _salvage(
         _salvage_images(found, journal, layout, env, images, total, known, tail)
     for name in journal.areas:
         if name in _EVENTS or name.startswith(FRAMES_AREA):
-            tail.rows += to_rows(log_records(journal, _log_area(journal, name), counts))
-
-
-def _rows_area(journal: JournalContents, name: str) -> RowArea:
-    area = journal.areas.get(name)
-    if not isinstance(area, RowArea):
-        raise FormatError(f"the journal has no rows {name!r}")
-    return area
-
-
-def _log_area(journal: JournalContents, name: str) -> LogArea:
-    area = journal.areas.get(name)
-    if not isinstance(area, LogArea):
-        raise FormatError(f"the journal has no records {name!r}")
-    return area
+            for channel, records in committed_records(journal, name).items():
+                rows = rows_of(records, counts.get(channel, 0))
+                tail.rows += [rows] if len(rows.offsets) else []
 
 
 def _salvage_images(
@@ -362,15 +351,16 @@ def _salvage_images(
             raise FormatError(
                 f"expected a channel for the images of {leaf.name!r}, sub-environment {env}, found none"
             )
-        dtype = layout.image_messages[leaf.name].dtype
-        area = _rows_area(journal, f"{leaf.name}/{env}")
-        salvage = Salvage(journal, area, 0, dtype, channel, rewritten=True)  # by resets
-        rows = image_rows(salvage, found.counts.get(channel, 0), min(steps, known), channel)
-        if rows is not None:
-            tail.rows.append(rows)
-        pending = salvage.row(steps)
+        dtype, first = layout.image_messages[leaf.name].dtype, found.counts.get(channel, 0)
+        # resets write over them
+        committed = CommittedRows(journal, f"{leaf.name}/{env}", 0, dtype, channel, rewritten=True)
+        images = rows_of(committed, first)[: max(0, min(steps, known) - first)]
+        images["#publish_time"] = images["#log_time"]
+        if len(images):
+            tail.rows.append(even_rows(channel, first, images.view(np.uint8).tobytes(), images))
+        pending = committed.row(steps)
         # where the file is ahead, a live writer may have been writing over that row while it was read
-        if pending is None or known < steps or found.counts.get(channel, 0) > steps:
+        if pending is None or known < steps or first > steps:
             tail.pending.pop(env, None)
         elif env in tail.pending:
             tail.pending[env] += leaf.as_values(pending["data"]).tobytes()
