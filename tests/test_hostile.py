@@ -608,3 +608,26 @@ def test_the_command_line_tells_that_memory_ran_out(
 ) -> None:
     assert _report(MemoryError("Unable to allocate 18.3 GiB")) == 1
     assert "error: there is not enough memory" in capsys.readouterr().err
+
+
+def test_a_chunk_whose_rows_are_not_consecutive_ends_what_is_read(tmp_path: Path) -> None:
+    """No writer makes it, its CRC is right, and nothing says that the recording was finished."""
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path, chunk_size=3000) as env:
+        for seed in range(20):
+            env.reset(seed=seed)
+            while not any(env.step(env.action_space.sample())[2:4]):
+                pass
+    with Recording(path) as recording:
+        whole, rows = recording.read().states, recording._contents.table
+        first, second, *_ = np.flatnonzero(rows["channel"] == recording._topics["/step"])
+    file = Model.of(path.read_bytes())
+    file.index = None
+    for expected in (len(whole), int(rows["rows"][first])):
+        path.write_bytes(file.encode())
+        with pytest.warns(UserWarning, match="has no journal"), Recording(path) as recording:
+            assert np.array_equal(recording.read().states, whole[:expected])
+        chunk = file.chunks()[second]
+        row = bytearray(chunk.inner[1])
+        row[11] ^= 128  # its sequence
+        chunk.inner[1] = bytes(row)

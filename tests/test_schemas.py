@@ -28,6 +28,7 @@ from tupli_mcap.messages.episodes import END_NAMES, EpisodeEnd, EpisodeStart, re
 from tupli_mcap.messages.frames import FRAME_LAYOUT, encode_pair
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import Topic, Topics, parse
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
@@ -357,3 +358,21 @@ def test_links_in_the_specification_lead_somewhere() -> None:
     for name in re.findall(r"`([\w./]+\.(?:msg|json))`", SPEC):
         if name not in ("benchmark.json", "labels.json"):  # attachments
             assert list(SCHEMAS.rglob(Path(name).name)), name
+
+
+@pytest.mark.parametrize("env", [None, 0, 12])
+def test_topics_say_what_they_are_made_of(env: int | None) -> None:
+    topics = Topics.of(env)
+    made = [topics.step, topics.image("state_a"), topics.camera("render"), topics.frame("render")]
+    top = "" if env is None else f"/env_{env}"
+    assert made == [f"{top}/step", f"{top}/image/state_a", f"{top}/camera/render", f"{top}/frame/render"]
+    kinds = [("step", ""), ("image", "state_a"), ("camera", "render"), ("frame", "render")]
+    assert [parse(topic) for topic in made] == [Topic(topics, env or 0, *kind) for kind in kinds]
+    assert Topics.of_step(topics.step) == topics
+
+
+@pytest.mark.parametrize(
+    "topic", ["/info", "/plot/step", "/env_01/step", "/env_/step", "/step/", "/image/", "step"]
+)
+def test_other_topics_are_none_of_an_environment(topic: str) -> None:
+    assert parse(topic) is None
