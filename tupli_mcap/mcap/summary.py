@@ -33,7 +33,7 @@ _MAX_SUMMARY = 1 << 31
 
 
 class Summary(NamedTuple):
-    """The parsed summary. `data_end` is the offset of DataEnd as the summary's start tells it."""
+    """The parsed summary, which begins at the offset `start`; `chunks` is how many it lists."""
 
     schemas: dict[int, Schema]
     channels: dict[int, Channel]
