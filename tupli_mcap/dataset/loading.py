@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,12 +20,12 @@ from tupli_mcap.messages.shared_dtypes import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.blocks import step_bytes, whole_episodes
 from tupli_mcap.schema import EpisodeHeader
 
 __all__ = ["Selected", "read_columns"]
 
 _BLOCK_BYTES = 64 << 20
-_VARIABLE_STEP_BYTES = 4096  # a guess, for steps of variable size
 _RECORDED = ("states", "actions", "rewards", "terminals", "timeouts", "next_states")
 
 
@@ -105,7 +105,7 @@ class _Reader:
             check_layouts(self._layout, self._first_name, layout, recording.name)
         listed = ListedEpisodes.of(recording.name, headers)
         positions, lengths = positions_of(recording, listed), listed.lengths
-        for block in _blocks(lengths, _step_bytes(layout)):
+        for block in whole_episodes(lengths, max(1, _BLOCK_BYTES // step_bytes(layout))):
             columns = _read_block(recording, positions[block], lengths[block], self._needed)
             steps = int(lengths[block].sum())
             keep = self._keep(columns, steps, layout)
@@ -144,23 +144,6 @@ def _empty_column(field: str) -> Any:
         return []
     dtypes: dict[str, Any] = {"terminals": np.bool_, "timeouts": np.bool_, "steps": np.int64}
     return np.empty(0, dtypes.get(field, np.float64))
-
-
-def _blocks(lengths: Array, step_bytes: int) -> Iterator[slice]:
-    """Consecutive episodes of at most `_BLOCK_BYTES` together, at least one."""
-    ends = np.cumsum(lengths)
-    start, limit = 0, max(1, _BLOCK_BYTES // step_bytes)
-    while start < len(lengths):
-        before = int(ends[start - 1]) if start else 0
-        end = max(start + 1, int(np.searchsorted(ends, before + limit, side="right")))
-        yield slice(start, end)
-        start = end
-
-
-def _step_bytes(layout: StepLayout) -> int:
-    if not layout.constant:
-        return _VARIABLE_STEP_BYTES
-    return layout.step_message.record_size + sum(leaf.size for leaf in layout.images)
 
 
 def _read_block(

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots import style
 from tupli_mcap.plots.measure import Measured
 from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, running_mean
 from tupli_mcap.plots.style import Cell, Page, cut
-from tupli_mcap.recording.blocks import Array
 
 __all__ = ["add_episodes"]
 

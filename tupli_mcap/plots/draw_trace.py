@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.plots import style
 from tupli_mcap.plots.measure import Measured, Trace
 from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.plots.style import Cell, Page, cut, number_text
-from tupli_mcap.recording.blocks import Array
 from tupli_mcap.spaces.element_names import short_path
 
 __all__ = ["add_trace", "by_scale"]

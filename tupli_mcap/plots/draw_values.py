@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.plots import style
 from tupli_mcap.plots.statistics import LARGEST, LeafValues, bin_edges, drawable_numbers
 from tupli_mcap.plots.style import COLUMNS, LEFT, SMALL, Cell, Page, cut, number_text
-from tupli_mcap.recording.blocks import Array
 from tupli_mcap.spaces.element_names import short_path
 
 __all__ = ["LEVELS", "add_coverage", "add_values", "most_varying", "quantiles"]

@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.blocks import Array, blocks, step_bytes
+from tupli_mcap.recording.blocks import blocks, step_bytes
 from tupli_mcap.recording.description import RecordingDescription, describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.recording.blocks import Array
+from tupli_mcap.arrays import Array
 from tupli_mcap.recording.description import spread_of
 from tupli_mcap.spaces.element_names import element_names, short_path
 from tupli_mcap.spaces.labels import Labels

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots import style
 from tupli_mcap.plots.measure import Measured
 from tupli_mcap.plots.style import Cell, Page, cut
-from tupli_mcap.recording.blocks import Array
 from tupli_mcap.recording.description import nan_text, spread_of
 
 __all__ = ["add_facts", "add_notes", "facts_of", "html_fragment", "html_page", "notes_of", "title_of"]

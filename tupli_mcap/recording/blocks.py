@@ -14,8 +14,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.recording import Recording
 
-__all__ = ["Array", "Block", "blocks", "step_bytes"]
-
+__all__ = ["Block", "blocks", "step_bytes", "whole_episodes"]
 
 BLOCK_BYTES = 8 << 20
 _VARIABLE_STEP_BYTES = 2048  # a guess, for steps of variable size
@@ -26,13 +25,14 @@ _FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "times")
 class Block:
     """Consecutive steps of some episodes.
 
-    rows: the index rows of the episodes. lengths: how many steps of each are here (int64). first_step: where the
-    block begins in its first episode; other than 0 only if it is the one episode of the block. whole: the block
-    holds its episodes to their ends. finals: the final states, by leaf name, of the episodes `finals_of` (positions
-    in `rows`) that end in this block.
+    positions: of the episodes, in the recording. rows: their index rows. lengths: how many steps of each are here
+    (int64). first_step: where the block begins in its first episode; other than 0 only if it is the one episode of
+    the block. whole: the block holds its episodes to their ends. finals: the final states, by leaf name, of the
+    episodes `finals_of` (places in `rows`) that end in this block; empty if none is known.
     """
 
     layout: StepLayout
+    positions: Array
     rows: Array
     lengths: Array
     first_step: int
@@ -71,49 +71,47 @@ class Block:
 
 
 def blocks(
-    recording: Recording, positions: Array, *, images: bool = True, finals: bool = True
+    recording: Recording,
+    positions: Array,
+    *,
+    images: bool = True,
+    finals: bool = True,
+    steps: int | None = None,
 ) -> Iterator[Block]:
-    """The steps of the episodes at some positions, in this order, about `BLOCK_BYTES` at a time.
+    """The steps of the episodes at some positions, in this order, at most `steps` (about `BLOCK_BYTES`) at a time.
 
     Without `images`, no image of a step is read, and the columns of image leaves are empty; without `finals`, no
     final state.
     """
     if not len(positions):
         return
-    layout = recording.layout
-    limit = max(1, BLOCK_BYTES // step_bytes(layout, images=images))
+    limit = steps or max(1, BLOCK_BYTES // step_bytes(recording.layout, images=images))
     lengths = recording.index["length"][positions].astype(np.int64)
+    for some in whole_episodes(lengths, limit):
+        length = int(lengths[some].sum())
+        if length <= limit:
+            columns = recording.read(positions[some], fields=_FIELDS, images=images)
+            yield _block(recording, positions[some], columns, 0, True, finals)
+            continue
+        for first in range(0, length, limit):  # a single one
+            stop = min(length, first + limit)
+            columns = recording.read_steps(int(positions[some][0]), first, stop, _FIELDS, images=images)
+            yield _block(recording, positions[some], columns, first, stop == length, finals)
+
+
+def whole_episodes(lengths: Array, limit: int) -> Iterator[slice]:
+    """Consecutive episodes of at most `limit` steps together, at least one."""
     ends = np.cumsum(lengths)
     start = 0
-    while start < len(positions):
+    while start < len(lengths):
         before = int(ends[start - 1]) if start else 0
-        stop = int(np.searchsorted(ends, before + limit, side="right"))
-        if stop <= start:
-            yield from _parts(recording, positions[start : start + 1], limit, images, finals)
-            start += 1
-            continue
-        chosen = positions[start:stop]
-        columns = recording.read(chosen, fields=_FIELDS, images=images)
-        yield _block(recording, chosen, columns, lengths[start:stop], 0, True, finals)
+        stop = max(start + 1, int(np.searchsorted(ends, before + limit, side="right")))
+        yield slice(start, stop)
         start = stop
 
 
-def _parts(recording: Recording, position: Array, limit: int, images: bool, finals: bool) -> Iterator[Block]:
-    length = int(recording.index["length"][position[0]])
-    for first in range(0, length, limit):
-        stop = min(length, first + limit)
-        columns = recording.read_steps(int(position[0]), first, stop, _FIELDS, images=images)
-        yield _block(recording, position, columns, np.array([stop - first]), first, stop == length, finals)
-
-
 def _block(
-    recording: Recording,
-    positions: Array,
-    columns: Columns,
-    lengths: Array,
-    first: int,
-    whole: bool,
-    finals: bool,
+    recording: Recording, positions: Array, columns: Columns, first: int, whole: bool, finals: bool
 ) -> Block:
     rows = recording.index[positions]
     known = np.flatnonzero(rows["final_row"] >= 0) if whole and finals else np.empty(0, np.int64)
@@ -121,7 +119,8 @@ def _block(
     if len(known):
         nested = recording.final_states(positions[known])
         found = {leaf.name: leaf.get(nested) for leaf in recording.layout.state}
-    return Block(recording.layout, rows, lengths, first, whole, columns, found, known)
+    lengths = columns.episode_lengths
+    return Block(recording.layout, positions, rows, lengths, first, whole, columns, found, known)
 
 
 def step_bytes(layout: StepLayout, *, images: bool = True) -> int:

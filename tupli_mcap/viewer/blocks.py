@@ -9,6 +9,8 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.recording import Columns, Recording
+from tupli_mcap.recording.blocks import Block as Steps
+from tupli_mcap.recording.blocks import blocks
 
 __all__ = ["TIMELINES", "Block", "Finals", "Piece", "blocks_of", "row_counts"]
 
@@ -60,7 +62,7 @@ class Block(NamedTuple):
 
     def with_finals(self) -> Block:
         """The states only, with the known final ones behind the last steps of their episodes."""
-        if self.finals is None:
+        if self.finals is None or not self.finals.known.any():
             return self
         finals = self.finals
         known = finals.known
@@ -120,25 +122,11 @@ def blocks_of(recording: Recording, positions: Sequence[int], first: int = 0) ->
     Args:
         first: the number of the first row.
     """
-    limit = _rows_at_once(recording)
-    lengths = recording.index["length"]
-    group: list[int] = []
-    total = 0
-    for position in positions:
-        length = int(lengths[position])
-        if group and total + length > limit:
-            yield _whole(recording, group, first)
-            first += total + len(group)
-            group, total = [], 0
-        if length > limit:
-            for start in range(0, length, limit):
-                yield _part(recording, position, start, min(start + limit, length), first + start)
-            first += length + 1
-        elif length:
-            group.append(position)
-            total += length
-    if group:
-        yield _whole(recording, group, first)
+    chosen = np.asarray(positions, np.int64)
+    chosen = chosen[recording.index["length"][chosen] > 0]
+    for block in blocks(recording, chosen, steps=_rows_at_once(recording)):
+        yield _shown(recording, block, first)
+        first += len(block) + (len(block.rows) if block.whole else 0)
 
 
 def _rows_at_once(recording: Recording) -> int:
@@ -147,37 +135,23 @@ def _rows_at_once(recording: Recording) -> int:
     return max(1, min(_MAX_ROWS, _MAX_BYTES // max(row, 8)))
 
 
-_FIELDS = ("states", "actions", "rewards", "times")
+def _shown(recording: Recording, block: Steps, first: int) -> Block:
+    """A block whose first row has the number `first`."""
+    starts, ends, earlier = block.starts, block.starts + block.lengths, np.arange(len(block.rows))
+    pieces = [
+        Piece(start, end, position, block.first_step, block.whole)
+        for start, end, position in zip(starts.tolist(), ends.tolist(), block.positions.tolist(), strict=True)
+    ]
+    number = np.arange(first, first + len(block)) + np.repeat(earlier, block.lengths)
+    return Block(recording, block.columns, pieces, number, block.columns.times, _finals(block, ends, first))
 
 
-def _whole(recording: Recording, positions: list[int], first: int) -> Block:
-    columns = recording.read(positions, fields=_FIELDS)
-    ends = np.cumsum(columns.episode_lengths)
-    starts = [0, *ends[:-1].tolist()]
-    pieces = [Piece(a, b, at, 0, True) for a, b, at in zip(starts, ends.tolist(), positions, strict=True)]
-    earlier = np.arange(len(positions))  # final states
-    number = np.arange(first, first + len(columns)) + np.repeat(earlier, columns.episode_lengths)
-    finals = _finals(recording, positions, columns, ends, first + ends + earlier)
-    return Block(recording, columns, pieces, number, columns.times, finals)
-
-
-def _part(recording: Recording, position: int, start: int, stop: int, first: int) -> Block:
-    columns = recording.read_steps(position, start, stop, _FIELDS)
-    last = stop == int(recording.index["length"][position])
-    end = first + stop - start
-    pieces = [Piece(0, stop - start, position, start, last)]
-    finals = (
-        _finals(recording, [position], columns, np.array([stop - start]), np.array([end])) if last else None
-    )
-    return Block(recording, columns, pieces, np.arange(first, end), columns.times, finals)
-
-
-def _finals(
-    recording: Recording, positions: list[int], columns: Columns, before: Array, number: Array
-) -> Finals:
-    """Of episodes that end before the rows `before` of some columns."""
-    chosen = np.array(positions)
-    known = recording.index["final_row"][chosen] >= 0
+def _finals(block: Steps, ends: Array, first: int) -> Finals | None:
+    if not block.whole:
+        return None
+    known = block.rows["final_row"] >= 0
+    states = [block.finals[leaf.name] for leaf in block.layout.state] if known.any() else None
     # they were seen when the last step returned; a moment later, that one's own state can be looked at, too
-    times = columns.times[before - 1] + 1
-    return Finals(before, known, recording.final_states(chosen[known]), number, times)
+    times = block.columns.times[ends - 1] + 1
+    nested = None if states is None else block.layout.nest_state(states)
+    return Finals(ends, known, nested, first + ends + np.arange(len(ends)), times)
