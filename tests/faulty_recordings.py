@@ -216,11 +216,11 @@ class Leaks:
 
 
 def is_clear(err: BaseException, path: Path, case: Case) -> str:
-    """An error of ours, in one sentence, that names the file, the reason and what to do."""
+    """An error of ours, in one sentence, that names the file or its journals' directory, the reason and what to do."""
     text = str(err)
     assert isinstance(err, TupliError), f"a raw error: {err!r}"
     assert "\n" not in text
-    assert path.name in text, text
+    assert path.name in text or repr(str(path.parent / "journals")) in text, text
     assert os.strerror(case.code) in text, text
     assert "; " in text, f"does not say what to do: {text}"
     return text

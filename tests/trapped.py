@@ -136,6 +136,10 @@ class Trap:
             return args[0] in sys.modules
         if event == "os.putenv":  # the commands spare themselves pydantic's plugins
             return args[0] == b"PYDANTIC_DISABLE_PLUGINS"
+        if (
+            event == "compile" and args[1] == "<filter>"
+        ):  # what a user filters by is parsed, and not run: see "exec"
+            return True
         # A writer generates its encoder from the environment at hand, as `append` does; readers generate nothing.
         return (
             event in ("compile", "exec", "code.__new__") and self.doing.endswith(": append") and _encoding()

@@ -118,7 +118,7 @@ def parse_filter(text: str) -> BaseFilter:
     """
     tokens = _checked_tokens(text)
     python = "".join(f"{_PYTHON.get(token.kind, token.kind):{_WIDTH}}" for token in tokens)
-    return _filter(ast.parse(python, mode="eval").body, tokens)
+    return _filter(ast.parse(python, "<filter>", "eval").body, tokens)
 
 
 def format_filter(filter: BaseFilter) -> str:
