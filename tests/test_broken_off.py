@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import gc
 import itertools
+import os
 import random
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -224,3 +229,23 @@ def test_nothing_is_recorded_once_it_was_closed_from_within(tmp_path: Path, when
             use()
     with Recording(tmp_path / "r.mcap") as recording:
         assert len(taken) <= recording.num_steps <= len(taken) + 1
+
+
+def test_a_recorder_that_the_disk_refused_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "run.mcap")
+    env.reset(seed=0)
+    env.step(0)
+
+    def refuse(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as context:
+        context.setattr(os, "pwritev", refuse)
+        with contextlib.suppress(RecordingError):  # nobody keeps the error
+            env.close()
+        with pytest.raises(RecordingError, match="No space left"):
+            env.step(0)
+    wrapper = weakref.ref(env)
+    del env
+    gc.collect()
+    assert wrapper() is None

@@ -85,7 +85,7 @@ class RecordingWriter:
         self._place = Path(os.path.realpath(path))
         self.options, self.format_version, self._keep_empty = options, format_version, keep_empty
         self.closed = False
-        self.failed: RecordingError | None = None  # why nothing more can be recorded, where that is known
+        self.failed = ""  # why nothing more can be recorded, where that is known
         self._told_deleted = False
         self._old_journal: Path | None = None  # on append: where a writer that was killed has left its own
         self.layout: StepLayout | None = None
@@ -398,17 +398,19 @@ class RecordingWriter:
 
     def stop(self, err: BaseException) -> None:
         """Notes for `why_stopped` what has broken off the recorder's work; a refused step does not."""
-        if self.failed is None and not isinstance(err, StepError):
-            self.failed = err if isinstance(err, RecordingError) else self._broken_off(type(err).__name__)
+        if not self.failed and not isinstance(err, StepError):
+            # only what it says: its traceback has frames that hold the recorder, and views of the journal
+            self.failed = str(err) if isinstance(err, RecordingError) else self._broken_off(type(err).__name__)
 
     def why_stopped(self) -> RecordingError:
         """Why nothing more can be recorded: it is closed, or has been broken off."""
-        if self.closed and self.failed is None:
+        if self.closed and not self.failed:
             return RecordingError(f"{self.path} is closed; wrap the environment again to record")
-        return self.failed or self._broken_off("an interruption (or this call, from a signal handler, say)")
+        interrupted = self._broken_off("an interruption (or this call, from a signal handler, say)")
+        return RecordingError(self.failed or interrupted)
 
-    def _broken_off(self, what: str) -> RecordingError:
-        return RecordingError(
+    def _broken_off(self, what: str) -> str:
+        return (
             f"{self.path}: {what} broke off the recorder's work; every finished step is safe: "
             'close the recording, and go on with mode="a"'
         )
@@ -599,7 +601,7 @@ class RecordingWriter:
     def abandon(self) -> None:
         """In a forked child: lets go of the file and its lock without writing; the parent goes on."""
         self.closed = True
-        self.failed = RecordingError(
+        self.failed = (
             f"{self.path} is recorded by the process that opened it, not by a forked child; wrap the environment here"
         )
         self.lock.release()
