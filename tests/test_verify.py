@@ -325,7 +325,7 @@ MISTAKES = {
     "end": "its end and the index differ",
     "start": "its start and the index differ",
     "final": "is the final state of no episode",
-    "length": "gives 59 of the 60 steps of sub-environment 0 to episodes",
+    "length": "gives 59 of the 60 steps to episodes",
     "index_return": "its end and the index differ",
     "index_seed": "its start and the index differ",
     "index_end": "other flags than the end",

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -18,12 +17,16 @@ from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 __all__ = [
     "EPISODE_TOPICS",
     "StepClaims",
+    "StepsAt",
     "check_chunks",
     "check_episodes",
     "check_rows",
 ]
 
 EPISODE_TOPICS = (EPISODE_START, EPISODE_END, FINAL_STATE)
+StepsAt = Callable[[Array], tuple[Array, Array]]
+"""What the steps at some rows say: `episode` and `step` as one number (`<u8`), and the two flags as one (`<u2`)."""
+
 _U32 = 2**32 - 1
 _CHUNK_FIXED = 9 + 40  # of a Chunk record, before and after the name of its compression
 _NAMED = np.array([_CHUNK_FIXED + len(name.replace("none", "")) for name in COMPRESSIONS], np.uint64)
@@ -88,12 +91,10 @@ def check_episodes(
         whole: whether each row of the step channels has to be of an episode.
     """
     _check_places(rows, steps, others, name)
-    lengths = np.bincount(rows["env"], rows["length"], minlength=len(steps))
-    if whole and (lengths != steps).any():
-        env = int(np.argmax(lengths != steps))
+    held = int(rows["length"].sum())
+    if whole and held != sum(steps):  # episodes lie apart: no sub-environment has more than it should
         raise FormatError(
-            f"{name}: the episode index gives {int(lengths[env])} of the {steps[env]} steps of sub-environment {env} "
-            "to episodes; recover it into a new file"
+            f"{name}: the episode index gives {held} of the {sum(steps)} steps to episodes; recover it into a new file"
         )
 
 
@@ -144,65 +145,65 @@ class StepClaims:
     """
 
     def __init__(self, index: Array, env: int) -> None:
-        mine = np.flatnonzero(index["env"] == env)
-        mine = mine[np.argsort(index["first_row"][mine], kind="stable")]
-        # field by field: NumPy takes far longer for rows of many fields
-        episodes, firsts, lengths = (index[name][mine] for name in ("episode", "first_row", "length"))
-        self._how = index["end"][mine]
-        self._rows = _by_turns(firsts, firsts + lengths - 1).astype(
-            np.int64
-        )  # the first and the last of each
-        # `episode` and `step` of such a row, as one number of 64 bits
-        self._numbers = _by_turns(episodes, episodes + (lengths - 1 << np.uint64(32)))
+        self._index, self._env = index, env
 
-    def check(self, first: int, numbers: Array, flags: Array, where: str) -> None:
+    @cached_property
+    def _boundaries(self) -> tuple[Array, Array, Array]:
+        """The first and the last row of each episode in turn, `episode` and `step` there; the end of each episode."""
+        index = self._index
+        mine = index["env"] == self._env
+        if not mine.all():
+            index = index[mine]
+        # field by field: NumPy takes far longer for rows of many fields
+        parts = [index[name] for name in ("first_row", "length", "episode", "end")]
+        if (parts[0][1:] < parts[0][:-1]).any():
+            order = np.argsort(parts[0], kind="stable")
+            parts = [part[order] for part in parts]
+        firsts, lengths, episodes, how = parts
+        rows = np.empty((len(index), 2), np.int64)
+        rows[:, 0], rows[:, 1] = firsts, firsts + lengths - 1
+        numbers = np.empty((len(index), 2), np.uint64)
+        numbers[:, 0], numbers[:, 1] = episodes, episodes + (lengths - 1 << np.uint64(32))
+        return rows.ravel(), numbers.ravel(), np.ascontiguousarray(how)
+
+    def check(self, first: int, count: int, steps_at: StepsAt, where: str) -> None:
         """Holds consecutive rows against the index.
 
         Args:
             first: the number of the first row.
-            numbers: `episode` and `step` of each row, as one number (`<u8`).
-            flags: the bytes of `terminal` and `timeout` of each row, as one number (`<u2`).
+            count: of rows, at least one.
+            steps_at: what the rows say; 0 is the first row.
             where: the file, and what of it is read.
 
         Raises:
             FormatError: a row is of another episode or step, or the flags of an episode's last row say another end.
         """
-        if not len(numbers):
-            return
-        low, high = self._rows.searchsorted((first, first + len(numbers))).tolist()
-        if low % 2:  # the first row belongs to an episode that began before
-            steps = first - int(self._rows[low - 1])
-            self._compare(first, [int(numbers[0])], [int(self._numbers[low - 1]) + (steps << 32)], where)
-        places = self._rows[low:high] - first
-        found, expected = numbers[places], self._numbers[low:high]
+        rows, numbers, how = self._boundaries
+        low, high = rows.searchsorted((first, first + count)).tolist()
+        low -= low % 2  # the first row may belong to an episode that began before
+        places, expected, ends = rows[low:high] - first, numbers[low:high], how[low // 2 : high // 2]
+        if len(places) and places[0] < 0:
+            expected = expected.copy()
+            expected[0] += np.uint64(-int(places[0]) << 32)
+            places[0] = 0
+        found, flags = steps_at(places)
         if found.tobytes() != expected.tobytes():
-            self._compare(self._rows[low:high], found.tolist(), expected.tolist(), where)
-        ends = _end_of()[flags[places[1 - low % 2 :: 2]]]
-        how = self._how[low // 2 : high // 2]
-        if ends.tobytes() != how.tobytes():
-            i = int(np.argmax(ends != how))
-            at = int(self._rows[low:high][1 - low % 2 :: 2][i])
+            i = int(np.argmax(found != expected))
+            one, other = int(found[i]), int(expected[i])
             raise FormatError(
-                f"{where}: expected the end {how[i]} of episode {int(self._numbers[low // 2 * 2 + 2 * i]) & _U32} as "
-                f"the episode index says, found other flags in its last row, {at}; recover it into a new file"
+                f"{where}: expected step {other >> 32} of episode {other & _U32} in row {first + places[i]} as the "
+                f"episode index says, found step {one >> 32} of episode {one & _U32}; recover it into a new file"
+            )
+        told = _end_of()[flags[1::2]]
+        if told.tobytes() != ends.tobytes():
+            i = int(np.argmax(told != ends))
+            raise FormatError(
+                f"{where}: expected the end {ends[i]} of episode {int(expected[2 * i]) & _U32} as the episode index "
+                f"says, found other flags in its last row, {first + places[2 * i + 1]}; recover it into a new file"
             )
 
-    def _compare(self, rows: Any, found: Sequence[int], expected: Sequence[int], where: str) -> None:
-        for row, one, other in zip(np.atleast_1d(rows).tolist(), found, expected, strict=True):
-            if one != other:
-                raise FormatError(
-                    f"{where}: expected step {other >> 32} of episode {other & _U32} in row {row} as the episode index "
-                    f"says, found step {one >> 32} of episode {one & _U32}; recover it into a new file"
-                )
 
-
-def _by_turns(firsts: Array, lasts: Array) -> Array:
-    both = np.empty(2 * len(firsts), np.uint64)
-    both[::2], both[1::2] = firsts, lasts
-    return both
-
-
-@functools.cache
+@cache
 def _end_of() -> Array:
     """The end that the bytes of `terminal` and `timeout` say: 0 terminal, 1 timeout, 2 interrupted."""
     flags = np.arange(1 << 16)

@@ -164,9 +164,11 @@ class Recording:
 
     def _check_sizes(self, layout: StepLayout, steps: Sequence[int]) -> None:
         """The chunks hold the rows that the index says, and each step has its images, before columns are allocated."""
-        least = BODY + 10 + sum(_stored_bytes(layout, leaf) for leaf in layout.step_leaves)
-        step = (layout.step_message.record_size, True) if layout.constant else (least, False)
-        sizes = dict.fromkeys(self._step_channels, step)
+        if layout.constant:
+            size = layout.step_message.record_size
+        else:  # at least
+            size = BODY + 10 + sum(_stored_bytes(layout, leaf) for leaf in layout.step_leaves)
+        sizes = dict.fromkeys(self._step_channels, (size, layout.constant))
         if layout.constant and FINAL_STATE in self._topics:
             sizes[self._topics[FINAL_STATE]] = (layout.final_message.record_size, True)
         for leaf in layout.images:

@@ -147,6 +147,20 @@ def _are_rows(data: Any, rows: int, size: int, channel: int) -> bool:
     return found and rests.startswith(np.ndarray(rows, _REST, data, 7, (size,)).tobytes())
 
 
+def _steps_of_rows(data: Any, size: int, places: Array) -> tuple[Array, Array]:
+    """`StepsAt` for rows of constant size."""
+    rows = np.frombuffer(data, f"V{size}").take(places)  # whole rows: one walk for both
+    return np.ndarray(len(rows), _U8, rows, BODY, (size,)), np.ndarray(
+        len(rows), _U2, rows, size - 2, (size,)
+    )
+
+
+def _steps_of_records(data: Any, starts: Array, stops: Array, places: Array) -> tuple[Array, Array]:
+    """`StepsAt` for records of variable size."""
+    numbers = np.ndarray(len(data) - 7, _U8, data, 0, (1,))[starts[places] + BODY]
+    return numbers, np.ndarray(len(data) - 1, _U2, data, 0, (1,))[stops[places] - 2]
+
+
 def _check_sequence(sequences: Array, first: int, where: str) -> None:
     """Raises FormatError unless rows are numbered from `first` on."""
     wrong = sequences != np.arange(first, first + len(sequences))
@@ -353,11 +367,10 @@ class ChunkStore:
         """Raises FormatError unless the rows of a chunk are those that the index says."""
         first, where = int(self.table["first"][i]), f"{self._source.name}: chunk {i}"
         claims = None if self.claims is None else self.claims.get(int(self.table["channel"][i]))
-        if claims is None:
+        if claims is None or not n:
             _check_sequence(np.ndarray(n, _U4, data, _SEQUENCE_AT, (size,)), first, where)
         else:
-            numbers = np.ndarray(n, _U8, data, BODY, (size,))
-            claims.check(first, numbers, np.ndarray(n, _U2, data, size - 2, (size,)), where)
+            claims.check(first, n, functools.partial(_steps_of_rows, data, size), where)
         self._held[i] = True  # its CRC says that it stays the same
 
     def _hold_records(self, i: int, data: Any, records: Array) -> None:
@@ -368,8 +381,9 @@ class ChunkStore:
             starts, stops = records[:, 0], records[:, 1]
             if int((stops - starts).min()) < _LEAST_STEP:
                 raise FormatError(f"{where} holds messages that are no steps")
-            numbers = np.ndarray(len(data) - 7, _U8, data, 0, (1,))[starts + BODY]
-            claims.check(first, numbers, np.ndarray(len(data) - 1, _U2, data, 0, (1,))[stops - 2], where)
+            claims.check(
+                first, len(records), functools.partial(_steps_of_records, data, starts, stops), where
+            )
         self._held[i] = True
 
     def _decoded(self, i: int, codec: Decoder, *, keep: bool) -> KeptChunk:

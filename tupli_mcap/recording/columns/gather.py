@@ -56,7 +56,7 @@ class Column(NamedTuple):
     @property
     def nbytes(self) -> int:
         """Bytes of one row in memory."""
-        return 0 if self.dtype is None else int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
+        return 0 if self.dtype is None else math.prod(self.shape) * self.dtype.itemsize
 
 
 class RowFormat:
