@@ -400,7 +400,9 @@ class RecordingWriter:
         """Notes for `why_stopped` what has broken off the recorder's work; a refused step does not."""
         if not self.failed and not isinstance(err, StepError):
             # only what it says: its traceback has frames that hold the recorder, and views of the journal
-            self.failed = str(err) if isinstance(err, RecordingError) else self._broken_off(type(err).__name__)
+            self.failed = (
+                str(err) if isinstance(err, RecordingError) else self._broken_off(type(err).__name__)
+            )
 
     def why_stopped(self) -> RecordingError:
         """Why nothing more can be recorded: it is closed, or has been broken off."""
@@ -601,9 +603,7 @@ class RecordingWriter:
     def abandon(self) -> None:
         """In a forked child: lets go of the file and its lock without writing; the parent goes on."""
         self.closed = True
-        self.failed = (
-            f"{self.path} is recorded by the process that opened it, not by a forked child; wrap the environment here"
-        )
+        self.failed = f"{self.path} is recorded by the process that opened it, not by a forked child; wrap the environment here"
         self.lock.release()
         self.on_close()
 
