@@ -203,40 +203,58 @@ class TestDeclaredKeys:
             F("metadata.score").isin([1, 2, "a"]),
             (F("metadata.score") > 0) & (F("metadata.name") == "x") & (F("benchmark_id") == "b"),
         ]
+        index = "USING COVERING INDEX ix_value (key=?"
         for part in wanted:
-            assert "USING INDEX ix_key" not in catalog.explain(part)
+            assert index not in catalog.explain(part)
         catalog.declare_key("metadata.score")
         for part in wanted:
-            assert "USING INDEX ix_key_0 (key_0_kind=?" in catalog.explain(part), part
+            assert index in catalog.explain(part), part
         catalog.declare_key("metadata.name")
-        assert "MULTI-INDEX OR" in catalog.explain((F("metadata.score") == 1) | (F("metadata.name") == "x"))
-        catalog.declare_key("n_tuples")
-        assert "USING INDEX ix_key_2 (n_tuples>?" in catalog.explain(F("n_tuples") > 100)
-        catalog.declare_key("episode_return")
-        assert "USING INDEX ix_key_3 (episode_return>?" in catalog.explain(F("episode_return") > 100)
+        either = (F("metadata.score") == 1) | (F("metadata.name") == "x")
+        assert "MULTI-INDEX OR" in catalog.explain(either)
+        for key in ("n_tuples", "episode_return", "seed", "created_by"):
+            catalog.declare_key(key)
+            plan = catalog.explain(F(key) > ("x" if key == "created_by" else 100))
+            assert index in plan
+            assert ("compared exactly" in plan) == (key in ("episode_return", "seed"))
 
-    def test_they_are_generated_columns_of_kind_and_value(self, catalog: Catalog) -> None:
-        catalog.declare_key("metadata.a b.c")
-        values = [1, 1.5, "1", True, None, math.nan, -math.inf, [1], {"x": 1}]
-        rows = [row(n, {"a b": {"c": value}}) for n, value in enumerate(values)]
-        put(catalog, rows=[*rows, row(len(values), {})])
-        with sqlite3.connect(catalog.path) as connection:
-            hidden = {name: kind for _, name, *_, kind in connection.execute("PRAGMA table_xinfo(episode)")}
-            found = connection.execute("SELECT key_0_kind, key_0_value FROM episode").fetchall()
-        connection.close()
-        assert (hidden["key_0_kind"], hidden["key_0_value"]) == (2, 2)  # virtual generated
-        assert found == [
-            ("number", 1),
-            ("number", 1.5),
-            ("text", "1"),
-            ("bool", 1),
-            ("null", None),
-            ("nan", None),
-            ("number", -math.inf),
-            ("other", None),
-            ("other", None),
-            (None, None),
+    def test_they_are_floats_and_texts(self, catalog: Catalog) -> None:
+        values = [
+            1,
+            1.5,
+            "1\x00",
+            True,
+            None,
+            math.nan,
+            -math.inf,
+            [1],
+            {"x": 1},
+            2**63 + 1,
+            10**300,
+            -(2**1024 - 1),
         ]
+        rows = [row(n, {"a b": {"ü": value}}) for n, value in enumerate(values)]
+        put(catalog, "before.mcap", rows=[*rows, row(len(values), {})])
+        catalog.declare_key('metadata."a b".ü')
+        catalog.declare_key("episode_return")
+        put(catalog, "after.mcap", rows=[*rows, row(len(values), {})])
+        with sqlite3.connect(catalog.path) as connection:
+            found = connection.execute(
+                "SELECT number, text FROM value WHERE key = 0 ORDER BY 1, 2"
+            ).fetchall()
+            (returns,) = connection.execute("SELECT count(*) FROM value WHERE key = 1").fetchone()
+        connection.close()
+        numbers = [*[-math.inf] * 4, 1, 1, 1, 1, 1.5, 1.5, 2.0**63, 2.0**63, 1e300, 1e300]
+        assert found == [
+            *[(None, None)] * 8,
+            *[(None, "1\x01\x01")] * 2,
+            *((number, None) for number in numbers),
+        ]
+        assert returns == 2 * len(rows) + 2
+        catalog.remove_recording("after.mcap")
+        with sqlite3.connect(catalog.path) as connection:
+            assert connection.execute("SELECT count(*) FROM value").fetchone() == (2 * len(rows) + 1,)
+        connection.close()
 
     def test_they_last(self, catalog: Catalog) -> None:
         put(catalog, rows=[row(0, {"score": 1})])
@@ -245,7 +263,7 @@ class TestDeclaredKeys:
             catalog.declare_key("metadata.x.y")
         with Catalog(catalog.path) as again:
             assert again.declared_keys() == ["metadata.score", "metadata.x.y"]
-            assert "ix_key_0" in again.explain(F("metadata.score") == 1)
+            assert "ix_value" in again.explain(F("metadata.score") == 1)
             again.declare_key("benchmark_id")  # indexed as it is
             assert again.count(F("benchmark_id") == "b") == 1
         assert catalog.declared_keys()[-1] == "benchmark_id"
@@ -254,10 +272,7 @@ class TestDeclaredKeys:
         ("key", "message"),
         [
             ("score", "unknown filter key 'score'; the keys are"),
-            ("metadata", "cannot be declared"),
-            ('metadata."a\\"b"', "cannot be declared: its names need to be printable ASCII"),
-            ("metadata.größe", "cannot be declared"),
-            ("metadata.x'); DROP TABLE episode; --", "cannot be declared"),
+            ("metadata", "cannot be declared: name one in it, such as metadata.score"),
             ("metadata..x", "needs a name at character 9"),
         ],
     )
@@ -267,17 +282,15 @@ class TestDeclaredKeys:
         assert catalog.declared_keys() == []
 
     @settings(max_examples=60, deadline=None)
-    @given(st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=6))
-    def test_any_declarable_name_is_found(self, name: str) -> None:
+    @given(st.text(max_size=6))
+    def test_any_name_is_found(self, name: str) -> None:
         wanted = F("metadata", name) == 3
         with Catalog(None) as catalog:
             put(catalog, rows=[row(0, {name: 3}), row(1, {name + "x": 3})])
             assert catalog.count(wanted) == 1
-            try:
-                catalog.declare_key(F("metadata", name).key)
-            except FilterError:
-                return
-            assert "ix_key_0" in catalog.explain(wanted)
+            catalog.declare_key(F("metadata", name).key)
+            assert catalog.declared_keys() == [F("metadata", name).key]
+            assert "ix_value" in catalog.explain(wanted)
             assert catalog.count(wanted) == 1
 
     def test_few_among_many_come_by_the_index(self, catalog: Catalog) -> None:
@@ -288,7 +301,7 @@ class TestDeclaredKeys:
         wanted = (F("metadata.score") > 0.5) & (F("metadata.score") < 0.55)
         expected = sum(0.5 < json.loads(r.metadata)["score"] < 0.55 for r in rows)
         assert len(catalog.episodes(wanted)) == expected
-        assert "(key_0_kind=? AND key_0_value>? AND key_0_value<?)" in catalog.explain(wanted)
+        assert "ix_value (key=? AND number>? AND number<?)" in catalog.explain(wanted)
 
 
 class TestLargeFilters:
@@ -313,9 +326,16 @@ class TestLargeFilters:
         assert catalog.count(FilterOR(filters=[*parts, F("episode") < 3, F("benchmark_id") == "x"])) == 3
         assert catalog.count(FilterAND(filters=[F("metadata.n") > i for i in range(-1500, 40)])) == 10
 
-    def test_too_many_parts(self, catalog: Catalog) -> None:
-        with pytest.raises(FilterError, match=r"at most 500 comparisons outside the metadata .* found 600"):
-            catalog.count(FilterAND(filters=[F("created_by") != f"{n}" for n in range(600)]))
+    def test_what_is_left_to_python(self, catalog: Catalog) -> None:
+        put(catalog, rows=[row(n, {"n": n}, created_by=f"{n}") for n in range(50)])
+        others = FilterAND(filters=[F("created_by") != f"{n}" for n in range(40)])
+        assert "compared exactly" not in catalog.explain(others)
+        many = FilterAND(filters=[F("created_by") != f"{n}" for n in range(1000)])
+        assert "compared exactly" in catalog.explain(many)
+        assert [catalog.count(others), catalog.count(many), catalog.count(~many)] == [10, 0, 50]
+        page = catalog.episodes(F("metadata.n") >= 20, limit=5, offset=3)
+        assert [header.episode for header in page] == [23, 24, 25, 26, 27]
+        assert catalog.episodes(F("metadata.n") >= 20, offset=2**63 - 1, limit=2**63 - 1) == []
 
 
 class TestFile:
@@ -401,8 +421,7 @@ class TestFile:
             "CREATE INDEX ix_more ON episode (end)",
             "ALTER TABLE episode ADD COLUMN more",
             "DROP INDEX ix_recording_uuid",
-            "INSERT INTO declared VALUES ('metadata..x', 9)",
-            "INSERT INTO declared VALUES ('seed', 9)",
+            "DROP INDEX ix_value",
         ],
     )
     def test_a_schema_that_is_not_exactly_ours_is_thrown_away(self, tmp_path: Path, change: str) -> None:

@@ -603,7 +603,7 @@ class TestFileStorage(StorageContract):
 
     def test_explain_names_the_index(self, storage: FileStorage) -> None:
         storage.declare_key("metadata.score")
-        assert "USING INDEX" in storage.explain(F("metadata.score") > 3)
+        assert "USING COVERING INDEX ix_value" in storage.explain(F("metadata.score") > 3)
 
     def test_several_processes_at_once(self, storage: FileStorage) -> None:
         header = storage.store_benchmark(query())

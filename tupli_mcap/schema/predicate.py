@@ -41,6 +41,11 @@ def compile_predicate(
     return _predicate(meant, timed=isinstance(fields, type))
 
 
+def bound_predicate(filter: BaseFilter) -> Predicate:
+    """The same of a filter that is `bound` to a model already."""
+    return _predicate(filter, timed=True)
+
+
 def _predicate(filter: BaseFilter, *, timed: bool) -> Predicate:
     match filter.type:
         case FilterType.AND:

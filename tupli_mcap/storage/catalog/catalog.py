@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import sys
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final
 
-from sqlalchemy import Connection, Select, delete, func, insert, select
+from sqlalchemy import Connection, Select, and_, delete, func, insert, select, true
 
 from tupli_mcap.errors import FilterError
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, filter_keys, split_key
-from tupli_mcap.schema.facts import check_key
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound, filter_keys, split_key
+from tupli_mcap.schema.facts import TIME_KEY, check_key
+from tupli_mcap.schema.predicate import bound_predicate
 from tupli_mcap.storage.catalog.database import (
     CatalogDamagedError,
     CatalogMovedError,
@@ -22,14 +24,22 @@ from tupli_mcap.storage.catalog.database import (
     Database,
     MemoryDatabase,
 )
-from tupli_mcap.storage.catalog.rows import EpisodeRow, StoredRow, header, store_row
-from tupli_mcap.storage.catalog.sql import compile_filter
-from tupli_mcap.storage.catalog.sqlite import SqliteDialect, is_searchable, key_statements
+from tupli_mcap.storage.catalog.filter_sql import Narrowed, merged, narrowed
+from tupli_mcap.storage.catalog.rows import (
+    EpisodeRow,
+    StoredRow,
+    header,
+    indexed_value,
+    is_indexed,
+    load_metadata,
+    store_row,
+)
 from tupli_mcap.storage.catalog.tables import (
     DECLARED,
     EPISODE,
     EPISODE_BITS,
     RECORDING,
+    VALUE,
     in_order,
     of_one_recording,
 )
@@ -49,6 +59,8 @@ _ROWS_AT_ONCE: Final = 20_000
 _FIELDS: Final = ", ".join(f'"{name}"' for name in StoredRow._fields)
 _PLACES: Final = ", ".join("?" * len(StoredRow._fields))
 _INSERT: Final = f"INSERT INTO {EPISODE.name} ({_FIELDS}) VALUES ({_PLACES})"
+_INSERT_VALUE: Final = f"INSERT INTO {VALUE.name} (episode_id, key, number, text) VALUES (?, ?, ?, ?)"
+_COLUMNS: Final = tuple(EPISODE.c[name] for name in StoredRow._fields)
 
 
 class Catalog:
@@ -142,10 +154,15 @@ class Catalog:
         remaining = iter(rows)
         first = list(itertools.islice(remaining, _ROWS_AT_ONCE))  # read before the lock is taken
         with self._write() as connection:
-            number = _add_recording(connection, relpath, stamp, uuid, benchmark_id)
+            number, indexed = (
+                _add_recording(connection, relpath, stamp, uuid, benchmark_id),
+                _indexed(connection),
+            )
             chunk = first
             while chunk:
-                connection.exec_driver_sql(_INSERT, [store_row(number, row) for row in chunk])
+                stored = [store_row(number, row) for row in chunk]
+                connection.exec_driver_sql(_INSERT, stored)
+                _index(connection, stored, indexed)
                 chunk = list(itertools.islice(remaining, _ROWS_AT_ONCE))
 
     def remove_recording(self, relpath: str) -> None:
@@ -159,69 +176,65 @@ class Catalog:
         """The episodes that a filter is true of, ordered by recording (path) and episode number.
 
         Raises:
-            FilterError: The filter names an unknown top-level key, or has too many values.
+            FilterError: The filter names an unknown top-level key, or compares a fact with what it can never be.
         """
-        columns = [EPISODE.c[name] for name in StoredRow._fields]
+        meant = _bound(filter)
         with self._read() as connection:
-            # Given the bare path to sort by, SQLite may walk all episodes in order for the few that match.
-            path = RECORDING.c.path if filter is None else func.coalesce(RECORDING.c.path, "")
-            query = self._query(connection, filter, *columns, *_OF_RECORDING).order_by(path, EPISODE.c.id)
-            if limit is not None or offset:
-                query = query.limit(-1 if limit is None else limit).offset(offset)
-            width = len(columns)
-            return [header(StoredRow(*row[:width]), *row[width:]) for row in connection.execute(query)]
+            found = _narrowed(connection, meant)
+            if found.exact:
+                return list(_headers(connection, meant, found, limit, offset))
+            headers = _headers(connection, meant, found, None, 0)
+            stop = None if limit is None else min(offset + limit, sys.maxsize)
+            return list(itertools.islice(headers, offset, stop))
 
     def count(self, filter: BaseFilter | None = None) -> int:
         """How many episodes a filter is true of. Raises as `episodes` does."""
+        meant = _bound(filter)
         with self._read() as connection:
-            return int(connection.execute(self._query(connection, filter, func.count())).scalar_one())
+            found = _narrowed(connection, meant)
+            if found.exact:
+                return int(connection.execute(_query(meant, found, func.count())).scalar_one())
+            return sum(1 for _ in _headers(connection, meant, found, None, 0))
 
     def explain(self, filter: BaseFilter | None) -> str:
-        """The SQL of a filter, its parameters, and SQLite's plan for it."""
+        """The SQL of a filter, its parameters, SQLite's plan for it, and whether Python looks at what that finds."""
+        meant = _bound(filter)
         with self._read() as connection:
-            compiled = self._query(connection, filter, EPISODE.c.id).compile(
+            found = _narrowed(connection, meant)
+            compiled = _query(meant, found, EPISODE.c.id).compile(
                 connection, compile_kwargs={"render_postcompile": True}
             )
             values = tuple(compiled.params[name] for name in compiled.positiontup or ())
             plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {compiled}", values)
             steps = [f"  {row.detail}" for row in plan]
-        return "\n".join([str(compiled), f"parameters: {values!r}", "plan:", *steps])
+        last = [] if found.exact else ["then each episode that was found is compared exactly"]
+        return "\n".join([str(compiled), f"parameters: {values!r}", "plan:", *steps, *last])
 
     def declare_key(self, key: str) -> None:
         """Index a key, so that filters on it find few episodes among many; declaring it twice is fine.
 
         Raises:
-            FilterError: There is no such top-level key, or SQLite cannot index it.
+            FilterError: There is no such top-level key, or it is that of all metadata.
         """
-        name, *inside = split_key(key)
-        check_key(key, (name,), filter_keys(EpisodeHeader))
-        if name == "metadata" and not (inside and is_searchable(tuple(inside))):
-            raise FilterError(
-                f"key {key!r} cannot be declared: its names need to be printable ASCII without quotes, "
-                "backslashes and a leading $ (it can be filtered on)"
-            )
+        path = _path_of(key)
+        check_key(key, path, filter_keys(EpisodeHeader))
+        if path == ("metadata",):
+            raise FilterError(f"key {key!r} cannot be declared: name one in it, such as metadata.score")
         with self._write() as connection:
-            if connection.execute(select(DECLARED).where(DECLARED.c.key == key)).first():
+            if connection.execute(select(DECLARED).where(DECLARED.c.key == escape_text(key))).first():
                 return
-            top = connection.execute(select(func.max(DECLARED.c.number))).scalar()
-            number = 0 if top is None else top + 1
-            connection.execute(insert(DECLARED).values(key=key, number=number))
-            for statement in key_statements(key, number):
-                connection.exec_driver_sql(statement)
+            number = connection.execute(select(func.count()).select_from(DECLARED)).scalar_one()
+            connection.execute(insert(DECLARED).values(key=escape_text(key), number=number))
+            if is_indexed(path):
+                rows = connection.execute(select(*_COLUMNS).order_by(EPISODE.c.id))
+                for chunk in rows.partitions(_ROWS_AT_ONCE):
+                    _index(connection, [StoredRow(*row) for row in chunk], {path: number})
 
     def declared_keys(self) -> list[str]:
         """The declared keys, in the order of their declaration."""
         with self._read() as connection:
-            return list(connection.execute(select(DECLARED.c.key).order_by(DECLARED.c.number)).scalars())
-
-    def _query(self, connection: Connection, filter: BaseFilter | None, *columns: Any) -> Select[Any]:
-        query: Select[Any] = select(*columns)
-        if filter is None:
-            return query.select_from(EPISODE.join(RECORDING, in_order()))
-        rows = connection.execute(select(DECLARED.c.key, DECLARED.c.number)).all()
-        declared = {path[1:]: number for key, number in rows if (path := split_key(key))[0] == "metadata"}
-        condition = compile_filter(filter, SqliteDialect(declared))
-        return query.select_from(EPISODE.join(RECORDING, of_one_recording())).where(condition)
+            keys = connection.execute(select(DECLARED.c.key).order_by(DECLARED.c.number)).scalars()
+            return [unescape_text(key) for key in keys]
 
     @contextlib.contextmanager
     def _read(self) -> Iterator[Connection]:
@@ -235,6 +248,61 @@ class Catalog:
 
 
 _OF_RECORDING: Final = (RECORDING.c.uuid, RECORDING.c.benchmark_id, RECORDING.c.path)
+_EVERYTHING: Final = Narrowed(true(), exact=True)
+
+
+def _bound(filter: BaseFilter | None) -> BaseFilter | None:
+    return None if filter is None else merged(bound(filter, EpisodeHeader))
+
+
+def _narrowed(connection: Connection, filter: BaseFilter | None) -> Narrowed:
+    return _EVERYTHING if filter is None else narrowed(filter, _indexed(connection))
+
+
+def _query(filter: BaseFilter | None, found: Narrowed, *columns: Any) -> Select[Any]:
+    of = of_one_recording() if filter is not None else in_order()
+    return select(*columns).select_from(EPISODE.join(RECORDING, of)).where(found.condition)
+
+
+def _headers(
+    connection: Connection, filter: BaseFilter | None, found: Narrowed, limit: int | None, offset: int
+) -> Iterator[EpisodeHeader]:
+    """The episodes that a filter is true of; `limit` and `offset` count those that SQL finds."""
+    # Given the bare path to sort by, SQLite may walk all episodes in order for the few that match.
+    path = RECORDING.c.path if filter is None else func.coalesce(RECORDING.c.path, "")
+    query = _query(filter, found, *_COLUMNS, *_OF_RECORDING).order_by(path, EPISODE.c.id)
+    rows = connection.execute(query.limit(limit).offset(offset or None))
+    matches = None if filter is None or found.exact else bound_predicate(filter)
+    width = len(_COLUMNS)
+    for row in rows:
+        made = header(StoredRow(*row[:width]), *row[width:])
+        if matches is None or matches(made):
+            yield made
+
+
+def _indexed(connection: Connection) -> dict[tuple[str, ...], int]:
+    """The paths of declared keys whose values are in `VALUE`, with their numbers there."""
+    declared = connection.execute(select(DECLARED.c.key, DECLARED.c.number)).all()
+    paths = {_path_of(unescape_text(key)): number for key, number in declared}
+    return {path: number for path, number in paths.items() if is_indexed(path)}
+
+
+def _path_of(key: str) -> tuple[str, ...]:
+    name, *inside = split_key(key)
+    return (TIME_KEY if name == "ended" else name, *inside)
+
+
+def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[tuple[str, ...], int]) -> None:
+    """Puts what rows hold at declared keys into `VALUE`."""
+    values = []
+    for row in rows if indexed else ():
+        metadata = load_metadata(row.metadata)
+        for path, number in indexed.items():
+            value = indexed_value(row, metadata, path)
+            if value is not None:
+                values.append((row.id, number, *value))
+    if values:
+        connection.exec_driver_sql(_INSERT_VALUE, values)
 
 
 def _add_recording(
@@ -255,7 +323,7 @@ def _remove_recording(connection: Connection, relpath: str) -> None:
     if number is None:
         return
     first = number << EPISODE_BITS
-    connection.execute(
-        delete(EPISODE).where(EPISODE.c.id >= first, EPISODE.c.id < first + (1 << EPISODE_BITS))
-    )
+    for episodes in (VALUE.c.episode_id, EPISODE.c.id):
+        of = and_(episodes >= first, episodes < first + (1 << EPISODE_BITS))
+        connection.execute(delete(episodes.table).where(of))
     connection.execute(delete(RECORDING).where(RECORDING.c.id == number))

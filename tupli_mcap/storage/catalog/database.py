@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import sqlite3
 import threading
@@ -11,14 +12,13 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from sqlalchemy import URL, Connection, Dialect, Engine, Pool, StaticPool, create_engine, event, select
+from sqlalchemy import URL, Connection, Dialect, Engine, Pool, StaticPool, create_engine, event
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
-from tupli_mcap.errors import FilterError, StorageError, os_reason
+from tupli_mcap.errors import StorageError, os_reason
 from tupli_mcap.mcap.lock import drop_private
 from tupli_mcap.storage.atomic import Lock, LockError, locked
-from tupli_mcap.storage.catalog.sqlite import key_statements, register_functions, table_statements
-from tupli_mcap.storage.catalog.tables import APPLICATION_ID, DECLARED, METADATA, VERSION
+from tupli_mcap.storage.catalog.tables import APPLICATION_ID, METADATA, VERSION
 from tupli_mcap.storage.place import is_private, make_private
 
 _BUSY_MS: Final = 30_000
@@ -36,7 +36,6 @@ _UNUSABLE: Final = (
 )
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _SCHEMA: Final = "SELECT type, name, tbl_name, sql FROM sqlite_master"
-_TOO_LARGE: Final = ("too many SQL variables", "Expression tree is too large", "parser stack overflow")
 
 
 class CatalogDamagedError(StorageError):
@@ -110,7 +109,6 @@ class Database:
             StorageError: SQLite refuses, or the catalog is closed.
             CatalogMovedError: The file was deleted or replaced meanwhile.
             CatalogDamagedError: The file is damaged.
-            FilterError: The statement is too large for SQLite.
         """
         with _translated(self.path):
             self._refresh()
@@ -310,7 +308,6 @@ def _prepared(engine: Engine) -> Engine:
         connection.execute(f"PRAGMA busy_timeout = {_BUSY_MS}")
         connection.execute("PRAGMA synchronous = NORMAL")
         connection.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
-        register_functions(connection)
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
@@ -332,17 +329,12 @@ def _is_catalog(engine: Engine, path: Path) -> bool:
         with engine.connect() as connection:
             application = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
             version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-            found = {tuple(row) for row in connection.exec_driver_sql(_SCHEMA)}
-            if (application, version) != (APPLICATION_ID, VERSION) or not _tables_only(found):
-                return False
-            keys = connection.execute(select(DECLARED.c.key, DECLARED.c.number).order_by(DECLARED.c.number))
-            return found == _schema_of([(key, number) for key, number in keys])
+            schema = {tuple(row) for row in connection.exec_driver_sql(_SCHEMA)}
+            return (application, version, schema) == (APPLICATION_ID, VERSION, _our_schema())
     except DBAPIError as err:
         if _is_damage(err) or not path.exists():
             return False
         raise
-    except FilterError:
-        return False  # it declares what is no key
 
 
 def _is_ours(path: Path) -> bool:
@@ -355,26 +347,19 @@ def _is_ours(path: Path) -> bool:
         return False
 
 
-def _tables_only(found: set[tuple[Any, ...]]) -> bool:
-    """Whether a schema has our tables, and neither views nor triggers."""
-    names = {name for kind, name, *_ in found if kind == "table"}
-    return names == set(METADATA.tables) and all(kind in ("table", "index") for kind, *_ in found)
-
-
-def _schema_of(keys: Sequence[tuple[str, int]]) -> set[tuple[Any, ...]]:
-    """The schema of a catalog in which these keys are declared."""
-    with contextlib.closing(sqlite3.connect(":memory:")) as connection:
-        for statement in table_statements():
-            connection.execute(statement)
-        for key, number in keys:
-            for statement in key_statements(key, number):
-                connection.execute(statement)
-        return set(connection.execute(_SCHEMA))
+@functools.cache
+def _our_schema() -> set[tuple[Any, ...]]:
+    engine = create_engine("sqlite://")
+    try:
+        with engine.connect() as connection:
+            METADATA.create_all(connection)
+            return {tuple(row) for row in connection.exec_driver_sql(_SCHEMA)}
+    finally:
+        engine.dispose()
 
 
 def _create_tables(connection: Connection) -> None:
-    for statement in table_statements():
-        connection.exec_driver_sql(statement)
+    METADATA.create_all(connection, checkfirst=False)
     connection.exec_driver_sql(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.exec_driver_sql(f"PRAGMA user_version = {VERSION}")
 
@@ -437,8 +422,6 @@ def _translated(path: Path | None) -> Iterator[None]:
             raise CatalogDamagedError(
                 f"{named} is damaged ({err.orig}); delete it, it is rebuilt from the recordings"
             ) from err
-        if any(reason in str(err.orig) for reason in _TOO_LARGE):
-            raise FilterError(f"the filter has too many values or parts for SQLite ({err.orig})") from err
         kind = CatalogUnusableError if _has_code(err, _UNUSABLE) else StorageError
         raise kind(f"{named} cannot be used: {err.orig}") from err
     except SQLAlchemyError as err:

@@ -1,28 +1,30 @@
-"""The tables of a catalog."""
+"""The tables of a catalog, the same in any SQL database."""
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
-from sqlalchemy import BigInteger, Column, ForeignKey, Integer, MetaData, Table, Text, and_
+from sqlalchemy import BigInteger, Column, Float, ForeignKey, Index, Integer, MetaData, Table, Text, and_
 from sqlalchemy.sql.elements import ColumnElement
-from sqlalchemy.types import UserDefinedType
+
+__all__ = [
+    "APPLICATION_ID",
+    "DECLARED",
+    "EPISODE",
+    "EPISODE_BITS",
+    "METADATA",
+    "RECORDING",
+    "VALUE",
+    "VERSION",
+    "in_order",
+    "of_one_recording",
+]
 
 APPLICATION_ID: Final = 0x7475_706C  # "tupl": how SQLite tells whose file this is
-VERSION: Final = 3
+VERSION: Final = 4
 
 EPISODE_BITS: Final = 32
 """An episode's row id is its recording's id shifted left by this, plus its number: rows lie in file order."""
-
-
-class AsStored(UserDefinedType[Any]):
-    """A column without affinity: SQLite keeps and compares each value as the type it was given."""
-
-    cache_ok = True
-
-    def get_col_spec(self, **_: Any) -> str:
-        return ""
-
 
 METADATA: Final = MetaData()
 
@@ -47,15 +49,13 @@ EPISODE: Final = Table(
     Column("env", Integer, nullable=False),
     Column("n_tuples", Integer, nullable=False),
     Column("end", Text, nullable=False),
-    # Numbers that SQLite cannot hold (NaN, integers beyond 64 bits) are their JSON text in these two.
-    Column("episode_return", AsStored),
-    Column("seed", AsStored),
+    Column("episode_return", Float),  # NULL for NaN, too
+    Column("seed", Float),  # the nearest one
     Column("created_at", BigInteger, nullable=False),  # ns since 1970 in UTC, whole microseconds
     Column("created_by", Text, nullable=False),
     Column("published_in", Text, nullable=False),
     Column("metadata", Text, nullable=False),
-    # The metadata as it was given, where `metadata` had to be rewritten for SQLite to see what it says.
-    Column("original", Text),
+    Column("exact", Text),  # JSON of the fields of which the columns do not say all
 )
 
 DECLARED: Final = Table(
@@ -63,6 +63,18 @@ DECLARED: Final = Table(
     METADATA,
     Column("key", Text, primary_key=True),
     Column("number", Integer, nullable=False),
+)
+
+# What episodes hold at declared keys: the nearest float of a number or a flag, or a text; neither for anything else.
+VALUE: Final = Table(
+    "value",
+    METADATA,
+    Column("episode_id", Integer, primary_key=True, autoincrement=False),
+    Column("key", Integer, primary_key=True, autoincrement=False),  # its number in `declared`
+    Column("number", Float),
+    Column("text", Text),
+    Index("ix_value", "key", "number", "text", "episode_id"),
+    sqlite_with_rowid=False,
 )
 
 
@@ -75,29 +87,3 @@ def in_order() -> ColumnElement[bool]:
     """The same join, cheap from recordings to their episodes only: SQLite then walks all in order."""
     first = RECORDING.c.id.op("<<")(EPISODE_BITS)
     return and_(EPISODE.c.id >= first, EPISODE.c.id < first + (1 << EPISODE_BITS))
-
-
-def declared_columns(number: int) -> tuple[str, str]:
-    """The names of the generated columns (kind, value) of a declared metadata key."""
-    return f"key_{number}_kind", f"key_{number}_value"
-
-
-def declared_index(number: int) -> str:
-    """The name of the index of a declared key."""
-    return f"ix_key_{number}"
-
-
-__all__ = [
-    "APPLICATION_ID",
-    "DECLARED",
-    "EPISODE",
-    "EPISODE_BITS",
-    "METADATA",
-    "RECORDING",
-    "VERSION",
-    "AsStored",
-    "declared_columns",
-    "declared_index",
-    "in_order",
-    "of_one_recording",
-]

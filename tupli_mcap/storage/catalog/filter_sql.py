@@ -1,0 +1,257 @@
+"""Filters as SQL: which rows may match, by the columns and indexes that there are.
+
+SQL answers coarsely where a database sees values otherwise than Python: numbers of metadata are compared as the nearest
+floats, texts that SQL and Python may order differently not at all. Each comparison thus is a condition that is true of
+all rows that match, and says whether it is exact, true of no others. What is found by a condition that is not exact is
+asked again in Python (`tupli_mcap.schema.predicate`), so that a filter means the same everywhere.
+
+All of it is SQL of any database, but for `json_extract` and `json_type`, which look into metadata where no key was
+declared: without them, all is asked again.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+from sqlalchemy import and_, false, func, not_, or_, select, true, union_all
+from sqlalchemy.sql.elements import ColumnElement
+
+from tupli_mcap.schema import BaseFilter, FilterIN, FilterType
+from tupli_mcap.schema.facts import comparisons
+from tupli_mcap.schema.filters import COMBINING, ORDERING, path_of
+from tupli_mcap.schema.predicate import scalar_test
+from tupli_mcap.schema.values import Scalar, classify
+from tupli_mcap.storage.catalog.rows import nearest_float
+from tupli_mcap.storage.catalog.tables import EPISODE, EPISODE_BITS, RECORDING, VALUE
+from tupli_mcap.storage.common import escape_text
+
+__all__ = ["Narrowed", "merged", "narrowed"]
+
+Condition = ColumnElement[bool]
+
+# A statement has so many comparisons with so many values each at most: databases have limits of both.
+_MOST_COMPARISONS: Final = 64
+_MOST_VALUES: Final = 250
+
+_SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
+# SQLite reads a decimal number to within a few units in the last place.
+_READ_WITHIN: Final = 1e-12
+_SMALLEST: Final = 1e-300
+
+_EPISODE_NUMBER: Final = re.compile("0|[1-9][0-9]{0,9}")
+_OPERATORS: Final[Mapping[FilterType, Callable[[Any, Any], Any]]] = {
+    FilterType.EQ: operator.eq,
+    FilterType.NE: operator.ne,
+    FilterType.GT: operator.gt,
+    FilterType.GEQ: operator.ge,
+    FilterType.LT: operator.lt,
+    FilterType.LEQ: operator.le,
+}
+_TEXTS: Final = {
+    "created_by": EPISODE.c.created_by,
+    "benchmark_id": RECORDING.c.benchmark_id,
+    "recording": RECORDING.c.path,
+}
+_INTEGERS: Final = {name: EPISODE.c[name] for name in ("created_at", "n_tuples", "env", "episode")}
+_NUMBERS: Final = {name: EPISODE.c[name] for name in ("episode_return", "seed")}
+_CHOICES: Final[Mapping[str, Mapping[Scalar, Condition]]] = {
+    "end": {Scalar("text", end): EPISODE.c.end == end for end in ("terminal", "timeout", "interrupted")},
+    "terminated": {
+        Scalar("bool", True): EPISODE.c.end == "terminal",
+        Scalar("bool", False): EPISODE.c.end != "terminal",
+    },
+    "timeout": {
+        Scalar("bool", True): EPISODE.c.end == "timeout",
+        Scalar("bool", False): EPISODE.c.end != "timeout",
+    },
+}
+
+
+class Narrowed(NamedTuple):
+    """A condition that is true of all rows a filter is true of; `exact`: and of no others."""
+
+    condition: Condition
+    exact: bool
+
+
+_ALL: Final = Narrowed(true(), exact=False)
+
+
+def narrowed(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narrowed:
+    """The condition on rows of `EPISODE` joined with `RECORDING` of a filter that is `bound` to episode headers.
+
+    indexed: the paths of declared keys that `VALUE` holds, and their numbers there.
+    """
+    parts = list(filter.filters) if filter.type is FilterType.AND else [filter]
+    kept, room = [], _MOST_COMPARISONS
+    for part in parts:
+        size = sum(1 for _ in comparisons(part))
+        if size <= room:
+            kept.append(part)
+            room -= size
+    found = _all(kept, indexed, negated=False)
+    return found if len(kept) == len(parts) else found._replace(exact=False)
+
+
+def merged(filter: BaseFilter) -> BaseFilter:
+    """The same filter, where parts of an OR that ask one key for one value each are one IN."""
+    if filter.type not in COMBINING:
+        return filter
+    parts = [merged(part) for part in filter.filters]
+    if filter.type is FilterType.OR:
+        equal: dict[tuple[str, ...], list[BaseFilter]] = {}
+        for part in parts:
+            if part.type is FilterType.EQ:
+                equal.setdefault(path_of(part), []).append(part)
+        parts = [part for part in parts if part.type is not FilterType.EQ]
+        for same in equal.values():
+            parts.append(FilterIN(key=same[0].key, value=[part.value for part in same]))
+    return filter.model_copy(update={"filters": tuple(parts)})
+
+
+def _narrow(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int], negated: bool) -> Narrowed:
+    if filter.type is FilterType.NOT:
+        return _narrow(filter.filters[0], indexed, not negated)
+    if filter.type is (FilterType.AND if negated else FilterType.OR):
+        parts = [_narrow(part, indexed, negated) for part in filter.filters]
+        either = or_(false(), *(part.condition for part in parts))
+        return Narrowed(either, all(part.exact for part in parts))
+    return _all(filter.filters if filter.type in COMBINING else [filter], indexed, negated)
+
+
+def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], negated: bool) -> Narrowed:
+    """Where all filters are true; what asks `VALUE` for one key is asked together."""
+    parts: list[Narrowed] = []
+    values: dict[int, list[Condition]] = {}
+    few = not negated and any(_names_few(part) for part in filters)
+    for part in filters:
+        if part.type in COMBINING:
+            parts.append(_narrow(part, indexed, negated))
+            continue
+        found = _compared(part)
+        if negated:
+            found = Narrowed(not_(found.condition), exact=True) if found.exact else _ALL
+        elif path_of(part) in indexed and part.type is not FilterType.NE and not few:
+            near = _near(part, VALUE.c.number, VALUE.c.text)
+            values.setdefault(indexed[path_of(part)], []).append(near)
+        parts.append(found)
+    held = (select(VALUE.c.episode_id).where(VALUE.c.key == key, *values[key]) for key in values)
+    conditions = [*(part.condition for part in parts), *(EPISODE.c.id.in_(ids) for ids in held)]
+    return Narrowed(and_(true(), *conditions), all(part.exact for part in parts))
+
+
+def _names_few(filter: BaseFilter) -> bool:
+    """Whether a filter names episodes or recordings: looking at each is quicker than finding others by a value."""
+    is_equal = filter.type in (FilterType.EQ, FilterType.IN)
+    return is_equal and path_of(filter)[0] in ("id", "recording")
+
+
+def _compared(filter: BaseFilter) -> Narrowed:
+    """A comparison by the columns of the two tables."""
+    name = path_of(filter)[0]
+    if name in _CHOICES:
+        test = scalar_test(filter)
+        chosen = (condition for choice, condition in _CHOICES[name].items() if test(choice))
+        return Narrowed(or_(false(), *chosen), exact=True)
+    if name in _TEXTS:
+        return _exactly(filter, _TEXTS[name], escape_text)
+    if name in _INTEGERS:
+        return _exactly(filter, _INTEGERS[name], _bindable)
+    if name == "id":
+        return _of_ids(filter)
+    if filter.type is FilterType.NE:
+        return _ALL
+    if name in _NUMBERS:
+        return Narrowed(_near(filter, _NUMBERS[name]), exact=False)
+    return Narrowed(_in_metadata(filter), exact=False)
+
+
+def _exactly(filter: BaseFilter, column: ColumnElement[Any], stored: Callable[[Any], Any]) -> Narrowed:
+    if filter.type is FilterType.IN:
+        values = [stored(value) for value in filter.value]
+        return Narrowed(_any_of(column, values), exact=len(values) <= _MOST_VALUES)
+    return Narrowed(_OPERATORS[filter.type](column, stored(filter.value)), exact=True)
+
+
+def _near(
+    filter: BaseFilter, number: ColumnElement[Any], text: ColumnElement[Any] | None = None
+) -> Condition:
+    """A comparison, other than NE, with what is stored as the nearest float, or a text."""
+    wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
+    numbers = [nearest_float(scalar.value) for scalar in wanted if scalar.kind in ("number", "bool")]
+    texts = [escape_text(scalar.value) for scalar in wanted if scalar.kind == "text"]
+    if filter.type not in (FilterType.EQ, FilterType.IN):
+        rising = filter.type in (FilterType.GT, FilterType.GEQ)
+        if numbers:
+            return number >= numbers[0] if rising else number <= numbers[0]
+        return false() if text is None or not texts else _OPERATORS[filter.type](text, texts[0])
+    parts = [_any_of(number, numbers)]
+    if any(scalar.kind == "null" for scalar in wanted):
+        parts.append(number.is_(None) if text is None else and_(number.is_(None), text.is_(None)))
+    if text is not None:
+        parts.append(and_(number.is_(None), _any_of(text, texts)))
+    return or_(*parts)
+
+
+def _in_metadata(filter: BaseFilter) -> Condition:
+    """A comparison, other than NE, with what JSON functions find in metadata."""
+    path = path_of(filter)[1:]
+    wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
+    texts = [scalar.value for scalar in wanted if scalar.kind == "text"]
+    ordered_texts = filter.type in ORDERING and texts
+    if ordered_texts or not all(map(_SEARCHABLE.fullmatch, path)) or not all(map(str.isprintable, texts)):
+        return true()
+    if len(wanted) > _MOST_VALUES:
+        return true()
+    where = "$" + "".join(f'."{segment}"' for segment in path)
+    value = func.json_extract(EPISODE.c.metadata, where)
+    parts = [EPISODE.c.metadata.contains('"$', autoescape=True)]  # tags stand for other values
+    for scalar in wanted:
+        if scalar.kind == "text":
+            parts.append(value == scalar.value)
+        elif scalar.kind == "null":
+            parts.append(func.json_type(EPISODE.c.metadata, where) == "null")
+        elif scalar.kind != "nan":
+            near = nearest_float(scalar.value)
+            room = 0.0 if math.isinf(near) else abs(near) * _READ_WITHIN + _SMALLEST
+            low, high = near - room, near + room
+            least = value >= low if filter.type not in (FilterType.LT, FilterType.LEQ) else true()
+            most = value <= high if filter.type not in (FilterType.GT, FilterType.GEQ) else true()
+            parts.append(and_(least, most))
+    return or_(*parts)
+
+
+def _of_ids(filter: BaseFilter) -> Narrowed:
+    """A comparison with ids of episodes: their recording's uuid, a hyphen and their number."""
+    if filter.type not in (FilterType.EQ, FilterType.NE, FilterType.IN):
+        return _ALL
+    texts = filter.value if filter.type is FilterType.IN else [filter.value]
+    parts = [text.rpartition("-") for text in texts]
+    ids = [(escape_text(uuid), int(number)) for uuid, _, number in parts if _EPISODE_NUMBER.fullmatch(number)]
+    if len(ids) > _MOST_VALUES:
+        return Narrowed(_any_of(RECORDING.c.uuid, [uuid for uuid, _ in ids]), exact=False)
+    if not ids:
+        return Narrowed(false() if filter.type is not FilterType.NE else true(), exact=True)
+    named = RECORDING.alias("named")
+    first = named.c.id.op("<<")(EPISODE_BITS)
+    rows = union_all(*(select(first + number).where(named.c.uuid == uuid) for uuid, number in ids))
+    found = EPISODE.c.id.in_(rows)
+    return Narrowed(not_(found) if filter.type is FilterType.NE else found, exact=True)
+
+
+def _any_of(column: ColumnElement[Any], values: Sequence[Any]) -> Condition:
+    """Where a column holds one of the values; of many values, anything between them."""
+    if len(values) <= _MOST_VALUES:
+        return column.in_(values) if values else false()
+    return column.between(min(values), max(values))
+
+
+def _bindable(number: float) -> float:
+    """A number that a database can be given, and that compares with every 64-bit integer as `number` does."""
+    if isinstance(number, int) and not -(2**63) <= number < 2**63:
+        return math.inf if number > 0 else -math.inf
+    return number
