@@ -17,7 +17,7 @@ from tupli_mcap import FileStorage, RecordEpisodes, Recording, rewrite_recording
 from tupli_mcap.environment import EnvironmentRecord, capture
 from tupli_mcap.recording.edit import assemble as transfer
 from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery
-from tupli_mcap.storage.document import benchmark_hash, facts_about, pack, recording_attachments, unpack
+from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
 
 MODULE = "evil_module"
 

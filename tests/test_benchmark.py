@@ -26,7 +26,7 @@ from tupli_mcap.errors import NotFoundError, StorageError, TupliError, Untrusted
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, F, FilterEQ, RLTuple
 from tupli_mcap.storage import FileStorage, TupliStorage
-from tupli_mcap.storage.document import unpack
+from tupli_mcap.storage.benchmark_json import unpack
 
 
 @pytest.fixture(autouse=True)

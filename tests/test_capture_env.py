@@ -23,7 +23,7 @@ from tupli_mcap.environment import EnvironmentRecord, build, note
 from tupli_mcap.errors import RecordingError, StorageError, TupliError, UntrustedError
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.schema import F
-from tupli_mcap.storage.document import unpack
+from tupli_mcap.storage.benchmark_json import unpack
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 from tupli_mcap.wrappers.rollout import record_rollouts
 

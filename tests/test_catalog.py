@@ -21,10 +21,11 @@ from hypothesis import strategies as st
 from tupli_mcap.errors import FilterError, FormatError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR
-from tupli_mcap.storage import FileStorage, place
+from tupli_mcap.storage import FileStorage
+from tupli_mcap.storage.catalog import place
 from tupli_mcap.storage.catalog.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
-from tupli_mcap.storage.common import escape_text, unescape_text
-from tupli_mcap.storage.place import cache_dir, catalog_path
+from tupli_mcap.storage.catalog.place import cache_dir, catalog_path
+from tupli_mcap.storage.texts import escape_text, unescape_text
 
 CREATED_NS = 1_795_251_600_000_001_999
 STAMP = RecordingStamp(size=10, mtime_ns=20, mixed=30)

@@ -39,7 +39,7 @@ from tupli_mcap.cli.output import bytes_of, number, numbers
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, RLTuple
-from tupli_mcap.storage.place import catalog_path
+from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
@@ -865,7 +865,7 @@ class TestSharing:
     def test_artifacts_come_along(self, here: Path) -> None:
         from tupli_mcap.environment import capture
         from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery
-        from tupli_mcap.storage.document import BenchmarkContent, benchmark_hash, facts_about, pack
+        from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, facts_about, pack
 
         env = gym.make("CartPole-v1")
         metadata = BenchmarkMetadata(name="with wind")

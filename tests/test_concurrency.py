@@ -22,7 +22,7 @@ from tupli_mcap import FileStorage, Recording, TupliDataset, TupliEnvWrapper
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.schema import F, FilterEQ
 from tupli_mcap.storage.atomic import Lock
-from tupli_mcap.storage.place import catalog_path
+from tupli_mcap.storage.catalog.place import catalog_path
 
 TOOL = Path(__file__).parents[1] / "tools" / "concurrency.py"
 
@@ -144,7 +144,7 @@ class TestTheCatalog:
         with FileStorage(storage.root) as other:
             other.list_episodes()
         storage.list_episodes()
-        assert "key_0" in storage.explain(F("metadata.score") > 1)
+        assert "ix_value" in storage.explain(F("metadata.score") > 1)
 
     def test_survives_a_fork(self, storage: FileStorage, env: TupliEnvWrapper) -> None:
         rollout(env, 2)

@@ -20,7 +20,7 @@ from gymnasium import spaces
 
 from tupli_mcap import EpisodeData, F, FileStorage, Recording, write_recording
 from tupli_mcap.storage.catalog import entries
-from tupli_mcap.storage.scan import scan
+from tupli_mcap.storage.listing import scan
 
 RECORDINGS, EPISODES = 12, 5
 

@@ -42,7 +42,7 @@ from tupli_mcap import FileStorage, Recording, TupliDataset, TupliEnvWrapper
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.schema import EpisodeMetadataCallback, F, FilterEQ, RLTuple
-from tupli_mcap.storage.place import catalog_path
+from tupli_mcap.storage.catalog.place import catalog_path
 
 FOREIGN = 1 << 20  # tokens of imported episodes start here
 _STEP = struct.Struct("<III")  # episode, steps acknowledged, whether it has ended

@@ -21,8 +21,8 @@ from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, Tupli
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.storage import TupliStorage
-from tupli_mcap.storage.common import first_defect
-from tupli_mcap.storage.document import benchmark_hash, facts_about, pack, recording_attachments, unpack
+from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
+from tupli_mcap.storage.texts import first_defect
 from tupli_mcap.wrappers import RecordEpisodes
 
 __all__ = ["DeletedBenchmark", "TupliEnvWrapper"]

@@ -22,7 +22,7 @@ from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, Storag
 from tupli_mcap.dataset.tuples import Tuples
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage import TupliStorage
-from tupli_mcap.storage.tuples import anew
+from tupli_mcap.storage.base import anew
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -26,7 +26,7 @@ from tupli_mcap.schema import (
 from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.storage import TupliStorage
-from tupli_mcap.storage.document import restored
+from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.sidecar import Notes
 
 __all__ = ["DatasetError", "FilesSource", "Source", "StorageSource", "episode_headers"]

@@ -13,8 +13,9 @@ from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import ArtifactMetadata, ArtifactMetadataItem, BaseFilter, compile_predicate
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
-from tupli_mcap.storage.common import LOCAL_USER, first_defect, is_hash, published_in, to_json
-from tupli_mcap.storage.document import plain, restored
+from tupli_mcap.storage.base import LOCAL_USER, published_in
+from tupli_mcap.storage.benchmark_json import plain, restored
+from tupli_mcap.storage.texts import first_defect, is_hash, to_json
 
 __all__ = ["ArtifactFiles"]
 

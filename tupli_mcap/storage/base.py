@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from tupli_mcap.errors import StorageError
+from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
@@ -22,10 +23,22 @@ from tupli_mcap.schema import (
     EpisodeItem,
 )
 
-__all__ = ["TupliStorage", "TupliStorageError"]
+__all__ = [
+    "LOCAL_USER",
+    "TupliStorage",
+    "TupliStorageError",
+    "anew",
+    "published_in",
+]
 
 TupliStorageError = StorageError
 """The name this error has in PyTupli."""
+
+
+LOCAL_USER = "local_storage"
+"""Who creates what is in a directory; also the name of the only group that sees it."""
+_ATTEMPTS = 5
+_T = TypeVar("_T")
 
 
 class TupliStorage(ABC):
@@ -162,3 +175,26 @@ class TupliStorage(ABC):
     @abstractmethod
     def declare_key(self, key: str) -> None:
         """Index an episode metadata key (`metadata.score`), so that filters on it stay fast."""
+
+
+def published_in(groups: Sequence[str], group: str) -> list[str]:
+    """The groups that see an item, and one more.
+
+    Raises:
+        StorageError: That is no name of a group.
+    """
+    if not isinstance(group, str) or not group or not group.isprintable():
+        raise StorageError(f"expected the name of a group to publish in, found {group!r:.80}")
+    return [*groups, *([] if group in groups else [group])]
+
+
+def anew(read: Callable[[], _T]) -> _T:
+    """What a function lists and reads, asked again if what it had listed was deleted before it was read.
+
+    Raises:
+        NotFoundError: that happened five times.
+    """
+    for _ in range(_ATTEMPTS - 1):
+        with contextlib.suppress(NotFoundError):
+            return read()
+    return read()

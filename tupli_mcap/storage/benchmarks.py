@@ -15,8 +15,9 @@ from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
-from tupli_mcap.storage.common import LOCAL_USER, first_defect, is_hash, published_in, to_json
-from tupli_mcap.storage.document import artifacts_of, benchmark_hash, pack, plain, restored, unpack
+from tupli_mcap.storage.base import LOCAL_USER, published_in
+from tupli_mcap.storage.benchmark_json import artifacts_of, benchmark_hash, pack, plain, restored, unpack
+from tupli_mcap.storage.texts import first_defect, is_hash, to_json
 
 __all__ = ["BenchmarkFiles"]
 

@@ -30,8 +30,8 @@ from tupli_mcap.schema import (
     FilterIN,
 )
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.common import first_defect
-from tupli_mcap.storage.document import (
+from tupli_mcap.storage.base import anew
+from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,
     DOCUMENT_NAME,
     PICKLE_NAME,
@@ -45,7 +45,7 @@ from tupli_mcap.storage.document import (
 )
 from tupli_mcap.storage.recordings import episode_id
 from tupli_mcap.storage.sidecar import Notes
-from tupli_mcap.storage.tuples import anew
+from tupli_mcap.storage.texts import first_defect
 
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey

@@ -38,13 +38,13 @@ from tupli_mcap.schema import (
 from tupli_mcap.storage import bundles
 from tupli_mcap.storage.artifacts import ArtifactFiles
 from tupli_mcap.storage.atomic import Lock, fill, os_errors, refusals_told, write_bytes
-from tupli_mcap.storage.base import TupliStorage
+from tupli_mcap.storage.base import TupliStorage, anew
+from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
 from tupli_mcap.storage.benchmarks import BenchmarkFiles
-from tupli_mcap.storage.common import first_defect
-from tupli_mcap.storage.document import declared_spaces, recording_attachments
-from tupli_mcap.storage.handmade import episode_data, episode_spaces
+from tupli_mcap.storage.from_values import episode_data, episode_spaces
+from tupli_mcap.storage.listing import with_tuples
 from tupli_mcap.storage.recordings import RecordingFiles
-from tupli_mcap.storage.tuples import anew, with_tuples
+from tupli_mcap.storage.texts import first_defect
 
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey

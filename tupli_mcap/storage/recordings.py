@@ -22,6 +22,7 @@ from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
+from tupli_mcap.storage.base import LOCAL_USER, published_in
 from tupli_mcap.storage.catalog.catalog import (
     Catalog,
     CatalogDamagedError,
@@ -30,9 +31,8 @@ from tupli_mcap.storage.catalog.catalog import (
     RecordingStamp,
 )
 from tupli_mcap.storage.catalog.entries import Entry, entry_of, read_ahead
-from tupli_mcap.storage.common import LOCAL_USER, published_in
-from tupli_mcap.storage.place import cache_dir, catalog_path
-from tupli_mcap.storage.scan import scan, stamp_of
+from tupli_mcap.storage.catalog.place import cache_dir, catalog_path
+from tupli_mcap.storage.listing import scan, stamp_of
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles", "episode_id"]

@@ -31,7 +31,7 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.storage.atomic import os_errors, write_bytes
-from tupli_mcap.storage.common import escape_text, first_defect, unescape_text
+from tupli_mcap.storage.texts import escape_text, first_defect, unescape_text
 
 __all__ = ["Deletion", "Notes", "Sidecar", "sidecar_path"]
 

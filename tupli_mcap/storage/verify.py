@@ -21,10 +21,10 @@ from tupli_mcap.storage import bundles
 from tupli_mcap.storage.artifacts import ArtifactFiles
 from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.benchmarks import BenchmarkFiles
-from tupli_mcap.storage.common import is_hash
 from tupli_mcap.storage.files import FileStorage
-from tupli_mcap.storage.scan import scan
+from tupli_mcap.storage.listing import scan
 from tupli_mcap.storage.sidecar import DELETING, Notes, sidecar_path
+from tupli_mcap.storage.texts import is_hash
 
 __all__ = ["StorageReport", "verify_paths", "verify_storage"]
 

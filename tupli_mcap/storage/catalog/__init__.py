@@ -2,6 +2,7 @@
 
 catalog             keeps it up to date with the directory, and answers queries
 database, tables    the database, and what is in it
+place               where it lies, for this user alone
 entries             what it holds of a recording, read here or by other processes
 rows                episodes as rows
 filter_sql          filters as SQL that finds what may match; Python looks at that again

@@ -43,8 +43,8 @@ from tupli_mcap.storage.catalog.tables import (
     in_order,
     of_one_recording,
 )
-from tupli_mcap.storage.common import escape_text, unescape_text
-from tupli_mcap.storage.scan import RecordingStamp
+from tupli_mcap.storage.listing import RecordingStamp
+from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = [
     "Catalog",

@@ -18,8 +18,8 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from tupli_mcap.errors import StorageError, os_reason
 from tupli_mcap.mcap.lock import drop_private
 from tupli_mcap.storage.atomic import Lock, LockError, locked
+from tupli_mcap.storage.catalog.place import is_private, make_private
 from tupli_mcap.storage.catalog.tables import APPLICATION_ID, METADATA, VERSION
-from tupli_mcap.storage.place import is_private, make_private
 
 _BUSY_MS: Final = 30_000
 _ATTEMPTS: Final = 100  # to open a file that others replace

@@ -25,9 +25,9 @@ from typing import NamedTuple
 
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
+from tupli_mcap.storage.base import LOCAL_USER
 from tupli_mcap.storage.catalog.rows import EpisodeRow
-from tupli_mcap.storage.common import LOCAL_USER
-from tupli_mcap.storage.scan import RecordingStamp, stamp_of
+from tupli_mcap.storage.listing import RecordingStamp, stamp_of
 from tupli_mcap.storage.sidecar import Notes, Sidecar
 
 __all__ = ["Entry", "entry_of", "read_ahead"]

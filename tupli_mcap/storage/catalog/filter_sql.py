@@ -27,7 +27,7 @@ from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import Scalar, classify
 from tupli_mcap.storage.catalog.rows import nearest_float
 from tupli_mcap.storage.catalog.tables import EPISODE, EPISODE_BITS, RECORDING, VALUE
-from tupli_mcap.storage.common import escape_text
+from tupli_mcap.storage.texts import escape_text
 
 __all__ = ["Narrowed", "merged", "narrowed"]
 

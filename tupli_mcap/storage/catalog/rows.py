@@ -16,7 +16,7 @@ from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.schema.values import classify
 from tupli_mcap.storage.catalog.tables import EPISODE_BITS
-from tupli_mcap.storage.common import escape_text, unescape_text
+from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = ["EpisodeRow", "StoredRow", "header", "indexed_value", "is_indexed", "nearest_float", "store_row"]
 

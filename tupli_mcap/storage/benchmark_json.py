@@ -16,7 +16,7 @@ from tupli_mcap.errors import FormatError, SpaceError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain, loads
 from tupli_mcap.schema import BenchmarkMetadata
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
-from tupli_mcap.storage.common import is_hash
+from tupli_mcap.storage.texts import is_hash
 
 __all__ = [
     "BenchmarkContent",

@@ -1,20 +1,16 @@
-"""Small things that the files of a storage have in common: ids, groups, JSON, texts."""
+"""Texts in the files of a storage: ids, JSON, what is wrong in it, and names that every database can hold."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 from pydantic import ValidationError
 
-from tupli_mcap.errors import StorageError
+__all__ = ["escape_text", "first_defect", "is_hash", "to_json", "unescape_text"]
 
-__all__ = ["LOCAL_USER", "escape_text", "first_defect", "is_hash", "published_in", "to_json", "unescape_text"]
-
-LOCAL_USER = "local_storage"
-"""Who creates what is in a directory; also the name of the only group that sees it."""
 _TO_ESCAPE: Final = re.compile("[\x00\x01\ud7ff\ud800-\udfff]")
 _ESCAPED: Final = re.compile("\x01[\x01\x02]|\ud7ff[\x01\u0100-\u08ff]")
 _SURROGATES_AT: Final = 0x100
@@ -23,17 +19,6 @@ _SURROGATES_AT: Final = 0x100
 def is_hash(value: object) -> bool:
     """Whether something is 64 lower-case hex digits: only such ids become file names."""
     return isinstance(value, str) and len(value) == 64 and set(value) <= set("0123456789abcdef")
-
-
-def published_in(groups: Sequence[str], group: str) -> list[str]:
-    """The groups that see an item, and one more.
-
-    Raises:
-        StorageError: That is no name of a group.
-    """
-    if not isinstance(group, str) or not group or not group.isprintable():
-        raise StorageError(f"expected the name of a group to publish in, found {group!r:.80}")
-    return [*groups, *([] if group in groups else [group])]
 
 
 def to_json(value: Mapping[str, Any]) -> bytes:
