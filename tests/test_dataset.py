@@ -24,7 +24,7 @@ from tupli_mcap.dataset import (
     TensorflowTupleParser,
     TorchTupleParser,
     TupliDataset,
-    loading,
+    load,
     sources,
 )
 from tupli_mcap.errors import (
@@ -75,9 +75,9 @@ def cart(tmp_path: Path) -> tuple[TupliDataset, Taken]:
     return TupliDataset.from_files(str(tmp_path / "*.mcap")), taken
 
 
-@pytest.fixture(params=[1, loading._BLOCK_BYTES], ids=["episode by episode", "at once"])
+@pytest.fixture(params=[1, load._BLOCK_BYTES], ids=["episode by episode", "at once"])
 def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(loading, "_BLOCK_BYTES", request.param)
+    monkeypatch.setattr(load, "_BLOCK_BYTES", request.param)
     return int(request.param)
 
 
@@ -376,10 +376,8 @@ def test_nothing_is_read_before_it_is_needed(
 ) -> None:
     dataset, _ = cart
     asked: list[tuple[str, ...]] = []
-    original = loading._read_block
-    monkeypatch.setattr(
-        loading, "_read_block", lambda *args: asked.append(tuple(args[-1])) or original(*args)
-    )
+    original = load._read_block
+    monkeypatch.setattr(load, "_read_block", lambda *args: asked.append(tuple(args[-1])) or original(*args))
     good = dataset.with_episode_filter(F("metadata.score") > 20)
     good.preview()
     assert len(good) > 0
@@ -417,8 +415,8 @@ def test_only_the_asked_episodes_are_read(
 ) -> None:
     dataset, _ = cart
     read: list[int] = []
-    original = loading._read_block
-    monkeypatch.setattr(loading, "_read_block", lambda *args: read.extend(args[1]) or original(*args))
+    original = load._read_block
+    monkeypatch.setattr(load, "_read_block", lambda *args: read.extend(args[1]) or original(*args))
     chosen = dataset.with_episode_filter(F("episode").isin([2, 5]))
     chosen.load()
     assert read == [2, 5, 2, 5]
@@ -431,7 +429,7 @@ def test_memory_is_bounded_by_what_is_asked_for(tmp_path: Path, monkeypatch: pyt
     space = gym.spaces.Box(-np.inf, np.inf, (20_000,), np.float64)
     env = Scripted(lambda step: np.full(20_000, float(step)), space, length=10)
     record(tmp_path / "a.mcap", env, 200)  # 32 MB
-    monkeypatch.setattr(loading, "_BLOCK_BYTES", 1 << 20)
+    monkeypatch.setattr(load, "_BLOCK_BYTES", 1 << 20)
     monkeypatch.setattr(sources, "_CACHE_BYTES", 1 << 20)
     dataset = TupliDataset.from_files(tmp_path / "a.mcap")
     tracemalloc.start()

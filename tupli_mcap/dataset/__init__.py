@@ -1,4 +1,13 @@
-"""Datasets: a lazy query over recorded episodes, and the arrays it yields."""
+"""Datasets: a lazy query over recorded episodes, and the arrays it yields.
+
+dataset, query     `TupliDataset`: three filters, and what has been read so far
+sources, which     where episodes come from; which of them a word, a number or a filter means
+load               from episodes to whole columns; tuple filters
+tuples, convert    columns as steps and episodes; as what other libraries expect
+access, items/     steps by number; windows, transitions, samplers
+saved              columns as a directory of `.npy` files
+curate, display    a recording of fewer episodes; datasets as text and HTML
+"""
 
 from __future__ import annotations
 
@@ -6,26 +15,26 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset.curate import FilterReport, filter_recording
-    from tupli_mcap.dataset.dataset import TupliDataset
-    from tupli_mcap.dataset.parsers import (
+    from tupli_mcap.dataset.convert import (
         BaseTupleParser,
         NumpyTupleParser,
         TensorflowTupleParser,
         TorchTupleParser,
     )
+    from tupli_mcap.dataset.curate import FilterReport, filter_recording
+    from tupli_mcap.dataset.dataset import TupliDataset
     from tupli_mcap.dataset.saved import SavedColumns, open_columns
     from tupli_mcap.dataset.sources import DatasetError
 
 # Imported on first use: who only reads items, as a worker of a DataLoader does, needs no storage.
 _HOMES = {
-    "BaseTupleParser": "parsers",
+    "BaseTupleParser": "convert",
     "DatasetError": "sources",
     "FilterReport": "curate",
-    "NumpyTupleParser": "parsers",
+    "NumpyTupleParser": "convert",
     "SavedColumns": "saved",
-    "TensorflowTupleParser": "parsers",
-    "TorchTupleParser": "parsers",
+    "TensorflowTupleParser": "convert",
+    "TorchTupleParser": "convert",
     "TupliDataset": "dataset",
     "filter_recording": "curate",
     "open_columns": "saved",

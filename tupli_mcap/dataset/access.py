@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.dataset.items import DeltaWindows, Pad, Steps, Transitions, Unit, Windows
+from tupli_mcap.dataset.items import DeltaWindows, Pad, SamplingError, Steps, Transitions, Unit, Windows
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
-from tupli_mcap.dataset.weights import episode_values
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
+from tupli_mcap.dataset.items.windows import FIVE
+from tupli_mcap.errors import FilterError
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate, split_key
+from tupli_mcap.schema.predicate import MISSING, look_up
 
-__all__ = ["RandomAccess"]
-
-FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
+__all__ = ["RandomAccess", "episode_values"]
 
 
 class RandomAccess:
@@ -98,3 +98,32 @@ class RandomAccess:
             step_seconds = self._step_seconds()
         made = DeltaWindows(self.steps, deltas, unit, step_seconds=step_seconds)
         return made.of_episodes(self._values_now())
+
+
+def episode_values(headers: Sequence[EpisodeHeader], expression: F | BaseFilter) -> np.ndarray[Any, Any]:
+    """The number that each episode has at a key, `F("metadata.score")` for example; of a filter, 1 where it is true.
+
+    Raises:
+        SamplingError: an episode has no number there, or it is no expression.
+        FilterError: the expression names an unknown field.
+    """
+    if isinstance(expression, BaseFilter):
+        matches = compile_predicate(expression, EpisodeHeader)
+        return np.array([float(matches(header)) for header in headers])
+    if not isinstance(expression, F):
+        raise SamplingError(f"expected an expression, such as F('metadata.score'), found {expression!r:.80}")
+    path = split_key(expression.key)
+    if path[0] not in EpisodeHeader.model_fields:
+        known = ", ".join(sorted(EpisodeHeader.model_fields))
+        raise FilterError(f"unknown key {expression.key!r}; the keys are {known}")
+    return np.array([_number(look_up(header, path), header, expression) for header in headers])
+
+
+def _number(value: object, header: EpisodeHeader, expression: F) -> float:
+    if not isinstance(value, int | float):
+        found = "nothing" if value is MISSING else f"{value!r:.80}"
+        raise SamplingError(
+            f"expected a number as {expression.key} of every episode, found {found} for {header.id}; "
+            "leave such episodes out with with_episode_filter(...)"
+        )
+    return float(value)

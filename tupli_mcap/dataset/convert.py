@@ -1,4 +1,4 @@
-"""Columns as what other libraries expect."""
+"""Columns as what other libraries expect: D4RL, pandas, batches, and what parsers make of them."""
 
 from __future__ import annotations
 
@@ -7,17 +7,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tupli_mcap.dataset.columns import pick
-from tupli_mcap.dataset.loading import Selected
-from tupli_mcap.dataset.parsers import BaseTupleParser
+from tupli_mcap.dataset.items.steps import map_arrays, pick
+from tupli_mcap.dataset.load import Selected
 from tupli_mcap.dataset.tuples import Tuples
-from tupli_mcap.errors import missing_extra
+from tupli_mcap.errors import MissingExtraError, missing_extra
 from tupli_mcap.messages.step import StepLayout
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["D4RL_NAMES", "batches", "dataframe", "import_pandas", "mark_cuts"]
+__all__ = [
+    "D4RL_NAMES",
+    "BaseTupleParser",
+    "NumpyTupleParser",
+    "TensorflowTupleParser",
+    "TorchTupleParser",
+    "batches",
+    "dataframe",
+    "import_pandas",
+    "mark_cuts",
+]
 
 D4RL_NAMES: Mapping[str, str] = {
     "observations": "states",
@@ -100,3 +109,94 @@ def _value(column: Any, row: int) -> Any:
     if isinstance(column, tuple):
         return tuple(_value(part, row) for part in column)
     return column[row]
+
+
+# ---- parsers: columns of steps as the arrays of a library
+#
+# A column is an array of shape (steps, ...), a list of one value a step where values differ in size (texts, graphs), or
+# dicts and tuples of those, nested as the environment's space is.
+
+Five = tuple[Any, Any, Any, Any, Any]
+
+
+class BaseTupleParser:
+    """To be subclassed: `parse_lists` makes what a library wants out of five columns."""
+
+    @classmethod
+    def parse_lists(cls, obs: Any, act: Any, rew: Any, term: Any, trunc: Any) -> tuple[Any, ...]:
+        """The five columns (states, actions, rewards, terminals, timeouts) in another form.
+
+        The arrays are the parser's own: it may change them.
+        """
+        raise NotImplementedError(f"{cls.__name__} has no parse_lists")
+
+
+class NumpyTupleParser(BaseTupleParser):
+    """NumPy arrays, in the dtypes that were recorded."""
+
+    @classmethod
+    def parse_lists(cls, obs: Any, act: Any, rew: Any, term: Any, trunc: Any) -> Five:
+        """The five columns, as arrays."""
+        return _as_arrays(obs), _as_arrays(act), _as_arrays(rew), _as_arrays(term), _as_arrays(trunc)
+
+
+class TorchTupleParser(BaseTupleParser):
+    """PyTorch tensors on the CPU, of the dtypes that were recorded; they share the arrays' memory."""
+
+    @classmethod
+    def parse_lists(cls, obs: Any, act: Any, rew: Any, term: Any, trunc: Any) -> Five:
+        """The five columns, as tensors.
+
+        Raises:
+            MissingExtraError: PyTorch is not installed.
+        """
+        try:
+            import torch  # type: ignore[import-not-found, unused-ignore]
+        except ImportError as err:
+            raise missing_extra("tensors need PyTorch", "torch") from err
+        obs, act, rew, term, trunc = NumpyTupleParser.parse_lists(obs, act, rew, term, trunc)
+        return (
+            map_arrays(torch.from_numpy, obs),
+            map_arrays(torch.from_numpy, act),
+            map_arrays(torch.from_numpy, rew),
+            map_arrays(torch.from_numpy, term),
+            map_arrays(torch.from_numpy, trunc),
+        )
+
+
+class TensorflowTupleParser(BaseTupleParser):
+    """TensorFlow tensors, of the dtypes that were recorded."""
+
+    @classmethod
+    def parse_lists(cls, obs: Any, act: Any, rew: Any, term: Any, trunc: Any) -> Five:
+        """The five columns, as tensors.
+
+        Raises:
+            MissingExtraError: TensorFlow is not installed.
+        """
+        try:
+            import tensorflow as tf  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        except ImportError as err:
+            raise MissingExtraError(
+                "tensors need TensorFlow, which is not installed; pip install tensorflow"
+            ) from err
+        obs, act, rew, term, trunc = NumpyTupleParser.parse_lists(obs, act, rew, term, trunc)
+        return (
+            map_arrays(tf.convert_to_tensor, obs),
+            map_arrays(tf.convert_to_tensor, act),
+            map_arrays(tf.convert_to_tensor, rew),
+            map_arrays(tf.convert_to_tensor, term),
+            map_arrays(tf.convert_to_tensor, trunc),
+        )
+
+
+def _as_arrays(column: Any) -> Any:
+    """Lists of numbers, as subclasses may pass them on, become arrays; values that differ in size stay a
+    list."""
+    if (
+        isinstance(column, list)
+        and column
+        and isinstance(column[0], bool | int | float | list | np.number | np.bool_)
+    ):
+        return np.asarray(column)
+    return column

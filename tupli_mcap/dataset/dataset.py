@@ -10,16 +10,15 @@ import numpy as np
 
 from tupli_mcap.dataset import convert, display
 from tupli_mcap.dataset.access import RandomAccess
-from tupli_mcap.dataset.episodes import EpisodeItems, items_of
+from tupli_mcap.dataset.convert import BaseTupleParser, NumpyTupleParser
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.steps import checked_count
-from tupli_mcap.dataset.loading import read_columns
-from tupli_mcap.dataset.parsers import BaseTupleParser, NumpyTupleParser
+from tupli_mcap.dataset.items.windows import FIVE
+from tupli_mcap.dataset.load import TupleFilter, read_columns
 from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.saved import save_columns
-from tupli_mcap.dataset.selection import TupleFilter
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
-from tupli_mcap.dataset.tuples import Tuples
+from tupli_mcap.dataset.tuples import EpisodeItems, Tuples, items_of
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.base import anew
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TupliDataset"]
 
-FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 SIX = (*FIVE, "infos")
 
 

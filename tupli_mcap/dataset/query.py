@@ -8,12 +8,10 @@ from contextlib import nullcontext
 from typing import Any, Self
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.columns import pick
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
 from tupli_mcap.dataset.items.recorded import CACHE_BYTES, THREADS
-from tupli_mcap.dataset.loading import Selected, read_columns
-from tupli_mcap.dataset.parsers import map_columns
-from tupli_mcap.dataset.selection import TupleFilter, selector_of
+from tupli_mcap.dataset.items.steps import map_arrays, pick
+from tupli_mcap.dataset.load import Selected, TupleFilter, read_columns, selector_of
 from tupli_mcap.dataset.sources import Source
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
@@ -119,7 +117,7 @@ class Query:
     def read(self, fields: Sequence[str]) -> dict[str, Any]:
         """Columns by field, which are kept and cannot be written to."""
         found = self._missing(fields)
-        self._columns.update({field: map_columns(_frozen, column) for field, column in found.items()})
+        self._columns.update({field: map_arrays(_frozen, column) for field, column in found.items()})
         return {field: self._columns[field] for field in fields}
 
     def own(self, fields: Sequence[str]) -> dict[str, Any]:

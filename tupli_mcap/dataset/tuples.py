@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, overload
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.schema import RLTuple
+from tupli_mcap.recording.episode import item_getter, reward_getter
+from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
 
-__all__ = ["Tuples"]
+__all__ = ["EpisodeItems", "Tuples", "items_of"]
 
 
 class Tuples(Sequence[RLTuple]):
@@ -28,9 +28,12 @@ class Tuples(Sequence[RLTuple]):
         self._columns = columns
         self._layout = layout
         self._rows = range(len(columns["terminals"])) if rows is None else rows
-        self._state = _item(None if layout is None else layout.observation_space, columns["states"])
-        self._action = _item(None if layout is None else layout.action_space, columns["actions"])
-        self._reward = _reward(columns["rewards"])
+        spaces: tuple[Any, Any, Any] = (None, None, None)
+        if layout is not None:
+            spaces = layout.observation_space, layout.action_space, layout.reward_space
+        self._state = item_getter(spaces[0], columns["states"])
+        self._action = item_getter(spaces[1], columns["actions"])
+        self._reward = reward_getter(spaces[2], columns["rewards"])
         self._infos = columns.get("infos")
 
     def __len__(self) -> int:
@@ -65,22 +68,55 @@ class Tuples(Sequence[RLTuple]):
         return f"<{len(self)} tuples>"
 
 
-def _item(space: gym.Space[Any] | None, column: Any) -> Callable[[int], Any]:
-    """A function from a row to its value, of the type the space's own samples have."""
-    if isinstance(column, dict):
-        inner = space.spaces if isinstance(space, spaces.Dict) else {}
-        parts = {key: _item(inner.get(key), part) for key, part in column.items()}
-        return lambda i: {key: part(i) for key, part in parts.items()}
-    if isinstance(column, tuple):
-        given = space.spaces if isinstance(space, spaces.Tuple) else [None] * len(column)
-        items = [_item(sub, part) for sub, part in zip(given, column, strict=True)]
-        return lambda i: tuple(item(i) for item in items)
-    if isinstance(space, spaces.Box) and space.shape == () and column.dtype.kind == "f":
-        return lambda i: np.asarray(column[i])  # Gymnasium samples an array here, but a scalar of integers
-    return lambda i: column[i]
+Columns = tuple[Mapping[str, Any], Array, StepLayout | None]
 
 
-def _reward(column: Any) -> Callable[[int], Any]:
-    if isinstance(column, np.ndarray) and column.ndim == 1:
-        return lambda i: column[i].item()
-    return _item(None, column)
+class EpisodeItems(Sequence[EpisodeItem]):
+    """Episodes with their steps.
+
+    Args:
+        headers: the episodes.
+        columns: gives the columns of all of them, the number of steps of each, and their layout.
+        chosen: places in `headers`.
+    """
+
+    def __init__(
+        self, headers: Sequence[EpisodeHeader], columns: Callable[[], Columns], chosen: range | None = None
+    ) -> None:
+        self._headers = headers
+        self._columns = columns
+        self._chosen = range(len(headers)) if chosen is None else chosen
+        self._found: tuple[Tuples, Array] | None = None
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    @overload
+    def __getitem__(self, i: int) -> EpisodeItem: ...
+    @overload
+    def __getitem__(self, i: slice) -> EpisodeItems: ...
+    def __getitem__(self, i: int | slice) -> EpisodeItem | EpisodeItems:
+        if isinstance(i, slice):
+            return EpisodeItems(self._headers, self._columns, self._chosen[i])
+        try:
+            place = self._chosen[i]
+        except IndexError as err:
+            raise IndexError(f"expected an episode from 0 to {len(self) - 1}, found {i}") from err
+        if self._found is None:
+            columns, lengths, layout = self._columns()
+            self._found = Tuples(columns, layout), np.concatenate([[0], np.cumsum(lengths)])
+        tuples, ends = self._found
+        # Both are valid already; validating each step again would cost more than reading it.
+        return EpisodeItem.model_construct(
+            **dict(self._headers[place]), tuples=list(tuples[int(ends[place]) : int(ends[place + 1])])
+        )
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} episodes>"
+
+
+def items_of(
+    headers: Sequence[EpisodeHeader], columns: Mapping[str, Any], lengths: Array, layout: StepLayout | None
+) -> EpisodeItems:
+    """The episodes whose columns are there."""
+    return EpisodeItems(headers, lambda: (columns, lengths, layout))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.frames import Frames
     from tupli_mcap.recording.recording import Recording
 
-__all__ = ["Episode", "Episodes", "Step", "item_getter"]
+__all__ = ["Episode", "Episodes", "Step", "item_getter", "reward_getter"]
 
 
 class Step(NamedTuple):
@@ -178,7 +178,7 @@ class Episode:
         layout = self._recording.layout
         state = item_getter(layout.observation_space, columns.states)
         action = item_getter(layout.action_space, columns.actions)
-        reward = _reward(layout.reward_space, columns.rewards)
+        reward = reward_getter(layout.reward_space, columns.rewards)
         for i in range(len(self)):
             yield Step(
                 state(i),
@@ -193,7 +193,7 @@ class Episode:
         return f"<Episode {self.number}: {len(self)} steps, return {self.return_:g}, {self.end}>"
 
 
-def _reward(space: Any, column: Any) -> Any:
+def reward_getter(space: Any, column: Any) -> Any:
     """A function from a step's index to its reward: a Python number where it is a scalar."""
     if isinstance(column, np.ndarray):
         return lambda i: column[i].item() if column.ndim == 1 else column[i]

@@ -1,29 +1,35 @@
-"""Reading: from listed episodes to columns, a block of episodes at a time."""
+"""From listed episodes to columns of the steps that a tuple filter is true of, a block of episodes at a time."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.columns import FieldBuilder, pick
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
-from tupli_mcap.dataset.selection import TupleSelector
+from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.sources import Source
-from tupli_mcap.errors import memory_for
-from tupli_mcap.messages.shared_dtypes import check_layouts
+from tupli_mcap.dataset.tuples import Tuples
+from tupli_mcap.errors import FilterError, memory_for
+from tupli_mcap.messages.shared_dtypes import check_layouts, common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
-from tupli_mcap.schema import EpisodeHeader
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
 
-__all__ = ["Selected", "read_columns"]
+__all__ = [
+    "Selected",
+    "TupleFilter",
+    "TupleSelector",
+    "read_columns",
+    "selector_of",
+]
 
 _BLOCK_BYTES = 64 << 20
 _RECORDED = ("states", "actions", "rewards", "terminals", "timeouts", "next_states")
@@ -91,7 +97,7 @@ class _Reader:
         self._capacity = total if known is None else known.steps
         self._total = total
         self._done = 0  # listed steps
-        self._builders: dict[str, FieldBuilder] = {}
+        self._builders: dict[str, _FieldBuilder] = {}
         self._layout: StepLayout | None = None
         self._first_name = ""
         self._mask = None if self._selector is None else np.empty(total, np.bool_)
@@ -100,7 +106,7 @@ class _Reader:
         layout = recording.layout
         if self._layout is None:
             self._layout, self._first_name = layout, recording.name
-            self._builders = {field: FieldBuilder(field, self._capacity, layout) for field in self._fields}
+            self._builders = {field: _FieldBuilder(field, self._capacity, layout) for field in self._fields}
         else:
             check_layouts(self._layout, self._first_name, layout, recording.name)
         listed = ListedEpisodes.of(recording.name, headers)
@@ -163,7 +169,7 @@ def _read_block(
         columns["infos"] = [info for i in positions.tolist() for info in _infos(recording, i)]
     if (now > lengths).any():
         listed = _steps_within(now) < np.repeat(lengths, now)
-        columns = {field: pick(column, listed) for field, column in columns.items()}
+        columns = {field: pick(column, np.flatnonzero(listed)) for field, column in columns.items()}
     return columns
 
 
@@ -177,3 +183,153 @@ def _infos(recording: Recording, position: int) -> list[dict[str, Any]]:
 def _steps_within(lengths: Array) -> Array:
     starts: Array = np.repeat(np.cumsum(lengths) - lengths, lengths)
     return np.arange(int(lengths.sum())) - starts
+
+
+# ---- columns while they are filled, recording after recording
+
+Keep = Array | None  # a bool mask of rows, a slice as None: all
+
+
+class _LeafBuilder:
+    """One array (a list for a leaf of variable size) that grows up to `capacity` rows.
+
+    Memory that is never written to is never used, so a generous capacity costs nothing.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._array: Array | None = None
+        self._items: list[Any] = []
+        self._filled = 0
+
+    def put(self, values: Any, keep: Keep) -> None:
+        """Appends those rows of `values` that `keep` is True of; all if it is None."""
+        if isinstance(values, list):
+            self._items += values if keep is None else [values[i] for i in np.flatnonzero(keep)]
+            return
+        rows = values if keep is None else values[keep]
+        if self._array is None:
+            if len(rows) == self._capacity and rows.base is None:
+                self._array, self._filled = rows, len(rows)  # the whole at once: nothing to copy
+                return
+            self._array = np.empty((self._capacity, *rows.shape[1:]), rows.dtype)
+        elif self._array.dtype != rows.dtype:
+            self._widen(common_dtype(self._array.dtype, rows.dtype))
+        self._array[self._filled : self._filled + len(rows)] = rows
+        self._filled += len(rows)
+
+    def _widen(self, dtype: np.dtype[Any] | None) -> None:
+        if dtype is None or self._array is None or dtype == self._array.dtype:
+            return
+        wider = np.empty(self._array.shape, dtype)
+        wider[: self._filled] = self._array[: self._filled]
+        self._array = wider
+
+    def finish(self) -> Any:
+        """What has been put; the builder is empty afterwards."""
+        array, self._array = self._array, None
+        if array is None:
+            return self._items
+        if self._filled < len(array):
+            array.resize((self._filled, *array.shape[1:]), refcheck=False)  # gives the rest back in place
+        return array
+
+
+class _FieldBuilder:
+    """A field's leaves while they are filled, nested as its space is once it is finished."""
+
+    def __init__(self, field: str, capacity: int, layout: StepLayout) -> None:
+        self._field = field
+        self._leaves = field_leaves(field, layout)
+        self._layout = layout
+        self._builders = [
+            _LeafBuilder(capacity) for _ in range(1 if self._leaves is None else len(self._leaves))
+        ]
+
+    def put(self, column: Any, keep: Keep) -> None:
+        if self._leaves is None:
+            self._builders[0].put(column, keep)
+            return
+        for leaf, builder in zip(self._leaves, self._builders, strict=True):
+            builder.put(leaf.get(column), keep)
+
+    def finish(self) -> Any:
+        values = [builder.finish() for builder in self._builders]
+        if self._leaves is None:
+            return values[0]
+        if self._field == "rewards":
+            return self._layout.nest_reward(values)
+        return (self._layout.nest_action if self._field == "actions" else self._layout.nest_state)(values)
+
+
+# ---- tuple filters
+
+STEP_KEYS: Mapping[str, str] = {
+    "state": "states",
+    "action": "actions",
+    "reward": "rewards",
+    "terminal": "terminals",
+    "timeout": "timeouts",
+    "next_state": "next_states",
+    "info": "infos",
+    "step": "steps",
+}
+"""What an expression may name, and the column it is in; `step` counts from 0 within its episode."""
+
+TupleFilter = BaseFilter | Callable[[RLTuple], bool]
+Mask = np.ndarray[Any, np.dtype[np.bool_]]
+
+
+class TupleSelector:
+    """A tuple filter and the columns it needs to see."""
+
+    def __init__(self, fields: tuple[str, ...], filter: TupleFilter) -> None:
+        self.fields = fields
+        self.filter = filter
+
+    def mask(self, columns: Mapping[str, Any], layout: StepLayout) -> Mask:
+        """Which steps of `columns` (by field, at least `self.fields`) are wanted.
+
+        Raises:
+            FilterError: the expression does not fit the columns, or the function returned no flag.
+        """
+        if isinstance(self.filter, BaseFilter):
+            steps = {key: columns[field] for key, field in STEP_KEYS.items() if field in self.fields}
+            return evaluate_columns(self.filter, steps)
+        tuples = Tuples(columns, layout)
+        return np.fromiter((_flag(self.filter(item)) for item in tuples), np.bool_, len(tuples))
+
+
+def selector_of(filter: TupleFilter) -> TupleSelector:
+    """What to read for a filter.
+
+    Raises:
+        FilterError: it is neither an expression nor a function, or it names an unknown field of a step.
+    """
+    if isinstance(filter, BaseFilter):
+        check_keys(filter, STEP_KEYS)
+        needed = {field for key, field in STEP_KEYS.items() if _names(filter, key)}
+        return TupleSelector(("terminals", *sorted(needed - {"terminals"})), filter)
+    if not callable(filter):
+        raise FilterError(
+            f"expected a function of one tuple or an expression like F('reward') > 0, found {filter!r:.80}"
+        )
+    return TupleSelector(("states", "actions", "rewards", "terminals", "timeouts", "infos"), filter)
+
+
+def _names(filter: BaseFilter, key: str) -> bool:
+    try:
+        check_keys(filter, [name for name in STEP_KEYS if name != key])
+    except FilterError:
+        return True
+    return False
+
+
+def _flag(value: object) -> bool:
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, np.ndarray) and value.shape == () and value.dtype == np.bool_:
+        return bool(value)
+    raise FilterError(
+        f"expected True or False from a tuple filter, found {value!r:.80}; compare one number of a step"
+    )
