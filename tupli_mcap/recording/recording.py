@@ -23,9 +23,8 @@ from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.columns.read import FIELDS, ColumnReader, Columns
+from tupli_mcap.recording.columns.read import FIELDS, ColumnReader, Columns, StoredSteps
 from tupli_mcap.recording.columns.runs import Runs, runs_of
-from tupli_mcap.recording.columns.stored_steps import StoredSteps
 from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.frames import Cameras, Frames

@@ -22,8 +22,8 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.chunk_store import ChunkCache, ChunkStore
 from tupli_mcap.recording.columns.gather import Files, image_names
+from tupli_mcap.recording.columns.read import StoredSteps
 from tupli_mcap.recording.columns.runs import Segments, SegmentsBuilder
-from tupli_mcap.recording.columns.stored_steps import StoredSteps
 from tupli_mcap.schema import EpisodeHeader
 
 __all__ = ["ListedEpisodes", "OpenFiles", "StepIndex", "positions_of"]

@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.gather import EPISODE, Files, Plan, Rows, final_rows, image_rows, step_rows
 from tupli_mcap.recording.columns.runs import Runs, final_runs, parts_of
 from tupli_mcap.recording.columns.threads import do_all
 
-__all__ = ["FIELDS", "ColumnReader", "Columns"]
+__all__ = ["FIELDS", "ColumnReader", "Columns", "StoredSteps"]
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
 
@@ -134,3 +135,29 @@ class ColumnReader:
                 f"found that of {columns[EPISODE][first]}"
             )
         return [columns[name] for name in names]
+
+
+class StoredSteps(NamedTuple):
+    """The steps of a recording, by channel and row.
+
+    `channels` are the step channels by sub-environment; `images` says for each image leaf (ROS name) which channel
+    holds the images of a step channel; `final_channel` is None where there is no final state; `where` is the path or
+    the URL that opens the file again, None if there is none; `source` is the file while the recording is open.
+    """
+
+    layout: StepLayout
+    store: ChunkStore
+    channels: list[int]
+    images: dict[str, dict[int, int]]
+    final_channel: int | None
+    where: str | None
+    source: Source
+
+    def channels_of(self, envs: Array, leaf: str | None = None) -> Array:
+        """The step channel (or that of an image leaf) of each sub-environment's number in `envs`."""
+        if len(envs) and int(envs.max()) >= len(self.channels):
+            raise FormatError(
+                f"an episode names sub-environment {envs.max()}, but there are {len(self.channels)}"
+            )
+        found = [self.images[leaf][channel] if leaf else channel for channel in self.channels]
+        return np.array(found, np.int64)[envs]
