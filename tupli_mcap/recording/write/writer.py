@@ -603,7 +603,10 @@ class RecordingWriter:
     def abandon(self) -> None:
         """In a forked child: lets go of the file and its lock without writing; the parent goes on."""
         self.closed = True
-        self.failed = f"{self.path} is recorded by the process that opened it, not by a forked child; wrap the environment here"
+        self.failed = (
+            f"{self.path} is recorded by the process that opened it, not by a forked child; "
+            "wrap the environment here"
+        )
         self.lock.release()
         self.on_close()
 
