@@ -57,6 +57,8 @@ class NumberedRows:
         where = following(rows, self._segments.total)
         held = self._held
         if held is None or not held.columns.keys() >= set(names):
+            if not self._rows.constant:  # decoding leaves no time to other threads
+                threads = 1
             return self._rows.read(names, self._segments.parts(where), len(rows), threads)
         if not held.whole:
             self._fill(held, rows, threads)

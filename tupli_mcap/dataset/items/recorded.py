@@ -24,6 +24,7 @@ __all__ = ["CACHE_BYTES", "THREADS", "RecordedSteps", "steps_of"]
 
 CACHE_BYTES = 512 << 20
 THREADS = min(4, os.cpu_count() or 1)
+_STATES = ("states",)
 
 
 class RecordedSteps:
@@ -165,27 +166,29 @@ class RecordedSteps:
         listed: Callable[[], Array],
     ) -> dict[str, Any]:
         """The columns of some listed steps, whose leaves `read` gives."""
-        names = checked_fields(fields)
         if self.layout is None:
-            return {field: np.empty(0) for field in names}
+            return {field: np.empty(0) for field in checked_fields(fields)}
         with memory_for(lambda: f"reading {', '.join(fields)} of {len(listed())} steps"):
-            plan = self._plans.get(tuple(names)) or self._plan(self.layout, names)
+            plan = self._plans.get(tuple(fields)) or self._plan(self.layout, fields)
             found: dict[str, Any] = {}
             for i, leaves in plan.sources:
                 found.update(read(self._rows[i], leaves))
             columns = plan.nest(found)
-            if "next_states" in names:
-                columns["next_states"] = self._next_states(self.layout, listed())
-        return {field: columns[field] for field in names}
+            if "next_states" not in fields:
+                return columns
+            columns["next_states"] = self._next_states(listed())
+            return {field: columns[field] for field in checked_fields(fields)}
 
     def _plan(self, layout: StepLayout, fields: Sequence[str]) -> Plan:
         """What has to be read for some fields; from now on, the budget is shared with it."""
-        plan = Plan.of([field for field in fields if field != "next_states"], layout, self._rows[:-1])
-        for i, names in plan.sources:
-            self._used[i].update(names)
-        if "next_states" in fields:
-            for i, names in Plan.of(["states"], layout, self._rows[:-1]).sources:
-                self._used[i].update(names)
+        names = checked_fields(fields)
+        plan = Plan.of([field for field in names if field != "next_states"], layout, self._rows[:-1])
+        for i, leaves in plan.sources:
+            self._used[i].update(leaves)
+        if "next_states" in names:
+            states = self._plans[_STATES] = Plan.of(["states"], layout, self._rows[:-1])
+            for i, leaves in states.sources:
+                self._used[i].update(leaves)
             self._used[-1].update(leaf.name for leaf in layout.state)
             self._used[-1].add(EPISODE)
         self._share_budget()
@@ -203,13 +206,13 @@ class RecordedSteps:
             rows.hold(self._used[i] if i in sizes else ())
         self._cache.budget = self.cache_bytes - sum(sizes.values())
 
-    def _next_states(self, layout: StepLayout, listed: Array) -> Any:
+    def _next_states(self, listed: Array) -> Any:
         index = self._index
         episodes = np.searchsorted(self._ends, listed, side="right")
         after = np.where(listed == self._ends[episodes] - 1, index.after[episodes], listed + 1)
         at_end = np.flatnonzero(after < 0)
         rows = np.where(after < 0, listed, after)
-        plan = Plan.of(["states"], layout, self._rows[:-1])
+        plan = self._plans[_STATES]
         found: dict[str, Any] = {}
         for i, names in plan.sources:
             found.update(self._rows[i].read(names, rows, self.threads))

@@ -145,7 +145,8 @@ class Rows:
         filled = {name: column for name, column in columns.items() if isinstance(column, list) or column.size}
         if not filled:
             return []
-        readers = {of_file: of_file.reader(filled) for of_file in set(self._formats)}
+        used = {self._formats[part.file] for part in parts}
+        readers = {of_file: of_file.reader(filled) for of_file in used}
         return [
             partial(readers[self._formats[part.file]], self._stores[part.file], part, keep) for part in parts
         ]
