@@ -19,6 +19,7 @@ from counting import calls, grows
 from environments import Sampler, roll
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
+from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from tupli_mcap import (
@@ -35,7 +36,7 @@ from tupli_mcap.journal.committed import CommittedRows
 from tupli_mcap.journal.file import JournalContents, RowArea, read_journal
 from tupli_mcap.journal.seals import checksum
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.mcap.records import BODY, iter_records, with_crc
+from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records, with_crc
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.recording.recover import unfinished as recover
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -72,6 +73,27 @@ def test_appending_finishes_what_a_killed_writer_left(tmp_path: Path) -> None:
     assert np.array_equal(recording.read().states[:100], before.states)
     assert recording.num_steps == 150
     assert not journal_path(path).exists()
+
+
+def test_what_lies_between_fields_is_recovered_as_it_was_recorded(tmp_path: Path) -> None:
+    """And not as it was in the memory of who recovers."""
+    space = spaces.Dict({"flags": spaces.Box(0, 1, (5,), np.int8), "x": spaces.Box(-1, 1, (2,), np.float64)})
+    path, copy = tmp_path / "r.mcap", tmp_path / "copy.mcap"
+    with RecordEpisodes(Sampler(space, space), path) as env:
+        roll(env, 20)
+        shutil.copy(journal_path(path), journal_path(copy))
+        shutil.copy(path, copy)
+    with path.open("rb") as file:
+        wanted = [message.data for _, _, message in make_reader(file).iter_messages(topics=["/step"])]
+    for _ in range(20):
+        for size in range(1000, 10_000, 100):
+            np.full(size, 255, np.uint8)  # for whoever takes this memory next
+        with Recording(copy) as recording:
+            rows = next(
+                rows for rows in recording._contents.tail if rows.channel == recording._topics["/step"]
+            )
+        size = len(rows.data) // 20
+        assert [rows.data[i * size + RECORD_HEADER.size : (i + 1) * size] for i in range(20)] == wanted
 
 
 def test_appending_does_little_for_each_chunk_that_is_there(tmp_path: Path) -> None:
