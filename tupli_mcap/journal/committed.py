@@ -244,21 +244,32 @@ class CommittedRecords:
         return int(self.numbers[-1]) + 1 if len(self.numbers) else 0
 
 
-def committed_records(journal: JournalContents, name: str) -> dict[int, CommittedRecords]:
-    """The committed records of a log, by channel. A record whose checksum differs ends its half."""
+def committed_records(
+    journal: JournalContents, name: str, in_file: Mapping[int, int] | None = None
+) -> dict[int, CommittedRecords]:
+    """The committed records of a log, by channel, but for as many of each as are known to be `in_file`.
+
+    A record whose checksum differs ends its half.
+    """
     found: dict[int, dict[int, bytes]] = {}
     area = journal.log_area(name)
     for half in range(area.halves):
         data = _half(journal, area, half)
-        for start, end, channel, sequence, _ in _whole_records(journal, data):
+        for start, end, channel, sequence, _ in _whole_records(journal, data, in_file or {}):
             found.setdefault(channel, {})[sequence] = bytes(data[start:end])
     return {channel: CommittedRecords(channel, found[channel]) for channel in sorted(found)}
 
 
-def _whole_records(contents: JournalContents, data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
+def _whole_records(
+    contents: JournalContents, data: memoryview, in_file: Mapping[int, int]
+) -> Iterator[tuple[int, int, int, int, int]]:
+    """As `iter_records`, without those that are in the file, up to one whose checksum differs."""
+    sealed = contents.sealed_records
     try:
         for start, end, channel, sequence, log_time in iter_records(data):
-            if contents.sealed_records and checksum(data[start:end]) != seal_of(data, start)[0]:
+            if sequence < in_file.get(channel, 0):
+                continue
+            if sealed and checksum(data[start:end]) != seal_of(data, start)[0]:
                 return
             yield start, end, channel, sequence, log_time
     except FormatError:  # torn
@@ -305,7 +316,7 @@ def _running_seal(contents: JournalContents, area: LogArea, sequence: int) -> in
     """The checksum of the state of the running record, which will have `sequence`, from the record before it."""
     for half in range(area.halves):
         data = _half(contents, area, half)
-        for start, _, _, found, _ in _whole_records(contents, data):
+        for start, _, _, found, _ in _whole_records(contents, data, {}):
             if found == sequence - 1:
                 return seal_of(data, start)[1]
     return None

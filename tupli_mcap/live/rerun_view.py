@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import subprocess
 import sys
 import time
 import uuid
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Protocol
 
-from tupli_mcap.live.follow import Watcher
+from tupli_mcap.live.follow import Follower
 from tupli_mcap.live.target import Target
-from tupli_mcap.recording.write.writer import RecordingWriter
 
 __all__ = ["Picture", "RerunView"]
 
@@ -33,7 +32,7 @@ class Picture(Protocol):
         """Sends what does not change; again for every new connection."""
         ...
 
-    def send(self, stream: Any, watcher: Watcher) -> None:
+    def send(self, stream: Any, follower: Follower) -> None:
         """Sends what is new."""
         ...
 
@@ -46,22 +45,20 @@ class RerunView:
         warn: told once, if there is no viewer or no longer one.
 
     Raises:
-        MissingExtraError: the extra `rerun` is not installed.
+        MissingExtraError: the rerun-sdk that is installed is too old.
     """
 
     def __init__(
         self,
         target: Target,
         title: str,
-        sketch: Callable[[str], Callable[[Watcher], Picture | None]],
+        sketch: Callable[[str], Callable[[Follower], Picture | None]],
         warn: Callable[[str], None],
     ) -> None:
-        from tupli_mcap.viewer.sdk import rerun_sdk
+        from tupli_mcap.viewer.sdk import import_quickly, rerun_sdk
 
-        rerun = rerun_sdk()
-        importlib.import_module("rerun.blueprint")
-        rerun.Scalars.columns(scalars=[0.0])  # imports now what would hold the rollout up later
-        self._sdk = rerun
+        import_quickly()
+        self._sdk = rerun_sdk()
         self._target = target
         self._title = self._first_title = title
         self._sketch = sketch
@@ -101,29 +98,29 @@ class RerunView:
         )
         self._expected = time.monotonic() + _STARTING
 
-    def show(self, watcher: Watcher) -> bool:
+    def show(self, follower: Follower) -> bool:
         if self._stream is None and not self._is_there():
             return False
         if self._picture is None:
-            self._picture = self._draw(watcher)
+            self._picture = self._draw(follower)
         if self._picture is None:
             return True
         if self._stream is None:
             self._connect(self._picture)
-        patience = _FAREWELL if watcher.is_over else _PATIENCE
+        patience = _FAREWELL if follower.is_over else _PATIENCE
         if self._is_behind and not self._caught_up(patience):
             return True
-        self._picture.send(self._stream, watcher)
+        self._picture.send(self._stream, follower)
         self._caught_up(patience)
         return True
 
-    def go_on(self, writer: RecordingWriter) -> None:
+    def go_on(self, path: Path) -> None:
         """Another recording in the viewer: rows, episodes and steps count from 0 again."""
         if self._stream is not None and not self._caught_up(_PATIENCE):
             self._lose()
         self._stream = self._picture = None
         self._identity = uuid.uuid4().hex
-        self._title = f"{self._first_title} ({writer.path.stem})"
+        self._title = f"{self._first_title} ({path.stem})"
         self._draw = self._sketch(self._title)
 
     def _is_there(self) -> bool:

@@ -139,9 +139,9 @@ class Walk:
             yield Damage(position, following, found, opcode)
             position = following
 
-    def places(self) -> Iterator[tuple[int, int, int]]:
-        """(opcode, offset, length) of the records up to the first that is cut off; what is in them is not looked at."""
-        position = len(MAGIC)
+    def places(self, position: int = len(MAGIC)) -> Iterator[tuple[int, int, int]]:
+        """(opcode, offset, length) of the records from one at an offset up to the first that is cut off; what is in
+        them is not looked at."""
         while position + RECORD.size <= self._end:
             opcode, length = RECORD.unpack(self._source.read(position, RECORD.size))
             if length > self._end - position - RECORD.size:

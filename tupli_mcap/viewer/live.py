@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.live.follow import NewInfo, NewSteps, Watcher
+from tupli_mcap.live.follow import Follower, NewInfo, NewSteps
 from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.description import nan_text, spread_of
 from tupli_mcap.viewer.about import plain
 from tupli_mcap.viewer.arrange import blueprint_of
@@ -25,7 +24,6 @@ from tupli_mcap.viewer.words import numbers_in
 
 __all__ = ["LivePicture", "Sketch"]
 
-_ENVS = 8
 _SAMPLE, _PATIENCE = 100, 1.0  # steps, and seconds to wait for them, before it is decided what shares an axis
 _BARS = 500
 _EVERY = 2.0  # seconds between two overviews
@@ -41,11 +39,11 @@ class _Gathered:
         self.ended: list[Array] = []
         self.infos: list[NewInfo] = []
 
-    def look(self, watcher: Watcher) -> None:
-        steps, ended = watcher.look(_ENVS)
+    def look(self, follower: Follower) -> None:
+        steps, ended = follower.look()
         self.steps += steps
         self.ended.append(ended)
-        self.infos += watcher.infos(0, MOST_INFOS)
+        self.infos += follower.infos(MOST_INFOS)
 
 
 class Sketch:
@@ -59,38 +57,35 @@ class Sketch:
         self._gathered = _Gathered()
         self._began = 0.0
 
-    def __call__(self, watcher: Watcher) -> LivePicture | None:
-        """None while there are too few; the rollout has a layout."""
-        layout = watcher.layout
-        if layout is None:
-            return None
+    def __call__(self, follower: Follower) -> LivePicture | None:
+        """None while there are too few."""
         self._began = self._began or time.monotonic()
         gathered = self._gathered
-        gathered.look(watcher)
+        gathered.look(follower)
         gathered.steps = gathered.steps[-_SAMPLE:]
         found = sum(map(len, gathered.steps))
         waited = time.monotonic() - self._began
-        if not found or (found < _SAMPLE and waited < _PATIENCE and not watcher.is_over):
+        if not found or (found < _SAMPLE and waited < _PATIENCE and not follower.is_over):
             return None
-        return LivePicture(self._title, layout, watcher, gathered)
+        return LivePicture(self._title, follower, gathered)
 
 
 class LivePicture:
     """The steps of the first sub-environments, and the episodes of all of them."""
 
-    def __init__(self, title: str, layout: StepLayout, watcher: Watcher, gathered: _Gathered) -> None:
+    def __init__(self, title: str, follower: Follower, gathered: _Gathered) -> None:
         self._title = title
         self._gathered = gathered
         self._returns: list[float] = []
         self._lengths: list[int] = []
         self._episodes = 0
         self._next_overview = 0.0
-        count = min(_ENVS, watcher.num_envs)
+        count = len(follower.steps)
         infos = numbers_in([info.values for info in gathered.infos])[:_MOST_KEYS]
-        labels = watcher.labels
+        layout, labels = follower.layout, follower.labels
         decoder = None if layout.constant else MessageDecoder(layout)
         sample = [columns_of(layout, decoder, steps.newest(_SAMPLE)) for steps in gathered.steps]
-        scene = live_scene(layout, labels, sample, watcher.camera(0), infos, apart=count > 1)
+        scene = live_scene(layout, labels, sample, follower.camera, infos, apart=count > 1)
         roots = [f"/env_{i}" for i in range(count)] if count > 1 else [""]
         self._envs = [
             LiveEnv(layout, labels.step_seconds, scene, i, _place(root, i if count > 1 else None), count)
@@ -107,22 +102,22 @@ class LivePicture:
             env.declare()
         self._next_overview = 0.0
 
-    def send(self, stream: Any, watcher: Watcher) -> None:
+    def send(self, stream: Any, follower: Follower) -> None:
         """Sends what is new."""
         gathered, self._gathered = self._gathered, _Gathered()
-        gathered.look(watcher)
+        gathered.look(follower)
         self._align(gathered.steps)
         for new in gathered.steps:
-            self._envs[new.env].send(watcher, new)
+            self._envs[new.env].send(follower, new)
         for env in self._envs:
-            env.send_frames(watcher)
+            env.send_frames(follower)
         self._envs[0].send_infos(gathered.infos)
         for ended in gathered.ended:
             self._returns = [*self._returns, *ended["return"].tolist()][-_BARS:]
             self._lengths = [*self._lengths, *ended["length"].tolist()][-_BARS:]
-        self._episodes = watcher.episodes
-        if time.monotonic() >= self._next_overview or watcher.is_over:
-            self._send_overview(stream, "recorded" if watcher.is_over else "being recorded")
+        self._episodes = follower.episodes
+        if time.monotonic() >= self._next_overview or follower.is_over:
+            self._send_overview(stream, "recorded" if follower.is_over else "being recorded")
             self._next_overview = time.monotonic() + _EVERY
 
     def _align(self, steps: Sequence[NewSteps]) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.live.follow import NewInfo, NewSteps, Watcher
+from tupli_mcap.live.follow import Follower, NewInfo, NewSteps
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
@@ -133,15 +133,15 @@ class LiveEnv:
         if self._infos is not None:
             self._infos.declare(self._alone)
 
-    def send(self, watcher: Watcher, new: NewSteps) -> None:
+    def send(self, follower: Follower, new: NewSteps) -> None:
         """Sends the newest of new steps."""
         shown = new.newest(self._most).moved(self._shift)
         if shown.first != self._next:
             self._leave_out(shown)
         self._next = shown.first + len(shown)
         self._send_steps(shown)
-        self._send_images(watcher, shown)
-        newest = self._times(np.array([self._next - 1]), shown.times[-1:])
+        self._send_images(follower, shown)
+        newest = self._times(np.array([self._next - 1]), shown.facts.time[-1:])
         for heat_map in self._maps:
             heat_map.send(self._place, newest)
 
@@ -162,7 +162,7 @@ class LiveEnv:
         """Breaks the lines where steps are missing before those that follow."""
         self._rewards.miss()
         self._missed = True
-        times = self._times(np.array([after.first - 1]), after.times[:1])
+        times = self._times(np.array([after.first - 1]), after.facts.time[:1])
         lines = [(panel.entity, len(panel.dims)) for panel in self._panels if isinstance(panel, Series)]
         for entity, width in (*lines, ("/reward", 1)):
             send_scalars(self._place.stream, self._place.root + entity, times, np.full((1, width), np.nan))
@@ -171,38 +171,38 @@ class LiveEnv:
         columns = columns_of(self._layout, self._decoder, steps)
         for heat_map in self._maps:
             heat_map.take(columns)
-        bounds = [0, *(np.flatnonzero(np.diff(steps.episodes)) + 1).tolist(), len(steps)]
-        ends = _ends_of(columns, self._flags(steps), bounds)
+        bounds = [0, *(np.flatnonzero(np.diff(steps.facts.episode)) + 1).tolist(), len(steps)]
+        ends = _ends_of(steps, bounds)
         block = _block(steps, columns, bounds, ends)
         times = self._times(block.number, block.times)
         for panel in self._panels:
             if not _is_apart(panel):
                 panel.send(self._place, block, times)
 
-    def _send_images(self, watcher: Watcher, steps: NewSteps) -> None:
+    def _send_images(self, follower: Follower, steps: NewSteps) -> None:
         stop = steps.first + len(steps)
         first = max(steps.first, stop - self._images)
         wanted = range(first - self._shift, stop - self._shift)
         for number, leaf in enumerate(self._layout.images):
-            found = watcher.images(number, self._env, wanted)
+            found = follower.images(number, self._env, wanted)
             for panel in self._panels:
                 if found and getattr(panel, "leaf", None) is leaf:
                     rows = np.array(sorted(found))
                     images = np.stack([leaf.as_values(found[row]["data"]) for row in rows.tolist()])
                     rows += self._shift
-                    times = steps.times[rows - steps.first]
+                    times = steps.facts.time[rows - steps.first]
                     part: Any = _Columns(self._nested(leaf, images), None, None)
                     nobody: Any = None  # a picture asks only for its values
                     block = Block(nobody, part, [], rows, times)
                     panel.send(self._place, block, self._times(rows, times))
 
-    def send_frames(self, watcher: Watcher) -> None:
+    def send_frames(self, follower: Follower) -> None:
         """Sends the newest frames."""
         import rerun as rr
 
         stream = self._place.stream
         for panel in self._cameras:
-            for row, frame in watcher.frames(self._env, self._images):
+            for row, frame in follower.frames(self._env, self._images):
                 stream.reset_time()
                 stream.set_time("step", sequence=row + self._shift)
                 stream.set_time("time", timestamp=np.datetime64(frame.time_ns, "ns"))
@@ -217,12 +217,6 @@ class LiveEnv:
 
     def _times(self, rows: Array, times: Array) -> Times:
         return Times(rows, times, self._seconds)
-
-    def _flags(self, steps: NewSteps) -> tuple[Array, Array]:
-        if steps.rows is not None:
-            return steps.rows["terminal"], steps.rows["timeout"]
-        flags = np.array([tuple(message[-2:]) for _, message in steps.messages], np.bool_)
-        return flags[:, 0], flags[:, 1]
 
 
 def columns_of(layout: StepLayout, decoder: MessageDecoder | None, steps: NewSteps) -> _Columns:
@@ -248,17 +242,17 @@ def columns_of(layout: StepLayout, decoder: MessageDecoder | None, steps: NewSte
 def _block(steps: NewSteps, columns: _Columns, bounds: list[int], ends: Sequence[int | None]) -> Block:
     """The steps, and between each two of the bounds an episode, or what there is of it."""
     pieces = [
-        Piece(begin, end, i, int(steps.steps[begin]), how is not None)
+        Piece(begin, end, i, int(steps.facts.step[begin]), how is not None)
         for i, ((begin, end), how) in enumerate(zip(itertools.pairwise(bounds), ends, strict=True))
     ]
     asked: Any = _Ends({"end": np.array([_INTERRUPTED if how is None else how for how in ends])})
     told: Any = columns
-    return Block(asked, told, pieces, np.arange(steps.first, steps.first + len(steps)), steps.times)
+    return Block(asked, told, pieces, np.arange(steps.first, steps.first + len(steps)), steps.facts.time)
 
 
-def _ends_of(columns: _Columns, flags: tuple[Array, Array], bounds: list[int]) -> list[int | None]:
+def _ends_of(steps: NewSteps, bounds: list[int]) -> list[int | None]:
     """How each stretch of an episode ends: None where it goes on after the last row."""
-    terminal, timeout = flags
+    terminal, timeout = steps.facts.terminal, steps.facts.timeout
     found: list[int | None] = []
     for end in bounds[1:]:
         if terminal[end - 1] or timeout[end - 1]:

@@ -1,27 +1,26 @@
 """What a live view costs the rollout, in wall time: steps that it shows over steps of a recorder without one.
 
-The viewers run in processes of their own, on the same machine. Virtual machines change their speed by a tenth from
-one moment to the next, so two recorders take turns, in slices of some 20 ms: one with a view, and one without. In the
-slices of the one without, the view is held in its rest, which then goes on where it stopped: put together, the slices
-with the view are a rollout with a view, look by look, and what viewers do in the 10 ms after a look counts. A figure
-is the median of several pairs of recorders; beside it is that of pairs without a view, which is 1 but for chance.
+The view and the viewers run in processes of their own, on the same machine. Virtual machines change their speed by a
+tenth from one moment to the next, so two recorders take turns, in slices of a second: one with a view, and one
+without. In the slices of the one without, the view's process is stopped. A figure is the median of several pairs of
+recorders; beside it is that of pairs without a view, which is 1 but for chance, and what the view's process takes of a
+core.
 
-Left out are making the recorder, which imports what the viewer needs; the view's beginning (the panels are made and
-sent, which costs about 0.2 s of a core, once); and closing, which waits until the viewer has the rest.
+Left out is the view's beginning (its process imports what it needs, the panels are made and sent, which costs about a
+second of a core, once), and closing, which waits until the viewer has the rest.
 """
 
 from __future__ import annotations
 
 import contextlib
 import itertools
-import math
+import os
+import signal
 import socket
 import statistics
 import subprocess
 import sys
-import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,62 +32,19 @@ from tools.bench.workloads import SEED, WORKLOADS, Workload
 _LIMIT = 1.10
 _LISTENER = Path(__file__).with_name("listener.py")
 _CONTROL = "no view, again"
-_SLICE = 0.02  # seconds, at least
-_SLICES = 75  # with the view, of a recorder
-_AFTER = 0.01  # seconds after a look that are in the same slice
-_HANDLE = 0.002  # seconds for the view's thread to see that it is held or let go
-_WARM = 0.5  # seconds of steps before the first slice, at least
-_LOOKS = 3  # of a view that has begun
-_BEGINNING = 10.0  # seconds for that, at most
+_SLICE = 1.0  # seconds
+_SLICES = 5  # with the view, of a recorder
+_WARM = 3.0  # seconds of steps before the first slice, at least: the view's process starts
+_BEGINNING = 30.0  # seconds for that, at most
+_ESTABLISHED = "01"
 
 
 class _Place(NamedTuple):
     """Where a side's view goes, and whether somebody is there."""
 
     url: str
+    port: int
     connected: bool
-
-
-class _Hold:
-    """In place of the event that a session's thread rests on: rests pass only while the view may work."""
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self._over = False
-        self._free = True
-        self._since = math.inf  # when it began to rest; infinite during a look
-        self.looks = 0
-
-    def let(self, free: bool) -> None:
-        with self._changed:
-            self._free = free
-            self._changed.notify_all()
-        time.sleep(_HANDLE)
-
-    def rested(self, seconds: float) -> bool:
-        """Whether the last look ended that long ago."""
-        return time.perf_counter() - self._since >= seconds
-
-    def none(self) -> None:
-        """There is no view to hold."""
-        self._since = -math.inf
-
-    def set(self) -> None:
-        with self._changed:
-            self._over = True
-            self._changed.notify_all()
-
-    def wait(self, seconds: float) -> bool:
-        with self._changed:
-            self._since = time.perf_counter()
-            while not self._over and (seconds > 0 or not self._free):
-                began, passes = time.perf_counter(), self._free
-                self._changed.wait(seconds if passes else None)
-                if passes:
-                    seconds -= time.perf_counter() - began
-            self._since = math.inf
-            self.looks += 1
-            return self._over
 
 
 class _Slice(NamedTuple):
@@ -114,17 +70,11 @@ class _Rollout:
                 self._env.reset()
         self.steps += self._at_once
 
-    def slice(self, hold: _Hold | None = None) -> _Slice:
-        """The next one, with the view that is held."""
-        if hold is not None:
-            hold.let(True)
+    def slice(self) -> _Slice:
+        """The next one."""
         first, began = self.steps, time.perf_counter()
-        seconds = 0.0
-        while seconds < _SLICE or not (hold is None or hold.rested(_AFTER)):
+        while (seconds := time.perf_counter() - began) < _SLICE:
             self.go_on()
-            seconds = time.perf_counter() - began
-        if hold is not None:
-            hold.let(False)
         return _Slice(seconds, self.steps - first)
 
 
@@ -137,11 +87,13 @@ def live(run: Run) -> Iterator[Target]:
 def compare(run: Run, workload: Workload) -> Iterator[Target]:
     """All sides of a workload."""
     per_step: dict[str, list[float]] = {}
+    cores: dict[str, list[float]] = {}
 
     def side(name: str, place: _Place | None) -> Callable[[], float]:
         def ratio() -> float:
-            bare, watched = _slices(run, workload, place)
+            bare, watched, core = _slices(run, workload, place)
             per_step.setdefault(name, []).append(watched * 1e6)
+            cores.setdefault(name, []).append(core)
             return watched / bare
 
         return ratio
@@ -152,31 +104,55 @@ def compare(run: Run, workload: Workload) -> Iterator[Target]:
     for name, found in values.items():
         figure = statistics.median(found)
         note = (
-            f"{min(found):.2f} to {max(found):.2f}, {statistics.median(per_step[name]):.2f} µs a step; {_CONTROL}: "
+            f"{min(found):.2f} to {max(found):.2f}, {statistics.median(per_step[name]):.2f} µs a step, "
+            f"{statistics.median(cores[name]):.1%} of a core; {_CONTROL}: "
             f"{statistics.median(control):.2f}, {min(control):.2f} to {max(control):.2f}"
         )
         yield at_most(f"live view of {workload.name}, {name}, over none", _LIMIT, figure, note, "x")
 
 
-def _slices(run: Run, workload: Workload, place: _Place | None) -> tuple[float, float]:
-    """Seconds per step of a recorder without a view, and of another with its view at work."""
+def _slices(run: Run, workload: Workload, place: _Place | None) -> tuple[float, float, float]:
+    """Seconds per step of a recorder without a view, and of another with its view at work; and how much of a core the
+    view's process takes meanwhile."""
     from tupli_mcap import RecordEpisodes
 
-    bare_path, path, hold = run.fresh("bare.mcap"), run.fresh("live.mcap"), _Hold()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # no viewer answers: that is one of the sides
-        bare_env = RecordEpisodes(workload.make(), bare_path)
-        env = RecordEpisodes(workload.make(), path, live=place and place.url)
-        bare, watched = _Rollout(bare_env, workload), _Rollout(env, workload)
-        _begin(bare, None, hold, None)
-        _begin(watched, env._live, hold, place)
-        hold.let(False)
-        taken = [(bare.slice(), watched.slice(hold)) for _ in range(run.part(_SLICES))]
-        bare_env.close()
-        env.close()
+    bare_path, path = run.fresh("bare.mcap"), run.fresh("live.mcap")
+    bare_env = RecordEpisodes(workload.make(), bare_path)
+    env = RecordEpisodes(workload.make(), path, live=place and place.url)
+    bare, watched = _Rollout(bare_env, workload), _Rollout(env, workload)
+    view = None if place is None else env._live.process.pid
+    _begin(bare, None)
+    _begin(watched, place)
+    taken, before = [], _cpu_seconds(view)
+    for _ in range(run.part(_SLICES)):
+        _signal(view, signal.SIGSTOP)
+        one = bare.slice()
+        _signal(view, signal.SIGCONT)
+        taken.append((one, watched.slice()))
+    busy = _cpu_seconds(view) - before
+    bare_env.close()
+    env.close()
     _check_steps(bare_path, bare.steps)
     _check_steps(path, watched.steps)
-    return _per_step([one for one, _ in taken]), _per_step([other for _, other in taken])
+    with_view = [other for _, other in taken]
+    return (
+        _per_step([one for one, _ in taken]),
+        _per_step(with_view),
+        busy / sum(one.seconds for one in with_view),
+    )
+
+
+def _signal(process: int | None, number: int) -> None:
+    if process is not None:
+        os.kill(process, number)
+
+
+def _cpu_seconds(process: int | None) -> float:
+    """CPU time of a process."""
+    if process is None:
+        return 0.0
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _check_steps(path: Path, steps: int) -> None:
@@ -192,30 +168,25 @@ def _per_step(slices: list[_Slice]) -> float:
     return sum(one.seconds for one in slices) / sum(one.steps for one in slices)
 
 
-def _begin(rollout: _Rollout, session: Any, hold: _Hold, place: _Place | None) -> None:
+def _begin(rollout: _Rollout, place: _Place | None) -> None:
     """Takes steps until the recorder is warm, the view has begun and whoever is to listen does."""
     warm = time.monotonic() + _WARM
-    if place is None:
-        hold.none()
-    else:
-        session._stopping = hold
     while time.monotonic() < warm:
         rollout.go_on()
     end = warm + _BEGINNING
-    while place and not _has_begun(session, hold, place):
+    while place is not None and place.connected and not _is_connected(place.port):
         check(time.monotonic() < end, "the view did not begin")
         rollout.go_on()
 
 
-def _has_begun(session: Any, hold: _Hold, place: _Place) -> bool:
-    return hold.looks >= _LOOKS and hold.rested(_AFTER) and _is_seen(session._view) == place.connected
-
-
-def _is_seen(view: Any) -> bool:
-    """Whether somebody takes what a view shows."""
-    if hasattr(view, "_stream"):
-        return view._stream is not None
-    return any(channel.has_sinks() for channel in list(view._channels.values()))
+def _is_connected(port: int) -> bool:
+    """Whether somebody is connected to a port of this machine, and not only to look whether it answers."""
+    for _ in range(2):
+        rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+        if not any(row[1].endswith(f":{port:04X}") and row[3] == _ESTABLISHED for row in rows):
+            return False
+        time.sleep(0.1)
+    return True
 
 
 @contextlib.contextmanager
@@ -233,19 +204,17 @@ def _viewers() -> Iterator[dict[str, _Place | None]]:
             process = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
             stack.callback(_end, process)
         time.sleep(3.0)
+        rerun_urls = [f"rerun+http://127.0.0.1:{port}/proxy" for port in ports[:2]]
         yield {
-            "Rerun, connected": _Place(f"rerun+http://127.0.0.1:{ports[0]}/proxy", connected=True),
-            "Rerun, no viewer": _Place(f"rerun+http://127.0.0.1:{ports[1]}/proxy", connected=False),
-            "Foxglove, connected": _Place(f"ws://127.0.0.1:{ports[2]}", connected=True),
-            "Foxglove, nobody there": _Place(f"ws://127.0.0.1:{ports[3]}", connected=False),
+            "Rerun, connected": _Place(rerun_urls[0], ports[0], connected=True),
+            "Rerun, no viewer": _Place(rerun_urls[1], ports[1], connected=False),
+            "Foxglove, connected": _Place(f"ws://127.0.0.1:{ports[2]}", ports[2], connected=True),
+            "Foxglove, nobody there": _Place(f"ws://127.0.0.1:{ports[3]}", ports[3], connected=False),
             _CONTROL: None,
         }
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    import os
-    import signal
-
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()

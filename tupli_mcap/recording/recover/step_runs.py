@@ -16,7 +16,7 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
-__all__ = ["Run", "StepFacts", "runs", "step_facts", "sum_up"]
+__all__ = ["Run", "StepFacts", "runs", "runs_in", "step_facts", "sum_up"]
 
 _TIME, _BEFORE_TIME = struct.Struct("<q"), 15  # of a Message record
 
@@ -85,7 +85,7 @@ def runs(
     for facts in step_facts(store, layout, channel, first, count, keep=keep):
         if facts.bad:
             raise FormatError(next(iter(facts.bad.values())))
-        for run in _runs(facts, row, last):
+        for run in runs_in(facts, row, last):
             if last is not None and run.row != last.row:
                 yield last
             last = run
@@ -94,7 +94,7 @@ def runs(
         yield last
 
 
-def _runs(facts: StepFacts, row: int, last: Run | None) -> Iterator[Run]:
+def runs_in(facts: StepFacts, row: int, last: Run | None) -> Iterator[Run]:
     """The runs of one batch of rows, which starts at `row`; the first one may go on with the last one before."""
     n = len(facts.episode)
     if not n:

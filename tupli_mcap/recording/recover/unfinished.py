@@ -47,6 +47,7 @@ from tupli_mcap.recording.recover.prefix import Scan, head, scan
 __all__ = [
     "KEEP_JOURNAL",
     "STEPS_IN_JOURNAL",
+    "add_unwritten",
     "belongs",
     "define",
     "find_journal",
@@ -109,7 +110,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         if journal is not None:
             # under same-step autoreset; and it is not known what else of that step was lost
             tail.final_lost = journal.torn and bool(journal.info.get("vector"))
-            _salvage(source, found, journal, layout, [c.id for c in steps], tail)
+            add_unwritten(source, found, journal, layout, [c.id for c in steps], tail)
             missing = size_behind(journal) - found.end
             if missing > 0:  # with ends and final states: what runs may be the episode after them
                 warnings.warn(_older(source, missing), UserWarning, stacklevel=6)
@@ -274,7 +275,7 @@ def define(
                 channels[channel.id] = channel
 
 
-def _salvage(
+def add_unwritten(
     source: Source,
     found: Scan,
     journal: JournalContents,
@@ -282,7 +283,10 @@ def _salvage(
     steps: list[int],
     tail: Unwritten,
 ) -> None:
-    """Takes the rows and records the file does not have out of the journal."""
+    """Takes the rows and records the file does not have out of the journal.
+
+    `steps` are the channels of the first sub-environments: of images and steps, those of these only.
+    """
     store = ChunkStore(source, chunk_table(found, tail.rows), [bytes(r.data) for r in tail.rows], 1 << 24)
     counts = dict(found.counts)
     topics = {channel.topic: channel.id for channel in found.channels.values()}
@@ -326,7 +330,7 @@ def _salvage(
         _salvage_images(found, journal, layout, env, images, total, known, tail)
     for name in journal.areas:
         if name in _EVENTS or name.startswith(FRAMES_AREA):
-            for channel, records in committed_records(journal, name).items():
+            for channel, records in committed_records(journal, name, counts).items():
                 rows = rows_of(records, counts.get(channel, 0))
                 tail.rows += [rows] if len(rows.offsets) else []
 

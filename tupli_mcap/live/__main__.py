@@ -1,0 +1,136 @@
+"""The process that shows a rollout: it follows the recording until nobody records any more.
+
+The recorder tells it on stdin which files there are: path, UUID, and where in the file this session begins, as a line
+of JSON each. It needs to say nothing else: who closes a recording, or is killed, lets go of its lock. The process
+sleeps 50 times as long as it kept a core busy, and longer while no viewer is there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import sys
+import time
+from pathlib import Path
+from typing import Protocol
+
+from tupli_mcap.errors import TupliError
+from tupli_mcap.live.follow import Follower, follow
+from tupli_mcap.live.target import Target, parse_target
+from tupli_mcap.mcap.lock import is_locked
+
+__all__ = ["LiveView"]
+
+_SHORTEST_REST = 1 / 20  # seconds between two looks
+_IDLE_REST = 0.25  # the same where nobody looks
+_LONGEST_REST = 3.0
+_REST = 50.0  # times as long as showing kept a core busy
+_PATIENCE = 60.0  # seconds for the recorder to tell of a file
+
+
+class LiveView(Protocol):
+    """A viewer, or a server that viewers connect to."""
+
+    def show(self, follower: Follower) -> bool:
+        """Shows what is new. May take a while; must return, and say False, where there is nobody to see it."""
+        ...
+
+    def go_on(self, path: Path) -> None:
+        """What is shown next is in another file of the same rollout."""
+        ...
+
+    def close(self) -> None:
+        """Lets go of the viewer, which stays as it is."""
+        ...
+
+
+class _Files:
+    """The files that the recorder tells of, in their order."""
+
+    def __init__(self) -> None:
+        self._stdin = open(0, "rb", buffering=0)  # noqa: SIM115 - not buffered, so that `select` sees what is left
+        self._is_open = True
+        self._told: list[tuple[str, str, int]] = []
+
+    def wait(self, seconds: float) -> None:
+        """Rests, unless the recorder says something, closes or dies."""
+        if not self._is_open:
+            time.sleep(seconds)
+        elif select.select([self._stdin], [], [], seconds)[0]:
+            line = self._stdin.readline()
+            self._is_open = bool(line)
+            if line:
+                self._told.append(tuple(json.loads(line)))
+
+    def next(self, seconds: float) -> tuple[str, str, int] | None:
+        """The next file; None if the recorder does not tell of one in time."""
+        if not self._told:
+            self.wait(seconds)
+        return self._told.pop(0) if self._told else None
+
+
+def _run(view: LiveView, files: _Files) -> None:
+    """Shows one file after the other, each until nobody records it any more."""
+    file = files.next(_PATIENCE)
+    while file is not None:
+        _show(view, files, *file)
+        file = files.next(0)  # told before the file before it was closed
+        if file is not None:
+            view.go_on(Path(file[0]))
+
+
+def _show(view: LiveView, files: _Files, path: str, uuid: str, begin: int) -> None:
+    follower: Follower | None = None
+    rest, is_over = _SHORTEST_REST, False
+    while not is_over:
+        files.wait(rest)
+        began = time.process_time()
+        is_over = not is_locked(Path(path))  # before the look: what came until then is shown
+        if follower is None:
+            follower = follow(Path(path), uuid, begin)
+        seen = False
+        if follower is not None:
+            follower.is_over = is_over
+            seen = view.show(follower)
+        wanted = _REST * (time.process_time() - began)
+        rest = min(max(_SHORTEST_REST if seen else _IDLE_REST, wanted), _LONGEST_REST)
+
+
+def _view_of(target: Target, title: str) -> LiveView:
+    if target.kind == "foxglove":
+        from tupli_mcap.live.foxglove_view import FoxgloveView
+
+        return FoxgloveView(target, title)
+    from tupli_mcap.live.rerun_view import RerunView
+    from tupli_mcap.viewer.live import Sketch
+
+    return RerunView(target, title, Sketch, _say)
+
+
+def _say(text: str) -> None:
+    """Tells the user, who sees what the recorder's process writes to stderr."""
+    with contextlib.suppress(OSError, ValueError):
+        print(f"tupli-mcap: {text}", file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """Whatever happens here is said once, and the rollout goes on."""
+    live, title = sys.argv[1:]
+    try:
+        view = _view_of(parse_target(live), title)
+    except (OSError, RuntimeError, TupliError) as err:  # the port is taken, say
+        _say(f"live={live!r} cannot show the rollout ({err}); it is recorded all the same")
+        return
+    try:
+        _run(view, _Files())
+    except Exception as err:  # noqa: BLE001 - of what kind ever
+        _say(f"the live view has ended ({type(err).__name__}: {err}); the recording goes on")
+    with contextlib.suppress(Exception):
+        view.close()
+    os._exit(0)  # the viewer's library would wait for a viewer that takes nothing
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""Starts and ends of episodes as they come: those that the recorder has written, and those that it leaves to rows.
+
+The latter are written with many others when their rows go to the file. Here they are made before: a start once the hole
+is there that its reset has left, an end once the hole behind it is there, or at the second look at it. At the first one
+the recorder may be about to write it. An end that is made has the time of the episode's last step, also where the
+recorder will take the time at which it writes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, RECORD_HEADER
+from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
+from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.recover.episodes import Unwritten
+from tupli_mcap.recording.recover.step_runs import Run, runs_in
+
+if TYPE_CHECKING:
+    from tupli_mcap.live.follow import NewSteps
+
+__all__ = ["EpisodeNews", "messages_of"]
+
+_STARTS = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8")])
+_ENDS = np.dtype([*_STARTS.descr, ("length", "<u8"), ("return", "<f8")])
+_NUMBER = len(CDR_HEADER)  # where messages have the number of their episode
+
+
+def messages_of(store: ChunkStore, channel: int, rows: range) -> list[tuple[int, bytes]]:
+    """(log_time, CDR message with its header) of rows."""
+    found = []
+    for span in store.spans(channel, rows.start, len(rows)):
+        data, places = store.records(span.chunk)
+        view = memoryview(data)
+        for start, end in places[span.begin : span.end].tolist():
+            time_ns = RECORD_HEADER.unpack_from(view, start)[4]
+            found.append((time_ns, bytes(view[start + RECORD_HEADER.size : end])))
+    return found
+
+
+class _Shown:
+    """Numbers of the episodes whose start, or end, was written lately, or is shown `ahead` of that."""
+
+    def __init__(self) -> None:
+        self.ahead: set[int] = set()
+        self._before: set[int] = set()
+        self._now: set[int] = set()
+
+    def note(self, numbers: Array) -> set[int]:
+        """Those that were written since the last look; returns which of them are shown already."""
+        self._before, self._now = self._now, set(numbers.tolist())
+        known = self.ahead & self._now
+        self.ahead -= known
+        return known
+
+    def __contains__(self, number: int) -> bool:
+        return number in self.ahead or number in self._now or number in self._before
+
+
+class EpisodeNews:
+    """What is new of episodes since the last look.
+
+    Args:
+        topics: the channels.
+        new_rows: the rows of a channel that were not looked at; `seen` has how many were.
+    """
+
+    def __init__(
+        self, topics: Mapping[str, int], new_rows: Callable[[int], range], seen: MutableMapping[int, int]
+    ) -> None:
+        self._start, self._end, self._final = topics[EPISODE_START], topics[EPISODE_END], topics[FINAL_STATE]
+        self._new_rows, self._seen = new_rows, seen
+        self._earlier = seen.get(self._end, 0)
+        self._starts, self._ends = _Shown(), _Shown()
+        self._last: dict[
+            int, tuple[int, Run]
+        ] = {}  # by sub-environment: the row after its last run, and that run
+        self._waiting: dict[int, tuple[int, Run]] = {}  # episodes that have ended: sub-environment, and rows
+        self.count = 0  # ended episodes
+
+    def look(
+        self,
+        store: ChunkStore,
+        tail: Unwritten,
+        steps: Sequence[NewSteps],
+        counts: Sequence[int],
+        *,
+        is_over: bool,
+    ) -> Array:
+        """The new ends: `episode`, `env`, `first_row`, `length`, `return`. `counts` are rows by sub-environment."""
+        self._store = store
+        self._rows = {channel: self._new_rows(channel) for channel in (self._final, self._end, self._start)}
+        starts = self._fields(self._start, _STARTS)
+        if len(starts) and not is_over and _is_empty(starts[-1], counts):  # it may be taken back
+            starts, rows = starts[:-1], self._rows[self._start]
+            self._rows[self._start], self._seen[self._start] = rows[:-1], rows.stop - 1
+        ends = self._fields(self._end, _ENDS)
+        known = self._ends.note(ends["episode"])
+        self._known = {
+            self._start: self._starts.note(starts["episode"]),
+            self._end: known,
+            self._final: known,
+        }
+        self._made: list[tuple[int, int, bytes]] = []
+        before, self._waiting = self._waiting, {}
+        made = [self._make_end(tail, number, *before[number], counts) for number in before]
+        for new in steps:
+            for run in self._whole_runs(new):
+                if run.row >= new.first:
+                    self._make_start(tail, new.env, run)
+                if run.terminal or run.timeout:
+                    made.append(self._make_end(tail, run.episode, new.env, run, None))
+        self.count = store.count(self._end) - self._earlier + len(self._ends.ahead)
+        fresh = ends[~np.isin(ends["episode"], list(known))]
+        return np.concatenate([fresh, np.array([end for end in made if end is not None], _ENDS)])
+
+    def _fields(self, channel: int, dtype: np.dtype[np.void]) -> Array:
+        """What the new messages of a channel begin with."""
+        parts: list[Array] = [np.empty(0, dtype)]
+        rows = self._rows[channel]
+        for span in self._store.spans(channel, rows.start, len(rows)):
+            data, places = self._store.records(span.chunk)
+            each: Array = np.ndarray(len(data) - BODY - dtype.itemsize + 1, dtype, data, BODY, (1,))
+            parts.append(each[places[span.begin : span.end, 0]])
+        return np.concatenate(parts)
+
+    def _whole_runs(self, new: NewSteps) -> Iterator[Run]:
+        """The rows of each episode so far, where all of them were looked at."""
+        stop, last = self._last.get(new.env, (-1, None))
+        for run in runs_in(new.facts, new.first, last if stop == new.first else None):
+            self._last[new.env] = new.first + len(new), run
+            at = max(0, run.row - new.first)
+            if run.row == new.first + at - int(new.facts.step[at]):
+                yield run
+
+    def _make_start(self, tail: Unwritten, env: int, run: Run) -> None:
+        hole = tail.finals.get((env, run.row))
+        if hole is not None and run.episode not in self._starts:
+            start = EpisodeStart(run.episode, env, run.row, False, False, "", "", "{}")
+            self._made.append((self._start, hole.time_ns, CDR_HEADER + start.encode()))
+            self._starts.ahead.add(run.episode)
+
+    def _make_end(
+        self, tail: Unwritten, number: int, env: int, run: Run, counts: Sequence[int] | None
+    ) -> tuple[int, int, int, int, float] | None:
+        """The end of an episode, and its final state. None if there is none to be made, or not yet; `counts` at the
+        second look."""
+        if number in self._ends:
+            return None
+        stop = run.row + run.steps
+        hole, state = tail.finals.get((env, stop)), None
+        if hole is not None:
+            state = hole.state
+        elif counts is None:
+            self._waiting[number] = env, run
+        elif counts[env] == stop:
+            state = tail.pending.get(env)
+        if state is None:
+            return None
+        facts = number, env, run.row, run.steps, run.total
+        end = EpisodeEnd(*facts, TERMINAL if run.terminal else TIMEOUT, True, "{}")
+        head = number.to_bytes(4, "little") + env.to_bytes(4, "little")
+        self._made.append((self._final, run.last_time, CDR_HEADER + head + state))
+        self._made.append((self._end, run.last_time, CDR_HEADER + end.encode()))
+        self._ends.ahead.add(number)
+        return facts
+
+    def messages(self, most: int) -> list[tuple[int, int, bytes]]:
+        """(channel, log_time, CDR message) of the newest of new starts, final states and ends."""
+        found = list(self._made)
+        for channel, rows in self._rows.items():
+            for time_ns, message in messages_of(self._store, channel, rows[-most:]):
+                if int.from_bytes(message[_NUMBER : _NUMBER + 4], "little") not in self._known[channel]:
+                    found.append((channel, time_ns, message))
+        order = list(self._rows)
+        return sorted(found, key=lambda one: (one[1], order.index(one[0])))[-most:]
+
+
+def _is_empty(start: Array, counts: Sequence[int]) -> bool:
+    """Whether an episode has no step."""
+    env = int(start["env"])
+    return env < len(counts) and int(start["first_row"]) >= counts[env]
