@@ -161,8 +161,6 @@ class _Recorder:
                 self._reset(env, options={"reset_mask": over})
             if rng.random() < flushes:
                 env.flush()
-            if kind.silent and rng.random() < 0.1:  # as a live view does
-                (env._writer.rows or env._writer.vector).ask()
 
     def _reset(self, env: Any, **arguments: Any) -> None:
         if not arguments and self._random.random() < 0.3:

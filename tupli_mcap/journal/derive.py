@@ -7,8 +7,7 @@ next reset.
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -71,25 +70,6 @@ class EpisodeRows:
         # ends whose final state comes with the next batch, by sub-environment
         self._waiting: Array = np.zeros(self._n, _END)
         self._waits = np.zeros(self._n, np.bool_)
-
-    def copy(self, rows: Array) -> Callable[[], EpisodeBatch]:
-        """What calls `take` with new rows, of which the last is the running one, on copies of all: nothing changes."""
-        other = copy.copy(self)
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                setattr(other, name, value.copy())
-        # as bytes: padding stays where it is
-        copied = rows.view(f"V{rows.dtype.itemsize}").copy().view(rows.dtype)
-        return lambda: other._take_with(copied[:, :-1], copied[:, -1])
-
-    def _take_with(self, rows: Array, running: Array) -> EpisodeBatch:
-        """As `take`; where the last row has ended an episode, the running one has its final state."""
-        over = self._waits
-        if rows.shape[1]:
-            last = rows[:, -1]
-            over = (last["terminal"] | last["timeout"]) & (last["#sequence"] != HOLE)
-        states = running[:, None].view(np.uint8)[:, self._state]
-        return self.take(rows, {i: states[i].tobytes() for i in np.flatnonzero(over).tolist()})
 
     def wait_for(self, end: EpisodeEnd, time_ns: int) -> None:
         """The next row is a hole that keeps the final state of an episode that has ended otherwise."""

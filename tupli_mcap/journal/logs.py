@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 from zlib import crc32
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from tupli_mcap.journal.file import LogArea
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.mcap.records import BODY, CDR_HEADER, RECORD_HEADER, iter_records
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
 
 __all__ = [
     "FRONT",
@@ -30,7 +30,6 @@ __all__ = [
 
 Sink = Callable[[Rows], None]
 LOG_HEADER = 64  # bytes of a half before its records
-_KEPT = 16  # times that a log has gone to the file
 FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
 _LOG_TIME = FRONT.size - 8
 
@@ -104,8 +103,6 @@ class EventLog:
         self.latest_ns = time_ns
         # what the journal holds by channel, so that a flush need not take it apart
         self._whole: defaultdict[int, list[bytes]] = defaultdict(list)
-        # what it held before that, newest last; None while nobody wants it
-        self._written: tuple[Mapping[int, list[bytes]], ...] | None = None
         self._last = 0  # where the last message began
         self._last_channel = 0
         self._can_drop = False
@@ -151,35 +148,6 @@ class EventLog:
         self._position = self._commit[0] = position
         return time_ns
 
-    def committed(self) -> memoryview:
-        """The records in the journal, for another thread to copy from."""
-        return self._records[: self._commit[0]]
-
-    def keep_written(self) -> None:
-        """From now on, what goes to the file is kept for a while, for those who watch."""
-        self._written = self._written or ()
-
-    def newest(self, firsts: Mapping[int, int]) -> list[tuple[int, int, int, bytes]]:
-        """(channel, sequence, log_time, CDR message) of the records of channels from a sequence on; for another thread.
-
-        Those that have gone to the file are there since `keep_written`, for a while.
-        """
-        whole = (
-            self._whole
-        )  # before `_written`: what goes to the file meanwhile is found twice, and not missed
-        halves = [*(self._written or ()), whole]
-        found: dict[tuple[int, int], tuple[int, bytes]] = {}
-        for channel, first in firsts.items():
-            for half in halves:
-                for group in reversed(list(half.get(channel, ()))):
-                    for start, end, _, sequence, time_ns in iter_records(memoryview(group)):
-                        if sequence >= first:
-                            message = group[start + RECORD_HEADER.size : end]
-                            found[channel, sequence] = time_ns, message
-                    if sequence < first:
-                        break
-        return [(*key, *found[key]) for key in sorted(found)]
-
     def drop_last(self, channel: int) -> None:
         """Takes back the message of the last `append`, which was one of `channel`, unless it is in the file already."""
         if not self._can_drop:
@@ -203,10 +171,7 @@ class EventLog:
 
     def _write(self, kept: int = 0) -> None:
         """Writes the records to the file, but the last `kept` of the last channel, which are taken out."""
-        whole = self._whole
-        if self._written is not None:
-            self._written = (*self._written, whole)[-_KEPT:]
-        self._whole = defaultdict(list)
+        whole, self._whole = self._whole, defaultdict(list)
         for channel, records in whole.items():
             if records:
                 before = sum(map(_count, records)) + (kept if channel == self._last_channel else 0)

@@ -70,9 +70,9 @@ class RowEncoder:
     for what cannot be stored exactly, and nothing has changed then.
 
     `offset()` is where the running row is in the buffer, `count()` the sequence of the next step, `total()` the return
-    so far; any thread may ask for one of them, but two need not be of the same moment. `move(start, last, end)` makes
-    the row at `start` the running one, behind the row at `last`; when the one at `end` has been started, `switch` is
-    called. `begin(prefix, total)`: what the rows to come hold before their state, and the return before them.
+    so far. `move(start, last, end)` makes the row at `start` the running one, behind the row at `last`; when the one at
+    `end` has been started, `switch` is called. `begin(prefix, total)`: what the rows to come hold before their state,
+    and the return before them.
     """
 
     put: Callable[[Any, Any, Any, Any, Any], None]

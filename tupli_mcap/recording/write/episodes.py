@@ -33,7 +33,7 @@ from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels
 
-__all__ = ["EPISODE_AND_ENV", "EpisodeLog", "Foretold", "ResetFacts", "StartedEpisode"]
+__all__ = ["EPISODE_AND_ENV", "EpisodeLog", "ResetFacts", "StartedEpisode"]
 
 _RECORD = BODY - len(CDR_HEADER)  # bytes of a record before its CDR header
 _LENGTH = _RECORD - 9  # of which its length counts
@@ -61,19 +61,6 @@ class ResetFacts(NamedTuple):
     def goes_on(self) -> bool:
         """True if the reset had no seed, so that it went on with the random stream of what came before it."""
         return self.seed is None and self.drawn_seed is None and not self.continued
-
-
-class Foretold(NamedTuple):
-    """What rows will tell of the episodes up to now.
-
-    Attributes:
-        tables: whole records, by channel.
-        first: the place in the index of the first of `ended` (EPISODE_ROWS, without what starts say).
-    """
-
-    tables: dict[int, Array]
-    first: int
-    ended: Array
 
 
 # makes a StartedEpisode of its fields without a call of Python
@@ -177,10 +164,6 @@ class EpisodeLog(EventLog):
         """The end of an episode will be told by its rows."""
         self._running[episode.number] = episode
 
-    def running(self, number: int) -> StartedEpisode | None:
-        """An episode whose end its rows will tell, and have not told yet. For any thread."""
-        return self._running.get(number)
-
     def take_back(self, number: int) -> StartedEpisode:
         """An episode whose rows have told its start, but will not tell its end."""
         return self._running.pop(number)
@@ -193,12 +176,6 @@ class EpisodeLog(EventLog):
         self.latest_ns = max(self.latest_ns, *(int(t["#log_time"][-1]) for t in (begun, ended) if len(t)))
         self._tell_index(begun, ended, final["#sequence"])
         self._add({self._start: begun, self._final: final, self._end: ended})
-
-    def foretell(self, told: EpisodeBatch) -> Foretold:
-        """What `extend` would add; nothing changes."""
-        begun, final, ended = self._tables(told)
-        tables = {self._start: begun, self._final: final, self._end: ended}
-        return Foretold(tables, self._index.count, _index_rows(ended, final["#sequence"]))
 
     def _tables(self, told: EpisodeBatch) -> tuple[Array, Array, Array]:
         """Records of starts, final states and ends."""

@@ -74,7 +74,6 @@ class SingleRecorder:
         self._episode: StartedEpisode | None = None
         self._over: int | None = None  # how the last step has ended its episode, if that is not written yet
         self._rows: SingleRows | None = None  # those that can tell of episodes
-        self._began_plain = False  # the running episode's reset had no seed, options and info
         self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset
         writer.on_close = self._stop
@@ -113,7 +112,6 @@ class SingleRecorder:
         rows.begin_episode(writer.next_episode)
         rows.put_state(state)
         self._episode = writer.start_episode(0, rows.count, facts)
-        self._began_plain = facts.goes_on and not facts.options and facts.info == "{}"
         self.put = rows.put
         if writer.syncs_steps:
             writer.sync_step()
@@ -123,11 +121,6 @@ class SingleRecorder:
         if self._rows is None:
             self.end(end)
             return
-        if self._episode is not None and self._writer.is_watched:
-            if self.resets_itself or not self._began_plain:
-                self.end(end)
-                return
-            self._leave_to_rows(self._rows, self._episode, end)
         self._over = end
         self.put = self._continue
 
@@ -143,8 +136,6 @@ class SingleRecorder:
         if self._episode is not None:
             self._leave_to_rows(rows, self._episode, over)
         rows.put_next(writer.next_episode, state)
-        if rows.asked:
-            rows.tell_now()
         writer.next_episode += 1
         self._over = None
         self.put = rows.put_plain
@@ -277,7 +268,6 @@ class SingleRecorder:
         rows.begin_episode(self._writer.next_episode)
         facts = ResetFacts(None, None, "", "{}", 0, continued=True)
         self._episode = self._writer.start_episode(0, rows.count, facts)
-        self._began_plain = False
         self.put = rows.put
         rows.put(action, state, reward, terminal, timeout)
 

@@ -108,7 +108,6 @@ class RecordingWriter:
         self.start_is_droppable: Callable[[], bool] = lambda: False
         # sub-environments whose random stream does not come from their last recorded episode
         self.lost_streams: set[int] = set()
-        self.is_watched = False  # ends of episodes are to be seen as they come
         self.num_envs = 1
         self.is_vector = False
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
@@ -268,8 +267,6 @@ class RecordingWriter:
         )  # fmt: skip
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
         self.events, self.infos, self.frames = stores.events, stores.infos, stores.frames
-        if self.is_watched:
-            self.events.keep_written()
 
     # ---- episodes
 
@@ -510,7 +507,7 @@ class RecordingWriter:
         self.container.close()
         try:
             self.worker.close()
-            if self._stores is not None and not self.is_watched:  # who watches has yet to show the rest
+            if self._stores is not None:
                 self._stores.let_go()
                 self._stores = self.rows = self.vector = self.events = self.infos = None
                 self.images, self.frames = [], []

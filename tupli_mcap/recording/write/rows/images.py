@@ -116,10 +116,6 @@ class ImageRows:
         if self._sealed:
             seal(self._buffer, start, start + self._row_size, b"")
 
-    def rows(self) -> Array:
-        """The rows of both halves, for another thread to copy from; their `#sequence` says which they are."""
-        return self._rows
-
     def pending(self) -> bytes:
         """The running row's image."""
         data: bytes = self._data[self._half, self._row].tobytes()

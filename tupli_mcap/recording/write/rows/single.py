@@ -23,7 +23,7 @@ from tupli_mcap.messages.encode_rows import (
 )
 from tupli_mcap.messages.episodes import EpisodeEnd
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.write.episodes import EpisodeLog, Foretold
+from tupli_mcap.recording.write.episodes import EpisodeLog
 
 __all__ = [
     "CHUNKS_PER_HALF",
@@ -80,8 +80,6 @@ class SingleRows:
         # what rows tell of their episodes goes there; None while they tell nothing
         self._events: EpisodeLog | None = None
         self._told = 0  # rows of the running half that have told it
-        self.asked = False  # for what is told at the next reset
-        self._changes = 0  # of what was told; odd while it changes
         self._episodes = EpisodeRows(1, encoder.state_end)
         self._state_end = encoder.state_end
         self._go_to(0)
@@ -119,40 +117,14 @@ class SingleRows:
         """True while rows tell of their episodes."""
         return self._events is not None
 
-    def tell_now(self) -> None:
-        """What has been asked for: `put_next` has just begun an episode."""
-        self.asked = False
-        start = self._half * self._area.half
-        self._changes += 1
-        self._tell(start, (self._offset() - start) // self._area.row_size)
-        self._changes += 1
-
-    def ask(self) -> None:
-        """Rows tell what they have to tell at the next reset, and not only when they go to the file. For any thread."""
-        self.asked = True
-
     def tell(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
         """The rows from here on will tell `events` of their episodes, and of the final state of the one that has
         ended just now."""
-        self._changes += 1
         self._events = events
         self._told = (self._offset() - self._half * self._area.half) // self._area.row_size
         self._episodes.begin([None])
         self._episodes.wait_for(ended, time.time_ns())
         events.leave_to_rows(started)
-        self._changes += 1
-
-    def foretell(self) -> Foretold | None:
-        """What rows would tell now; None if that is nothing, or just changes. For any thread."""
-        changes, events = self._changes, self._events
-        if changes % 2 or events is None:
-            return None
-        half, row, table = self.committed()
-        copy = self._episodes.copy(table[None, half, self._told : row + 1])
-        if self._changes != changes:
-            return None
-        told = events.foretell(copy())
-        return told if self._changes == changes else None
 
     def settle(self, *, over: bool) -> StartedEpisode | None:
         """Rows tell what they have to tell, and from here on nothing; returns the running episode, if it has a row.
@@ -164,10 +136,8 @@ class SingleRows:
             return None
         half = self._half * self._area.half
         row = (self._offset() - half) // self._area.row_size
-        self._changes += 1
         self._tell(half, row, {0: self.pending_state()} if over else None)
         self._events = None
-        self._changes += 1
         number = int(self._episodes.running[0])
         if number < 0:
             return None
@@ -183,12 +153,6 @@ class SingleRows:
         rows = np.frombuffer(self._buffer[half + told * size : half + end * size], self._dtype)
         self._events.extend(self._episodes.take(rows[None], pending))
 
-    def committed(self) -> tuple[int, int, Array]:
-        """The running half, its committed rows, and the rows of both halves; for another thread to copy from."""
-        half, offset = divmod(self._offset(), self._area.half)
-        table: Array = np.frombuffer(self._buffer, self._dtype).reshape(2, self._area.rows + 1)
-        return half, offset // self._area.row_size, table
-
     def pending_state(self) -> bytes:
         """The CDR bytes of the running row's state, as they follow `episode` and `env` in `/final_state`."""
         start = self._offset()
@@ -201,7 +165,6 @@ class SingleRows:
     def _switch(self) -> None:
         """The half is full: go on in the other one, then write this one as a chunk."""
         area, half = self._area, self._half
-        self._changes += 1
         # before the other half's last row goes, whose hole may be here
         self._tell(half * area.half, area.rows)
         spare = half * area.half + area.rows * area.row_size
@@ -213,7 +176,6 @@ class SingleRows:
         flushed, self._flushed = self._flushed, 0
         self._go_to(self._half)
         self._told = 0
-        self._changes += 1
         self._emit(half * area.half, flushed, area.rows)
 
     def _go_to(self, half: int) -> None:
@@ -227,9 +189,7 @@ class SingleRows:
         start = self._half * self._area.half
         rows = (self._offset() - start) // self._area.row_size
         flushed, self._flushed = self._flushed, rows
-        self._changes += 1
         self._tell(start, rows)
-        self._changes += 1
         self._emit(start, flushed, rows)
 
     def _emit(self, start: int, begin: int, end: int) -> None:

@@ -203,11 +203,6 @@ class StepLog:
             pending, 0, 5, 0, self._channel, self.count, 0, 0, CDR_HEADER, self._episode, self._step
         )
 
-    def committed(self) -> tuple[int, memoryview]:
-        """The running half and its committed records, for another thread to copy from."""
-        half = self._half
-        return half, self._records[half][: self._ends[half][0]]
-
     def pending_state(self) -> bytes:
         """The CDR bytes of the running record's state, as they follow `episode` and `env` in `/final_state`."""
         return bytes(self._pending[BODY + 8 :])

@@ -21,7 +21,7 @@ from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.write.episodes import EpisodeLog, Foretold
+from tupli_mcap.recording.write.episodes import EpisodeLog
 from tupli_mcap.recording.write.rows.single import StartChunks
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.spaces.leaves import Leaf
@@ -85,8 +85,6 @@ class VectorRows:
         # what rows tell of their episodes goes there; None while they tell nothing
         self._events: EpisodeLog | None = None
         self._told = 0  # rows of the running half that have told it
-        self._asked = False  # for what is told at the next reset
-        self._changes = 0  # of what was told; odd while it changes
         self._episodes = EpisodeRows(n, layout.state_end)
         self._state = [self._writer(leaf, 1) for leaf in layout.state if not leaf.apart]
         others = [*((leaf, _ACTION) for leaf in layout.action), *((leaf, _REWARD) for leaf in layout.reward)]
@@ -182,11 +180,6 @@ class VectorRows:
         self._row = row + 1
         if self._row == self._area.rows:
             self._switch()
-        if self._asked and active is not None:
-            self._asked = False
-            self._changes += 1
-            self._tell(self._half, self._row)
-            self._changes += 1
 
     # ---- episodes told by rows
 
@@ -198,34 +191,11 @@ class VectorRows:
     def tell(self, events: EpisodeLog, running: Sequence[StartedEpisode | None]) -> None:
         """The rows from here on will tell `events` of their episodes. `running` are those that have been started, by
         sub-environment, and have no row yet."""
-        self._changes += 1
         self._events, self._told = events, self._row
         self._episodes.begin(running)
         for started in running:
             if started is not None:
                 events.leave_to_rows(started)
-        self._changes += 1
-
-    @property
-    def tells(self) -> bool:
-        """True while rows tell of their episodes."""
-        return self._events is not None
-
-    def ask(self) -> None:
-        """As `SingleRows.ask`."""
-        self._asked = True
-
-    def foretell(self) -> Foretold | None:
-        """As `SingleRows.foretell`."""
-        changes, events = self._changes, self._events
-        if changes % 2 or events is None:
-            return None
-        half, row = self._half, self._row
-        copy = self._episodes.copy(self._rows[half, :, self._told : row + 1])
-        if self._changes != changes:
-            return None
-        told = events.foretell(copy())
-        return told if self._changes == changes else None
 
     def settle(self, over: Array) -> tuple[list[int], list[float]]:
         """Rows tell what they have to tell, and from here on nothing; returns the numbers of the running episodes (-1:
@@ -233,10 +203,8 @@ class VectorRows:
 
         `over`: where the last row has ended its episode, and the running one has its final state.
         """
-        self._changes += 1
         self._tell(self._half, self._row, {i: self.pending_state(i) for i in np.flatnonzero(over).tolist()})
         self._events = None
-        self._changes += 1
         return self._episodes.running.tolist(), self._episodes.totals.tolist()
 
     def _tell(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
@@ -244,10 +212,6 @@ class VectorRows:
         if self._events is not None:
             told, self._told = self._told, end
             self._events.extend(self._episodes.take(self._rows[half, :, told:end], pending))
-
-    def committed(self, i: int) -> tuple[int, int, Array]:
-        """As `SingleRows.committed`, of one sub-environment."""
-        return self._half, self._row, self._rows[:, i]
 
     def pending_state(self, i: int) -> bytes:
         """The CDR bytes of a sub-environment's running state, as they follow `episode` and `env` in `/final_state`."""
@@ -265,14 +229,12 @@ class VectorRows:
     def _switch(self) -> None:
         self._finish_chunks()  # a half is used again only when its chunks are in the file
         half, rows, flushed = self._half, self._area.rows, self._flushed
-        self._changes += 1
         self._tell(half, rows)  # see SingleRows
         self._half = 1 - half
         self._sequence[self._half] = HOLE  # see SingleRows
         end = self._state_end
         self._state_bytes[self._half, :, 0, BODY:end] = self._state_bytes[half, :, rows, BODY:end]
         self._row = self._flushed = self._told = 0
-        self._changes += 1
         self._write_chunks = self._start_chunks(self._chunks(half, flushed, rows))
         if self._durable:
             self._finish_chunks()
@@ -281,9 +243,7 @@ class VectorRows:
         """Writes the rows that are not in the file yet."""
         self._finish_chunks()
         flushed, self._flushed = self._flushed, self._row
-        self._changes += 1
         self._tell(self._half, self._row)
-        self._changes += 1
         self._write_chunks = self._start_chunks(self._chunks(self._half, flushed, self._row))
         self._finish_chunks()
 
