@@ -552,6 +552,25 @@ def test_lengths_of_maps_are_looked_at(tmp_path: Path) -> None:
         assert not verify_recording(path).ok
 
 
+@pytest.mark.parametrize("change", [('"halves": 1', '"halves": 0'), ('"channels": 1', '"channels": 0')])
+def test_areas_of_nothing(change: tuple[str, str], tmp_path: Path) -> None:
+    """An area of a journal has rows, or records, in some half."""
+    seed = next(one for one in load_seeds() if one.name == "unfinished")
+    assert seed.journal is not None
+    head = struct.Struct("<8sII")
+    magic, length, _ = head.unpack_from(seed.journal)
+    before = seed.journal[head.size : head.size + length].decode()
+    text = before.replace(*change).encode()
+    assert before != text.decode()
+    path = tmp_path / "a.mcap"
+    path.write_bytes(seed.data)
+    journal = head.pack(magic, length, zlib.crc32(text)) + text + seed.journal[head.size + length :]
+    path.with_name("a.mcap.journal").write_bytes(journal)
+    with pytest.raises(FormatError, match="expected areas"):
+        read_journal(path.with_name("a.mcap.journal"))
+    verify_recording(path)
+
+
 def test_holes_of_a_journal_take_no_memory(tmp_path: Path) -> None:
     area = RowArea("steps", 64, 1 << 24)
     path = tmp_path / "a.journal"

@@ -419,7 +419,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], list[Area]
 def _area(entry: Mapping[str, Any]) -> Area:
     values = {key: value for key, value in entry.items() if key != "kind"}
     sizes = [value for key, value in values.items() if key != "name"]
-    if type(entry["name"]) is not str or any(type(n) is not int or not 0 <= n < 1 << 48 for n in sizes):
+    if type(entry["name"]) is not str or any(type(n) is not int or not 0 < n < 1 << 48 for n in sizes):
         raise ValueError(entry)
     return RowArea(**values) if entry["kind"] == "rows" else LogArea(**values)
 
