@@ -12,9 +12,9 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Place, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic
 from tupli_mcap.doctor.message_text import plural, share
-from tupli_mcap.doctor.values import bounds
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
+from tupli_mcap.recording.columns.statistics import element_bounds
 
 __all__ = ["Digests", "duplicate_episodes"]
 
@@ -110,5 +110,5 @@ def duplicate_episodes(recordings: Sequence[Digests], *, rarity: float = 1000) -
 def _log_choices(layout: StepLayout) -> float:
     if any(leaf.dtype is None or leaf.dtype.kind == "f" for leaf in (*layout.state, *layout.action)):
         return math.inf
-    limits = (bounds(leaf) for leaf in layout.action)
+    limits = (element_bounds(leaf) for leaf in layout.action)
     return sum(float(np.log(high.astype(np.float64) - low + 1).sum()) for low, high in limits)

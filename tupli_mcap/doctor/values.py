@@ -9,40 +9,32 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.arrays import Array, DType
+from tupli_mcap.arrays import Array
 from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace, value_bytes
 from tupli_mcap.doctor.message_text import dimension_text, dimensions, plural
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
+from tupli_mcap.recording.columns.statistics import ElementStatistics, columns_of
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["LeafValues", "bounds", "constant_dimension", "infinity", "nan", "outside_space", "unused_action"]
+__all__ = ["LeafValues", "constant_dimension", "infinity", "nan", "outside_space", "unused_action"]
 
 Locate = Callable[[int], StepPlace]
 Role = Literal["state", "action", "reward"]
 _KINDS = ("nan", "infinite", "outside")
 _ROUNDING = 8  # units in the last place that a value may be outside of its space
-_NARROW = 64  # elements a step up to which a transposed copy makes reductions quicker
-_MOST_CHOICES = 1 << 12
 _NAMED = 8  # choices that a message names
-_INT64_MAX = 2**63 - 1
 
 
 class LeafValues(Statistic):
     """The values of a leaf, in steps and final states.
 
     seen: how many. counts: how many of each element (int64, C order) are of each of `_KINDS`; a value of variable size
-    is one element. places: the first of each kind. choices: of each element of an action, how often each choice occurs;
-    empty where the action is not discrete, or has more than 4,096. Of each element of a leaf of constant size, low and
-    high are the bounds of the space, least and most the range of the finite values.
+    is one element. places: the first of each kind. of_elements: more of a leaf of constant size.
     """
 
-    low: Array
-    high: Array
-    least: Array
-    most: Array
-    dtype: DType = np.dtype(object)
+    of_elements: ElementStatistics | None = None
 
     def __init__(self, leaf: Leaf, role: Role) -> None:
         self.leaf = leaf
@@ -50,7 +42,6 @@ class LeafValues(Statistic):
         self.seen = 0
         self.counts = {kind: np.zeros(leaf.size, np.int64) for kind in _KINDS}
         self.places: dict[str, list[StepPlace]] = {kind: [] for kind in _KINDS}
-        self.choices: list[Array] = []
 
     @classmethod
     def start(cls, measured: Measurements) -> Sequence[LeafValues]:
@@ -78,7 +69,6 @@ class LeafValues(Statistic):
 
     def _note(self, kind: str, bad: Array, locate: Locate) -> None:
         """`bad[element, i]`: that element of value `i` is of this kind."""
-        self.counts[kind] += bad.sum(axis=1)
         missing = MAX_PLACES - len(self.places[kind])
         if missing:
             self.places[kind] += [locate(int(i)) for i in np.flatnonzero(bad.any(axis=0))[:missing]]
@@ -92,69 +82,43 @@ def _final_place(block: Block, i: int) -> StepPlace:
 class _ArrayValues(LeafValues):
     """A leaf of constant size."""
 
+    of_elements: ElementStatistics
+
     def __init__(self, leaf: Leaf, role: Role, layout: StepLayout) -> None:
         super().__init__(leaf, role)
-        recorded = layout.dtypes[leaf.name]
-        # Bools have no range, and NumPy is slow with float16.
-        wider: dict[str, DType] = {"bool": np.dtype(np.uint8), "float16": np.dtype(np.float32)}
-        self.dtype = wider.get(recorded.name, recorded)
-        self.low, self.high = self._lowest, self._highest = bounds(leaf)
+        self.of_elements = found = ElementStatistics(leaf, layout.dtypes[leaf.name])
+        self.counts |= {"nan": found.nan, "infinite": found.infinite}
+        self._lowest, self._highest = found.low, found.high
         if leaf.dtype is not None and leaf.dtype.kind == "f":
-            sizes = [np.where(np.isfinite(b), np.abs(b.astype(np.float64)), 0) for b in (self.low, self.high)]
+            ends = (found.low, found.high)
+            sizes = [np.where(np.isfinite(b), np.abs(b.astype(np.float64)), 0) for b in ends]
             slack = _ROUNDING * float(np.finfo(leaf.dtype).eps) * np.maximum(*sizes)
-            self._lowest, self._highest = self.low - slack, self.high + slack
-        info: Any = np.finfo(self.dtype) if self.dtype.kind == "f" else np.iinfo(self.dtype)
-        self.least = np.full(leaf.size, info.max, self.dtype)
-        self.most = np.full(leaf.size, info.min, self.dtype)
-        if role == "action" and not isinstance(leaf.space, spaces.Box):
-            counts = [int(high) - int(low) + 1 for low, high in zip(self.low, self.high, strict=True)]
-            self.choices = [np.zeros(n, np.int64) for n in counts] if sum(counts) <= _MOST_CHOICES else []
+            self._lowest, self._highest = found.low - slack, found.high + slack
 
     @property
     def constant(self) -> Array:
-        finite = self.counts["nan"] + self.counts["infinite"] == 0
-        constant: Array = finite & (self.least == self.most) & (self.low < self.high)
+        found = self.of_elements
+        constant: Array = (
+            (found.finite == found.seen) & (found.least == found.most) & (found.low < found.high)
+        )
         return constant
 
     def _add(self, values: Any, locate: Locate) -> None:
         self.seen += len(values)
         if not self.leaf.size:
             return
-        flat = values.reshape(len(values), -1).astype(self.dtype, copy=False)
-        columns = np.ascontiguousarray(flat.T) if flat.shape[1] <= _NARROW else flat.T
-        least, most = self._finite_range(columns, locate)
-        self.least, self.most = np.minimum(self.least, least), np.maximum(self.most, most)
-        if (least < self.low).any() or (most > self.high).any():
+        found, columns = self.of_elements, columns_of(values)
+        before = found.finite.sum() - found.seen * self.leaf.size
+        found.add(columns)
+        if found.finite.sum() - found.seen * self.leaf.size != before:
+            self._note("nan", np.isnan(columns), locate)
+            self._note("infinite", np.isinf(columns), locate)
+        if (found.least < found.low).any() or (found.most > found.high).any():
             with np.errstate(invalid="ignore"):  # signalling NaN
                 outside = (columns < self._lowest[:, None]) | (columns > self._highest[:, None])
-            self._note("outside", outside & np.isfinite(columns), locate)
-        for counts, column, low in zip(self.choices, columns, self.low, strict=False):
-            inside = column[(column >= low) & (column - low < len(counts))]
-            counts += np.bincount((inside - low).astype(np.int64), minlength=len(counts))
-
-    def _finite_range(self, columns: Array, locate: Locate) -> tuple[Array, Array]:
-        if columns.dtype.kind != "f" or (finite := np.isfinite(columns)).all():
-            return columns.min(axis=1), columns.max(axis=1)
-        nan = np.isnan(columns)
-        self._note("nan", nan, locate)
-        self._note("infinite", ~finite & ~nan, locate)
-        least = np.where(finite, columns, np.inf).min(axis=1)
-        return least, np.where(finite, columns, -np.inf).max(axis=1)
-
-
-def bounds(leaf: Leaf) -> tuple[Array, Array]:
-    """The smallest and largest value the space allows, of each element of a leaf of constant size (C order)."""
-    space = leaf.space
-    if isinstance(space, spaces.Box):
-        return space.low.reshape(-1), space.high.reshape(-1)
-    starts, counts = [0] * leaf.size, [2] * leaf.size
-    if isinstance(space, spaces.Discrete):
-        starts, counts = [int(space.start)], [int(space.n)]
-    elif isinstance(space, spaces.MultiDiscrete):
-        starts, counts = np.asarray(space.start).reshape(-1).tolist(), space.nvec.reshape(-1).tolist()
-    # As Python's integers: a file may claim choices beyond what int64 holds.
-    ends = [min(start + n - 1, _INT64_MAX) for start, n in zip(starts, counts, strict=True)]
-    return np.array([min(start, _INT64_MAX) for start in starts], np.int64), np.array(ends, np.int64)
+            outside &= np.isfinite(columns)
+            self.counts["outside"] += outside.sum(axis=1)
+            self._note("outside", outside, locate)
 
 
 class _VariableValues(LeafValues):
@@ -185,6 +149,7 @@ class _VariableValues(LeafValues):
                 self._first = encoded if self._first is None else self._first
                 self._changes = encoded != self._first
         for kind, flags in bad.items():
+            self.counts[kind] += flags.sum(axis=1)
             self._note(kind, flags, locate)
 
 
@@ -228,11 +193,11 @@ def outside_space(measured: Measurements) -> Iterator[Finding]:
         leaf, mask = values.leaf, values.counts["outside"] > 0
         if not mask.any():
             continue
-        what = f"outside of {leaf.space!r:.80}"
-        if leaf.kind != "variable":
+        what, found = f"outside of {leaf.space!r:.80}", values.of_elements
+        if found is not None:
             what = (
-                f"outside the space{dimension_text(leaf, mask)}: they reach from {values.least[mask].min():g} to "
-                f"{values.most[mask].max():g}, the space from {values.low[mask].min():g} to {values.high[mask].max():g}"
+                f"outside the space{dimension_text(leaf, mask)}: they reach from {found.least[mask].min():g} to "
+                f"{found.most[mask].max():g}, the space from {found.low[mask].min():g} to {found.high[mask].max():g}"
             )
         severity = Severity.WARNING
         if not isinstance(leaf.space, spaces.Box):
@@ -272,18 +237,20 @@ def constant_dimension(measured: Measurements, *, min_steps: int = 100) -> Itera
     if measured.steps < min_steps:
         return
     for values in measured.statistics(LeafValues):
-        leaf, mask = values.leaf, values.constant
+        leaf, mask, found = values.leaf, values.constant, values.of_elements
         count, whole = int(mask.sum()), bool(mask.all())
-        if values.role == "reward" or values.choices or not count or (leaf.apart and not whole):
+        of_choices = values.role == "action" and not isinstance(leaf.space, spaces.Box)
+        if values.role == "reward" or of_choices or not count or (leaf.apart and not whole):
             continue
         if whole:
             message = f"all {values.seen:,} {'frames' if leaf.apart else 'values'} are the same"
             advice = "look whether this sensor, camera or actuator works; leave it out when training"
         else:
-            what = f"is always {values.least[mask][0]:g}" if count == 1 else "never change"
+            what = "never change" if found is None or count > 1 else f"is always {found.least[mask][0]:g}"
             message = f"{dimensions(leaf, mask)} {what} in {values.seen:,} values"
             advice = "guard against a standard deviation of 0 when normalising, or leave it out"
-        severity = Severity.WARNING if whole or values.dtype.kind == "f" else Severity.INFO
+        floats = found is not None and found.dtype.kind == "f"
+        severity = Severity.WARNING if whole or floats else Severity.INFO
         yield measured.finding(
             "constant-dimension", severity, message, advice, count, leaf.size, (), leaf, mask
         )
@@ -295,12 +262,15 @@ def unused_action(measured: Measurements, *, steps_each: int = 20) -> Iterator[F
     Judged from `steps_each` steps a choice on: a uniform policy then misses one with a probability below e^-20.
     """
     for values in measured.statistics(LeafValues):
-        for i, counts in enumerate(values.choices):
+        found = values.of_elements
+        if found is None or values.role != "action":
+            continue
+        for i, counts in enumerate(found.choices):
             unused = np.flatnonzero(counts == 0)
             if not len(unused) or values.seen < steps_each * len(counts):
                 continue
             leaf, element = values.leaf, np.arange(values.leaf.size) == i
-            names = ", ".join(str(int(values.low[i]) + int(choice)) for choice in unused[:_NAMED])
+            names = ", ".join(str(int(found.low[i]) + int(choice)) for choice in unused[:_NAMED])
             count, total = len(unused), len(counts)
             message = (
                 f"{count:,} of {total:,} choices{dimension_text(leaf, element)} never "

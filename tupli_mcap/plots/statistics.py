@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.recording.description import spread_of
+from tupli_mcap.recording.columns.statistics import ElementStatistics
 from tupli_mcap.spaces.element_names import element_names, short_path
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
@@ -17,7 +17,6 @@ __all__ = ["LARGEST", "LeafValues", "bands", "bin_edges", "drawable_numbers", "r
 
 LARGEST = 1e150  # values of larger size are not drawn: their differences are too large for a float
 MAX_ELEMENTS = 256  # of a leaf that are looked at one by one; of larger leaves, so many evenly chosen ones
-_MOST_CHOICES = 1 << 12
 _SMALLEST_PICTURE = 16  # pixels
 _TAIL = 0.002  # part of the values at either end that may be cut off
 _FAR = 4  # times the range of all others that values must reach to be cut off
@@ -37,33 +36,37 @@ class LeafValues:
     kind: "numbers" (a Box), "choices" (a Discrete, ...: `counts` are kept), "picture" (only shown in a trace),
     "variable" or "empty" (nothing is kept). elements: which of the flattened leaf are looked at; values: theirs,
     (elements, steps). nan, infinite: how many values are. mean, std, least, most: of the finite values (population
-    standard deviation), NaN where there is none. counts: of choices, how often each value occurs, from `starts` on;
-    outside: how many values are none of them. value_names: names of the values of a choice, or none.
+    standard deviation), NaN where there is none. counts: of choices, how often each value occurs, from `starts` on.
+    value_names: names of the values of a choice, or none.
     """
+
+    nan: Array = np.empty(0)
+    infinite: Array = np.empty(0)
+    mean: Array = np.empty(0)
+    std: Array = np.empty(0)
+    least: Array = np.empty(0)
+    most: Array = np.empty(0)
 
     def __init__(self, leaf: Leaf, labels: Labels, column: Array | None) -> None:
         """`column` is (steps, size); None for images and leaves of variable size."""
         self.leaf = leaf
-        choices = _choices(leaf.space)
-        self.kind: Kind = _kind(leaf, max((size for _, size in choices), default=None))
-        n = min(leaf.size, MAX_ELEMENTS) if self.kind in ("numbers", "choices") else 0
+        self.kind: Kind = _kind(leaf)
+        n = min(leaf.size, MAX_ELEMENTS) if self.kind == "numbers" else 0
         self.elements = np.linspace(0, leaf.size - 1, n).round().astype(np.int64)
         self.names = element_names(leaf, labels, self.elements.tolist())
         self.value_names = labels.values.get(leaf.path, ())
-        self.values = np.empty((0, 0)) if column is None else np.ascontiguousarray(column.T[self.elements])
-        self.nan, self.infinite = np.isnan(self.values).sum(axis=1), np.isinf(self.values).sum(axis=1)
-        spreads = [spread_of(row[np.isfinite(row)]) or [np.nan] * 5 for row in self.values]
-        self.mean, self.std, self.least, self.most, _ = np.array(spreads).reshape(n, 5).T
-        self.starts: list[int] = []
         self.counts: list[Array] = []
-        self.outside = np.zeros(n, np.int64)
-        for i, element in enumerate(self.elements.tolist() if self.kind == "choices" else ()):
-            start, size = choices[element]
-            at = self.values[i].astype(np.int64) - start
-            inside = at[(at >= 0) & (at < size)]
-            self.starts.append(start)
-            self.counts.append(np.bincount(inside, minlength=size))
-            self.outside[i] = len(at) - len(inside)
+        self.values = np.empty((0, 0)) if column is None else np.ascontiguousarray(column.T[self.elements])
+        if not n:
+            return
+        found = ElementStatistics(leaf, self.values.dtype, self.elements)
+        found.add(self.values)
+        self.nan, self.infinite, self.mean, self.std = found.nan, found.infinite, found.mean, found.std
+        self.least, self.most = (
+            np.where(found.finite, end.astype(np.float64), np.nan) for end in (found.least, found.most)
+        )
+        if found.choices:
+            self.kind, self.counts, self.starts = "choices", found.choices, found.low.tolist()
 
     def column(self, i: int) -> Array:
         """The values of element `i` that can be drawn (float64)."""
@@ -87,33 +90,23 @@ class LeafValues:
             notes.append(f"Of the {size:,} elements of {name}, {shown} at even distances are shown.")
         if (np.fmax(np.abs(self.least), np.abs(self.most)) > LARGEST).any():
             notes.append(f"{name}: values beyond {LARGEST:g} are not drawn.")
-        counted = {"NaN": self.nan, "infinite": self.infinite, "outside of the space": self.outside}
-        odd = [f"{int(counts.sum()):,} {word}" for word, counts in counted.items() if counts.any()]
+        inside = sum(int(counts.sum()) for counts in self.counts)
+        counted = {"NaN": self.nan.sum(), "infinite": self.infinite.sum()}
+        counted["outside of the space"] = self.values.size - inside if self.counts else 0
+        odd = [f"{int(count):,} {word}" for word, count in counted.items() if count]
         if odd:
             notes.append(f"{name}: {', '.join(odd)} values are left out.")
         return notes
 
 
-def _kind(leaf: Leaf, choices: int | None) -> Kind:
+def _kind(leaf: Leaf) -> Kind:
     if leaf.kind == "variable":
         return "variable"
     # Grey pictures, and stacks of them: (height, width) or (n, height, width).
     grey = leaf.dtype == np.uint8 and isinstance(leaf.space, spaces.Box) and len(leaf.shape) in (2, 3)
     if leaf.apart or (grey and leaf.size and min(leaf.shape[-2:]) >= _SMALLEST_PICTURE):
         return "picture"
-    if not leaf.size:
-        return "empty"
-    return "choices" if choices is not None and choices <= _MOST_CHOICES else "numbers"
-
-
-def _choices(space: Any) -> list[tuple[int, int]]:
-    """The first value and the number of values of each element (C order); nothing of other spaces."""
-    if isinstance(space, spaces.Discrete):
-        return [(int(space.start), int(space.n))]
-    if isinstance(space, spaces.MultiDiscrete):
-        starts = np.asarray(space.start).reshape(-1).tolist()
-        return list(zip(starts, space.nvec.reshape(-1).tolist(), strict=True))
-    return [(0, 2)] * int(np.prod(space.shape)) if isinstance(space, spaces.MultiBinary) else []
+    return "numbers" if leaf.size else "empty"
 
 
 def running_mean(values: Array, window: int) -> Array:

@@ -1,0 +1,122 @@
+"""What the values of a leaf are like, element by element, in memory that does not grow with the steps."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from tupli_mcap.arrays import Array, DType
+from tupli_mcap.spaces.leaves import Leaf
+
+__all__ = ["ElementStatistics", "columns_of", "element_bounds"]
+
+_MOST_CHOICES = 1 << 14  # of all elements together, up to which they are counted
+_NARROW = 64  # elements a step up to which a transposed copy makes reductions quicker
+_INT64_MAX = 2**63 - 1
+# bools have no range, and NumPy is slow with float16
+_WIDER: dict[str, DType] = {"bool": np.dtype(np.uint8), "float16": np.dtype(np.float32)}
+
+
+class ElementStatistics:
+    """Statistics of a leaf of constant size. Every array has an entry for each element that is looked at.
+
+    Args:
+        leaf: whose values are looked at.
+        dtype: of the values.
+        elements: of the flattened leaf (C order), those that are looked at; None: all.
+
+    Attributes:
+        low, high: the smallest and the largest value that the space allows.
+        seen: values of each element.
+        nan, infinite: how many of them are (int64).
+        least, most: of the finite values; as far apart the wrong way as can be where there is none.
+        choices: how often each value from `low` on occurs; empty for a Box, and where there are more than 16,384.
+    """
+
+    def __init__(self, leaf: Leaf, dtype: DType, elements: Array | None = None) -> None:
+        chosen: Any = slice(None) if elements is None else elements
+        self.low, self.high = (ends[chosen] for ends in element_bounds(leaf))
+        self.dtype = _WIDER.get(dtype.name, dtype)
+        size = len(self.low)
+        info: Any = np.finfo(self.dtype) if self.dtype.kind == "f" else np.iinfo(self.dtype)
+        self.seen = 0
+        self.nan, self.infinite = np.zeros(size, np.int64), np.zeros(size, np.int64)
+        self.least, self.most = np.full(size, info.max, self.dtype), np.full(size, info.min, self.dtype)
+        self._mean, self._squares = np.zeros(size), np.zeros(size)
+        counts = (
+            [] if isinstance(leaf.space, spaces.Box) else (self.high.astype(object) - self.low + 1).tolist()
+        )
+        self.choices = [np.zeros(n, np.int64) for n in counts] if sum(counts) <= _MOST_CHOICES else []
+
+    @property
+    def finite(self) -> Array:
+        """How many values are finite."""
+        found: Array = self.seen - self.nan - self.infinite
+        return found
+
+    @property
+    def mean(self) -> Array:
+        """Of the finite values; NaN where there is none."""
+        return np.where(self.finite, self._mean, np.nan)
+
+    @property
+    def std(self) -> Array:
+        """The population standard deviation of the finite values; NaN where there is none."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.sqrt(self._squares / self.finite)
+
+    def add(self, columns: Array) -> None:
+        """Takes values of each element: shape (elements, values)."""
+        if not columns.size:
+            return
+        columns, before = columns.astype(self.dtype, copy=False), self.finite
+        self.seen += columns.shape[1]
+        lowest = highest = columns
+        finite: Any = True
+        if self.dtype.kind == "f" and not (finite := np.isfinite(columns)).all():
+            nan = np.isnan(columns)
+            self.nan += nan.sum(axis=1)
+            self.infinite += (~finite & ~nan).sum(axis=1)
+            info = np.finfo(self.dtype)
+            lowest, highest = (np.where(finite, columns, end) for end in (info.max, info.min))
+        self.least = np.minimum(self.least, lowest.min(axis=1))
+        self.most = np.maximum(self.most, highest.max(axis=1))
+        self._add_moments(columns, finite, before)
+        for counts, column, low in zip(self.choices, columns, self.low, strict=False):
+            inside = column[(column >= low) & (column - low < len(counts))]
+            counts += np.bincount((inside - low).astype(np.int64), minlength=len(counts))
+
+    def _add_moments(self, columns: Array, finite: Any, before: Array) -> None:
+        """Chan, Golub and LeVeque (1983): mean and sum of squares of two sets out of those of each."""
+        count = self.finite - before
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # numbers may be too large to add
+            mean = columns.sum(axis=1, dtype=np.float64, where=finite) / count
+            squares = np.square(columns - mean[:, None]).sum(axis=1, where=finite)
+            share = np.where(count, count / self.finite, 0)
+            step = np.where(count, mean - self._mean, 0)
+            self._mean = self._mean + step * share
+            self._squares = self._squares + np.where(count, squares, 0) + step**2 * before * share
+
+
+def columns_of(values: Array) -> Array:
+    """Values of a leaf, shape (n, ...), as one row for each element: shape (elements, n)."""
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
+    return np.ascontiguousarray(flat.T) if flat.shape[1] <= _NARROW else flat.T
+
+
+def element_bounds(leaf: Leaf) -> tuple[Array, Array]:
+    """The smallest and largest value the space allows, of each element of a leaf of constant size (C order)."""
+    space = leaf.space
+    if isinstance(space, spaces.Box):
+        return space.low.reshape(-1), space.high.reshape(-1)
+    starts, counts = [0] * leaf.size, [2] * leaf.size
+    if isinstance(space, spaces.Discrete):
+        starts, counts = [int(space.start)], [int(space.n)]
+    elif isinstance(space, spaces.MultiDiscrete):
+        starts, counts = np.asarray(space.start).reshape(-1).tolist(), space.nvec.reshape(-1).tolist()
+    # As Python's integers: a file may claim choices beyond what int64 holds.
+    ends = [min(start + n - 1, _INT64_MAX) for start, n in zip(starts, counts, strict=True)]
+    return np.array([min(start, _INT64_MAX) for start in starts], np.int64), np.array(ends, np.int64)
