@@ -1,4 +1,5 @@
-"""What lies between an environment and its recorder."""
+"""`Tap`: a wrapper between an environment and its recorder, so that a recorder can be put on after a reset, and taken
+off again."""
 
 from __future__ import annotations
 

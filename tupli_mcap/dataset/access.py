@@ -1,4 +1,4 @@
-"""Steps of a dataset at random: windows, transitions, and what is drawn from them."""
+"""Random access to the steps of a dataset: windows, transitions, delta windows, and samples of them."""
 
 from __future__ import annotations
 

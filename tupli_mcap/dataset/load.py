@@ -1,4 +1,4 @@
-"""From listed episodes to columns of the steps that a tuple filter is true of, a block of episodes at a time."""
+"""Loads columns: the steps of listed episodes that pass a tuple filter, a block of episodes at a time."""
 
 from __future__ import annotations
 

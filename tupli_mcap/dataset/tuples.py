@@ -1,4 +1,4 @@
-"""Steps and episodes as objects, made of columns when they are asked for."""
+"""Steps and episodes as objects, made from columns on access."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers, times and dimensions as a message says them."""
+"""Numbers, times and dimensions as the text of a message."""
 
 from __future__ import annotations
 

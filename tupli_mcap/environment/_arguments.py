@@ -1,4 +1,4 @@
-"""What in the arguments of a spec, and in the options of a reset, is more than data, so that it needs trust."""
+"""Finds what in the arguments of a spec, and in the options of a reset, is more than data and so needs trust."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether an environment still is as its constructors left it, told from the code of its classes.
+"""Tells from the code of its classes whether an environment is still as its constructors left it.
 
 No other environment is made to compare it with. What code says of the attributes of an object is this: which
 names it assigns, and that some of them are only ever given constants or arguments of the constructor. Changed is an

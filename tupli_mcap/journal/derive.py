@@ -1,4 +1,4 @@
-"""Episodes that rows tell of: their starts and ends, made for many at a time when the rows go to the file.
+"""Derives `/episode_start`, `/episode_end` and `/final_state` from committed step rows, many episodes at a time.
 
 A plain episode (a reset without seed, options and info; an end by a flag) writes nothing of its own while it is
 recorded: its rows carry its number and its flags, and the hole after its last row the final state and the time of the

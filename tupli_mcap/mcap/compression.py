@@ -1,4 +1,4 @@
-"""Decompression that believes nothing: neither more is produced nor allocated than was announced."""
+"""Bounded decompression: never produces or allocates more than the chunk's header declares."""
 
 from __future__ import annotations
 

@@ -290,7 +290,8 @@ class Container:
     def start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], Packed]:
         """What compresses chunks of different channels, in any thread; `finish_chunks` takes what it returns.
 
-        Whatever needs the interpreter lock is done now, or then: a thread that compresses waits for it once.
+        Everything that needs the interpreter lock is done here, or in `finish_chunks`: the compressing thread takes it
+        only once.
         """
         codecs = [self.codecs.get(rows.channel) for rows in chunks] if self.codecs else ()
         if any(codecs):

@@ -1,8 +1,7 @@
-"""CRC-32 by ISA-L, which takes a third of zlib's time; by zlib on the machines that it is not made for.
+"""CRC-32 by ISA-L where there is a build of it, else by zlib.
 
-ISA-L leaves the upper halves of the vector registers in use. On Intel processors all that follows in the thread is
-slower then, the environment included (recording CartPole took 2.6 µs a step instead of 1.5), until something clears
-them: NumPy's loops do so as they end.
+End every use of ISA-L with a loop of NumPy. ISA-L leaves the upper halves of the vector registers dirty, which slows
+down everything that follows in the thread on Intel processors, the environment included; NumPy's loops clear them.
 """
 
 from __future__ import annotations

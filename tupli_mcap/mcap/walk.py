@@ -120,7 +120,9 @@ class Walk:
         self._known = dict(known or {})
         self._known_offsets = sorted(self._known)
         self._end = source.size if end is None else min(end, source.size)
-        self._budget = 4 * source.size + (64 << 20)  # bytes to be checked in vain while looking for a record
+        self._budget = 4 * source.size + (
+            64 << 20
+        )  # bytes of CRC checks for false starts while looking for a record
 
     def __iter__(self) -> Iterator[Found | Damage]:
         position = len(MAGIC)

@@ -1,4 +1,4 @@
-"""What a recording says of the program that wrote it."""
+"""The name and version of this program, as recordings give them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The topics of a recording: what each is called, and what a topic says.
+"""The topic scheme: builds the topics of a recording, and parses them.
 
 A recording of a single environment has `/step`, `/image/<leaf>`, `/camera/<name>` and `/frame/<name>`; one of several
 has those of each below `/env_<i>`. The topics of episodes and infos are those of all sub-environments.

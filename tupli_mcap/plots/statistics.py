@@ -1,4 +1,4 @@
-"""What is drawn of many numbers: the moments and counts of a leaf's values, running means, bands, and bins."""
+"""What plots draw of many numbers: statistics of a leaf, running means, bands, and bins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What there is to say about a recording without reading a step: counts, sizes, spaces, channels."""
+"""Facts about a recording that need no step: counts, sizes, spaces, channels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a file's indexes claim, held against what is there before anything is allocated or read by them."""
+"""Checks the episode index and the chunk table against the file before anything is allocated or read by them."""
 
 from __future__ import annotations
 

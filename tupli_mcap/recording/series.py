@@ -1,4 +1,4 @@
-"""A recording in a few small series of numbers: cheap enough for every look at it."""
+"""A recording summed up in a few short series of numbers, for `info`."""
 
 from __future__ import annotations
 

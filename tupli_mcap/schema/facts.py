@@ -1,4 +1,4 @@
-"""What a filter may ask of the fields of a model: keys that there are, values of their kind, and times as times."""
+"""Checks filters against a model: their keys exist, values are of the right kind, and times are compared as times."""
 
 from __future__ import annotations
 

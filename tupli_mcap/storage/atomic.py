@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all, and a lock between the processes that write them."""
+"""Writes files of a storage whole or not at all, and locks out other processes meanwhile."""
 
 from __future__ import annotations
 

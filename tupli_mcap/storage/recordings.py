@@ -39,7 +39,7 @@ __all__ = ["RecordingFiles", "episode_id"]
 
 _LIVE = -1  # in place of a stamp that must not be believed next time
 _ATTEMPTS = 100  # at a catalog that is deleted or replaced again and again
-_RESTLESS = "the catalog of {!r} is replaced all the time; try again later"
+_RESTLESS = f"the catalog of {{!r}} was replaced during each of {_ATTEMPTS} attempts; try again later"
 _TROUBLE = (CatalogMovedError, CatalogDamagedError, CatalogUnusableError)
 _OLD_CATALOG = [f"catalog.sqlite{end}" for end in ("", "-wal", "-shm", "-journal", ".lock", ".new")]
 _T = TypeVar("_T")

@@ -1,4 +1,4 @@
-"""In which order an epoch goes through its items: shuffled, and still near each other on the disk.
+"""The order of an epoch: shuffled, with items that are near each other on the disk still near each other.
 
 The blocks (chunks) of the items are shuffled, and laid out as one sequence, of which each rank has its part, and each
 stream of a rank a part of that. Within a stream, the items of `mix` blocks at a time are shuffled. Batch b of a rank is

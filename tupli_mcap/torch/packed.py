@@ -1,4 +1,4 @@
-"""Batches on their way from a worker: all their tensors in one piece of shared memory.
+"""Hands a batch from a worker to the loader: all its tensors in one piece of shared memory.
 
 PyTorch passes each tensor as a file of its own, which costs more than reading a small batch; this passes one a batch.
 """

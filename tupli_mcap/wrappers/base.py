@@ -1,4 +1,4 @@
-"""What the wrappers of one environment and of many have in common: their files, from the first to the last."""
+"""What `RecordEpisodes` for one environment and for many have in common: options, files, rotation, closing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a plain recording says of its environment: `benchmark.json`, and the pickle where it is asked for."""
+"""The attachments that describe the environment of a recording: `benchmark.json`, and a pickle on request."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Batches of items, read one after the other, some of them ahead."""
+"""Batches of items in an order, some of them read ahead."""
 
 from __future__ import annotations
 

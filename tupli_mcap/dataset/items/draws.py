@@ -1,4 +1,4 @@
-"""Numbers of items drawn without end, in batches. Seeded; they go on from a saved state."""
+"""Item numbers drawn without end, in batches: seeded, and resumable from a saved state."""
 
 from __future__ import annotations
 

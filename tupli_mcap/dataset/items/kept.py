@@ -1,4 +1,4 @@
-"""Rows by number, in any order: out of decoded columns where all of them fit into memory, else chunk by chunk."""
+"""Rows by number, in any order: from decoded columns where all fit into memory, else chunk by chunk."""
 
 from __future__ import annotations
 

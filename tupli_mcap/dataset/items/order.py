@@ -1,4 +1,4 @@
-"""Every item's number once an epoch, in batches: in order, or shuffled. Seeded; goes on from a saved state."""
+"""Every item's number once an epoch, in batches: in order or shuffled, seeded, resumable from a saved state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps read out of recordings, as they are asked for."""
+"""Reads steps by number out of recordings."""
 
 from __future__ import annotations
 

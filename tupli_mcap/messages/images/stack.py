@@ -1,4 +1,4 @@
-"""Frames of sliding windows, each stored once: in pixels here, as PNG in `pngcodec`."""
+"""Frames of sliding windows, each stored once: in pixels here, as PNG in `png`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many small tasks, done by several threads that hardly wait for each other."""
+"""Runs many small tasks on a few threads with little contention."""
 
 from __future__ import annotations
 

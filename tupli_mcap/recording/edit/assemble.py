@@ -1,4 +1,4 @@
-"""Episodes of recordings on their way into another one: rows renumbered, chunks copied where nothing changes."""
+"""Copies episodes of recordings into another one: renumbers rows, and copies chunks in which nothing changes."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ class NewFrames(Protocol):
 
 
 class Target:
-    """A recording that is put together from others.
+    """A recording that is put together from episodes of others.
 
     Attributes:
         container: what it is written to, with all its channels.
         index: the episodes so far.
         followers: companion channels to make, by step channel.
-        held: rows whose time had to be changed, for it was before that of the row ahead of it.
+        held: rows whose `log_time` was raised to that of the row ahead: times of a channel never decrease.
         copied: chunks that were copied as they are.
     """
 

@@ -63,7 +63,7 @@ def _write(
     container = Container(fd, str(path), "zstd")
     restore_container(container, contents, source)
     kept = [index for index in container.attachment_indexes if index.name not in attachments]
-    # one that is replaced and lies last is left out; elsewhere its bytes stay, and nothing names them
+    # the bytes of a replaced attachment are dropped where it is the last one; elsewhere they stay, unreferenced
     last = max(container.attachment_indexes, key=lambda index: index.offset, default=None)
     end = contents.data_end
     if last is not None and last not in kept and last.offset + last.length == end:

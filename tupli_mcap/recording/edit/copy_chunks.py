@@ -1,4 +1,4 @@
-"""Compressed chunks of a recording that another one can have as they are.
+"""Finds the compressed chunks of a recording that another one can take over unchanged.
 
 A row says which one it is (`sequence`), of which channel and of which episode; so only the first rows of a recording
 are those of another one, up to the first that is left out.

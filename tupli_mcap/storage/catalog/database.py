@@ -169,7 +169,9 @@ class Database:
                 self._opened += 1
                 return
             self._engine.dispose()  # it was replaced or deleted meanwhile
-        raise CatalogMovedError(f"catalog {str(self.path)!r} is replaced all the time")
+        raise CatalogMovedError(
+            f"catalog {str(self.path)!r} was replaced during each of {_ATTEMPTS} attempts"
+        )
 
     def _make(self) -> None:
         """Make the catalog, unless another process is first."""
