@@ -42,10 +42,10 @@ from tupli_mcap.recording import RecoveryReport
 from tupli_mcap.recording.check.signature import check_signature
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
-from tupli_mcap.recording.recover.evidence import gather
+from tupli_mcap.recording.recover.damaged import gather
+from tupli_mcap.recording.recover.episodes import NewPlaces, make_plan
+from tupli_mcap.recording.recover.evidence import Channels
 from tupli_mcap.recording.recover.file_end import Tail, read_tail
-from tupli_mcap.recording.recover.plan import NewPlaces, make_plan
-from tupli_mcap.recording.recover.segments import Channels
 from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, sign_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -537,7 +537,7 @@ def test_a_step_is_not_held_against_each_piece_of_its_episode(tmp_path: Path) ->
 
     def looked(count: int) -> int:
         places = NewPlaces(
-            whole._replace(number=i, segment=whole.segment._replace(step=Looked(10 * i), steps=6))
+            whole._replace(number=i, run=whole.run._replace(step=Looked(10 * i), steps=6))
             for i in range(count)
         )
         Looked.times = 0

@@ -61,28 +61,29 @@ class Committed(Protocol[Taken_co]):
         ...
 
 
-def rows_of(committed: Committed[Taken], in_file: int) -> Taken:
+def rows_of(committed: Committed[Taken], in_file: int, stop: int | None = None) -> Taken | None:
     """The reader's rule: of a channel with `in_file` rows in the file, those of the journal that go on with them.
 
-    Rows `in_file`, `in_file + 1`, … up to the first that is missing. All others are stale.
+    Rows `in_file`, `in_file + 1`, … up to the first that is missing, or to `stop`; None if there are none. All others
+    are stale.
     """
     start = int(np.searchsorted(committed.numbers, in_file))
-    return committed.take(np.arange(start, start + _run(committed, start, in_file)))
-
-
-def _run(committed: Committed[Any], start: int, first: int, *, torn: bool = False) -> int:
-    """How many rows from place `start` on have the numbers from `first` on; also `torn` ones, if asked for."""
-    numbers = committed.numbers[start:]
-    good = numbers == first + np.arange(len(numbers))
-    if not torn:
-        good &= committed.whole[start:]
-    return int(np.argmin(np.append(good, False)))
+    count = _run(committed.numbers[start:], in_file, committed.whole[start:])
+    count = count if stop is None else min(count, stop - in_file)
+    return committed.take(np.arange(start, start + count)) if count > 0 else None
 
 
 def torn_rows(committed: Committed[Any], in_file: int) -> int:
     """How many rows more `rows_of` would give if none were torn."""
     start = int(np.searchsorted(committed.numbers, in_file))
-    return _run(committed, start, in_file, torn=True) - _run(committed, start, in_file)
+    numbers, whole = committed.numbers[start:], committed.whole[start:]
+    return _run(numbers, in_file, np.ones_like(whole)) - _run(numbers, in_file, whole)
+
+
+def _run(numbers: Array, first: int, whole: Array) -> int:
+    """How many of the numbers are `first`, `first + 1`, …, and of whole rows."""
+    good = whole & (numbers == first + np.arange(len(numbers)))
+    return int(np.argmin(np.append(good, False)))
 
 
 def rows_among(committed: Committed[Taken], wanted: Array) -> list[Taken]:
@@ -235,7 +236,7 @@ class CommittedRecords:
         """The records at `places`."""
         chosen = [self._records[i] for i in places.tolist()]
         sizes = np.fromiter(map(len, chosen), np.uint64)
-        first = int(self.numbers[places[0]]) if chosen else 0
+        first = int(self.numbers[places[0]])
         return as_rows(self._channel, first, bytearray().join(chosen), sizes, sealed=True)
 
     @property

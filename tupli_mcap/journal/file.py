@@ -33,6 +33,7 @@ from tupli_mcap.journal.seals import boot_id, sync_directory
 from tupli_mcap.mcap.source import open_regular
 
 __all__ = [
+    "EVENT_AREAS",
     "FRAMES_AREA",
     "Journal",
     "LogArea",
@@ -424,4 +425,5 @@ def _area(entry: Mapping[str, Any]) -> Area:
     return RowArea(**values) if entry["kind"] == "rows" else LogArea(**values)
 
 
+EVENT_AREAS = "events", "info"
 FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name

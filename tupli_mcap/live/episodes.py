@@ -18,8 +18,8 @@ from tupli_mcap.mcap.records import BODY, CDR_HEADER, RECORD_HEADER
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.recover.episodes import Unwritten
-from tupli_mcap.recording.recover.step_runs import Run, runs_in
+from tupli_mcap.recording.recover.evidence import Evidence
+from tupli_mcap.recording.recover.step_runs import StepRun, runs_in
 
 if TYPE_CHECKING:
     from tupli_mcap.live.follow import NewSteps
@@ -77,16 +77,14 @@ class EpisodeNews:
         self._new_rows, self._seen = new_rows, seen
         self._earlier = seen.get(self._end, 0)
         self._starts, self._ends = _Shown(), _Shown()
-        self._last: dict[
-            int, tuple[int, Run]
-        ] = {}  # by sub-environment: the row after its last run, and that run
-        self._waiting: dict[int, tuple[int, Run]] = {}  # episodes that have ended: sub-environment, and rows
+        self._last: dict[int, StepRun] = {}  # by sub-environment
+        self._waiting: dict[int, StepRun] = {}  # episodes that have ended
         self.count = 0  # ended episodes
 
     def look(
         self,
         store: ChunkStore,
-        tail: Unwritten,
+        evidence: Evidence,
         steps: Sequence[NewSteps],
         counts: Sequence[int],
         *,
@@ -108,13 +106,13 @@ class EpisodeNews:
         }
         self._made: list[tuple[int, int, bytes]] = []
         before, self._waiting = self._waiting, {}
-        made = [self._make_end(tail, number, *before[number], counts) for number in before]
+        made = [self._make_end(evidence, run, counts) for run in before.values()]
         for new in steps:
             for run in self._whole_runs(new):
                 if run.row >= new.first:
-                    self._make_start(tail, new.env, run)
+                    self._make_start(evidence, run)
                 if run.terminal or run.timeout:
-                    made.append(self._make_end(tail, run.episode, new.env, run, None))
+                    made.append(self._make_end(evidence, run, None))
         self.count = store.count(self._end) - self._earlier + len(self._ends.ahead)
         fresh = ends[~np.isin(ends["episode"], list(known))]
         return np.concatenate([fresh, np.array([end for end in made if end is not None], _ENDS)])
@@ -129,37 +127,35 @@ class EpisodeNews:
             parts.append(each[places[span.begin : span.end, 0]])
         return np.concatenate(parts)
 
-    def _whole_runs(self, new: NewSteps) -> Iterator[Run]:
+    def _whole_runs(self, new: NewSteps) -> Iterator[StepRun]:
         """The rows of each episode so far, where all of them were looked at."""
-        stop, last = self._last.get(new.env, (-1, None))
-        for run in runs_in(new.facts, new.first, last if stop == new.first else None):
-            self._last[new.env] = new.first + len(new), run
-            at = max(0, run.row - new.first)
-            if run.row == new.first + at - int(new.facts.step[at]):
+        for run in runs_in(new.facts, new.env, new.first, self._last.get(new.env)):
+            self._last[new.env] = run
+            if run.step == 0:
                 yield run
 
-    def _make_start(self, tail: Unwritten, env: int, run: Run) -> None:
-        hole = tail.finals.get((env, run.row))
+    def _make_start(self, evidence: Evidence, run: StepRun) -> None:
+        hole = evidence.finals.get((run.env, run.row))
         if hole is not None and run.episode not in self._starts:
-            start = EpisodeStart(run.episode, env, run.row, False, False, "", "", "{}")
+            start = EpisodeStart(run.episode, run.env, run.row, False, False, "", "", "{}")
             self._made.append((self._start, hole.time_ns, CDR_HEADER + start.encode()))
             self._starts.ahead.add(run.episode)
 
     def _make_end(
-        self, tail: Unwritten, number: int, env: int, run: Run, counts: Sequence[int] | None
+        self, evidence: Evidence, run: StepRun, counts: Sequence[int] | None
     ) -> tuple[int, int, int, int, float] | None:
         """The end of an episode, and its final state. None if there is none to be made, or not yet; `counts` at the
         second look."""
+        number, env = run.episode, run.env
         if number in self._ends:
             return None
-        stop = run.row + run.steps
-        hole, state = tail.finals.get((env, stop)), None
+        hole, state = evidence.finals.get((env, run.stop)), None
         if hole is not None:
             state = hole.state
         elif counts is None:
-            self._waiting[number] = env, run
-        elif counts[env] == stop:
-            state = tail.pending.get(env)
+            self._waiting[number] = run
+        elif counts[env] == run.stop:
+            state = evidence.states.get(env)
         if state is None:
             return None
         facts = number, env, run.row, run.steps, run.total

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,13 +39,14 @@ from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics, parse
-from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.contents import RECORDING_METADATA, check_metadata, step_channels
+from tupli_mcap.recording.contents import check_metadata, step_channels
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recover.episodes import Unwritten, chunk_table
-from tupli_mcap.recording.recover.prefix import Scan, scan
+from tupli_mcap.recording.recover.add_journal import define, take_rows
+from tupli_mcap.recording.recover.evidence import Channels, Evidence, Piece
+from tupli_mcap.recording.recover.file_end import Tail
+from tupli_mcap.recording.recover.find_journal import belongs
+from tupli_mcap.recording.recover.prefix import prefix
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
-from tupli_mcap.recording.recover.unfinished import add_unwritten, belongs, define
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
 
 __all__ = ["Follower", "NewInfo", "NewSteps", "follow"]
@@ -56,7 +56,6 @@ _STEPS = 5000  # of a sub-environment at a time, the newest
 _DECODED = 200  # the same where each message is decoded on its own
 _EPISODES = 1000  # whose begin is known
 _CHUNKS = 8  # of each channel, at hand
-_CACHE = 64 << 20
 _HEADER = RECORD_HEADER.size
 _PAIR = struct.Struct("<II")  # episode and step, with which the messages of infos and frames begin
 
@@ -106,15 +105,17 @@ class NewInfo(NamedTuple):
 
 
 class _GrowingFile:
-    """The newest chunks of a file that grows, as their heads and message indexes say; `found` has the rows of each
-    channel. `earlier` are those before offset `begin`."""
+    """The newest chunks of a file that grows, as their heads and message indexes say.
 
-    def __init__(self, source: Source, found: Scan, begin: int) -> None:
-        self._source, self.found = source, found
-        self._position = found.end
-        self._chunks: dict[int, list[tuple[int, ...]]] = {}  # by channel
+    `earlier` has the rows of each channel before offset `begin`; `position` is where the records that are known begin.
+    """
+
+    def __init__(self, source: Source, position: int, begin: int) -> None:
+        self._source = source
+        self._position = position
+        self._pieces: dict[int, list[Piece]] = {}  # by channel
         self.read_on(begin)
-        self.earlier = dict(found.counts)
+        self.earlier = {channel: pieces[-1].stop for channel, pieces in self._pieces.items()}
 
     def read_on(self, end: int | None = None) -> None:
         """Takes note of the chunks that have come."""
@@ -143,27 +144,32 @@ class _GrowingFile:
         _, _, channel, entries = MESSAGE_INDEX.unpack(self._source.read(index, MESSAGE_INDEX.size))
         # the first entry says where the first message begins, behind the definitions
         skip = int.from_bytes(self._source.read(index + MESSAGE_INDEX.size + 8, 8), "little")
-        first, rows = self.found.counts.get(channel, 0), entries // 16
-        self.found.counts[channel] = first + rows
-        chunks = self._chunks.setdefault(channel, [])
+        pieces = self._pieces.setdefault(channel, [])
+        first, rows = pieces[-1].stop if pieces else 0, entries // 16
         method = COMPRESSIONS.index(name)
-        chunks.append((chunk, length + RECORD.size, size, first, rows, skip, crc, channel, method, 0))
-        if len(chunks) > _CHUNKS:  # the oldest ones become one that nobody reads
-            chunks[:2] = [(0, 0, 0, 0, chunks[0][4] + chunks[1][4], 0, 0, channel, 0, 0)]
+        entry = chunk, length + RECORD.size, size, first, rows, skip, crc, channel, method, 0
+        pieces.append(Piece(first, rows, entry))
+        if len(pieces) > _CHUNKS:  # the oldest ones become one that nobody reads
+            pieces[:2] = [_unread(channel, 0, pieces[1].stop)]
 
-    def found_beyond(self, seen: Mapping[int, int]) -> Scan:
+    def evidence(self, seen: Mapping[int, int]) -> Evidence:
         """As if the rows that were looked at were in the file: they are not taken out of the journal once more."""
-        counts, chunks = dict(self.found.counts), [row for rows in self._chunks.values() for row in rows]
+        evidence = Evidence(self._source, Tail(), strict=True, good_end=self._source.size)
+        evidence.pieces = {channel: list(pieces) for channel, pieces in self._pieces.items()}
         for channel, count in seen.items():
-            first = counts.get(channel, 0)
-            if count > first:
-                chunks.append((0, 0, 0, first, count - first, 0, 0, channel, 0, 0))
-                counts[channel] = count
-        return replace(self.found, chunks=chunks, counts=counts)
+            stop = evidence.stop(channel)
+            if count > stop:
+                evidence.pieces.setdefault(channel, []).append(_unread(channel, stop, count))
+        return evidence
 
     def at_hand(self, channel: int) -> int:
         """The first row of a channel in the chunks that can be read."""
-        return next((row[3] for row in self._chunks.get(channel, []) if row[0]), 0)
+        return next((piece.first for piece in self._pieces.get(channel, []) if piece.entry[0]), 0)
+
+
+def _unread(channel: int, first: int, stop: int) -> Piece:
+    """Rows in a chunk that is nowhere."""
+    return Piece(first, stop - first, (0, 0, 0, first, stop - first, 0, 0, channel, 0, 0))
 
 
 class Follower:
@@ -174,7 +180,7 @@ class Follower:
         steps: the step channels of the sub-environments that are looked at.
     """
 
-    def __init__(self, source: PathSource, metadata: Mapping[str, str], found: Scan, begin: int) -> None:
+    def __init__(self, source: PathSource, metadata: Mapping[str, str], found: Evidence, begin: int) -> None:
         self.is_over = False
         self.channels, self.schemas = found.channels, found.schemas
         self.topics = {channel.topic: number for number, channel in found.channels.items()}
@@ -190,7 +196,8 @@ class Follower:
         self._of_env = [Topics.of_step(channel.topic) for channel in channels]
         self._codecs = image_codecs(layout, found.channels)
         self._source, self._metadata = source, metadata
-        self._file = _GrowingFile(source, found, begin)
+        self._known = Channels.of(found, layout)._replace(steps=self.steps)
+        self._file = _GrowingFile(source, found.good_end, begin)
         self._seen = dict(self._file.earlier)  # rows of each channel
         envs = range(len(self.steps))
         self._areas = {"steps", "events", "info"}
@@ -215,17 +222,16 @@ class Follower:
 
     def look(self) -> tuple[list[NewSteps], Array]:
         """The newest of the new steps by sub-environment, and the new ends of episodes (see `EpisodeNews`)."""
-        journal, tail = _journal_of(self._source, self._metadata, self._areas), Unwritten()
+        journal = _journal_of(self._source, self._metadata, self._areas)
         self._file.read_on()
-        found = self._file.found_beyond({channel: self._seen.get(channel, 0) for channel in self._logs})
+        evidence = self._file.evidence({channel: self._seen.get(channel, 0) for channel in self._logs})
         if journal is not None:
-            add_unwritten(self._source, found, journal, self.layout, self.steps, tail)
-        rows = [bytes(one.data) for one in tail.rows]
-        self._store = ChunkStore(self._source, chunk_table(found, tail.rows), rows, _CACHE)
+            take_rows(evidence, journal, self.layout, self._known)
+        self._store = evidence.store()
         self._store.codecs = self._codecs
         steps = [new for env in range(len(self.steps)) if len(new := self._new_steps(env))]
         counts = [self._store.count(channel) for channel in self.steps]
-        return steps, self._news.look(self._store, tail, steps, counts, is_over=self.is_over)
+        return steps, self._news.look(self._store, evidence, steps, counts, is_over=self.is_over)
 
     def _new_rows(self, channel: int, most: int | None = None) -> range:
         """The rows of a channel, or the newest of them, that were not looked at; now they are."""
@@ -328,13 +334,13 @@ def follow(path: Path, uuid: str, begin: int) -> Follower | None:
         source = PathSource(path)
     except RecordingError:  # no step was recorded
         return None
-    found = scan(source, only_metadata=True)
-    told = found.metadata.get(RECORDING_METADATA, {})
+    found = prefix(source, only_metadata=True)
+    told = found.metadata or {}
     if told.get("uuid") == uuid:
         metadata = check_metadata(source, told)
         journal = _journal_of(source, metadata, ())
         if journal is not None:  # that of every recorder at work defines the channels, later the summary does
-            define(found.schemas, found.channels, journal, source.name)
+            define(found, journal)
         elif has_summary(source) and not is_locked(path):
             summary = read_summary(source)
             found.schemas, found.channels = summary.schemas, summary.channels

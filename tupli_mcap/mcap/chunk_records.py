@@ -121,9 +121,12 @@ def message_places(data: Any, most: int | None = None) -> Array:
 
 def messages(data: memoryview) -> Iterator[tuple[int, memoryview]]:
     """(log_time, CDR body) of consecutive Message records; FormatError before the first one for bytes that are none."""
-    for header in message_headers(data):
-        start = int(header["#offset"])
-        yield int(header["#log_time"]), data[start + BODY : start + 9 + int(header["#length"])]
+    headers = message_headers(data)
+    for begin in range(0, len(headers), _BLOCK):
+        part = headers[begin : begin + _BLOCK]
+        columns = (part[name].tolist() for name in ("#log_time", "#offset", "#length"))
+        for log_time, start, length in zip(*columns, strict=True):
+            yield log_time, data[start + BODY : start + 9 + length]
 
 
 def _too_many(most: int | None) -> FormatError:

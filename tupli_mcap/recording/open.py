@@ -43,7 +43,8 @@ def read_contents(source: Source) -> Contents:
 def _read_contents(source: Source) -> Contents:
     check_magic(source)
     if not has_summary(source):
-        from tupli_mcap.recording.recover.unfinished import find_journal, recover_contents
+        from tupli_mcap.recording.recover.find_journal import find_journal
+        from tupli_mcap.recording.recover.unfinished import recover_contents
 
         journal = find_journal(source)  # a writer that closed in between has left a summary, and no journal
         if not has_summary(source):

@@ -25,10 +25,11 @@ from tupli_mcap.recording.edit.write_repaired import RepairWriter
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.add_journal import add_journal
-from tupli_mcap.recording.recover.evidence import Gathered, gather, is_recording, may_be_recording
+from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording
+from tupli_mcap.recording.recover.episodes import Plan, make_plan
+from tupli_mcap.recording.recover.evidence import Channels, Evidence
 from tupli_mcap.recording.recover.file_end import read_tail
-from tupli_mcap.recording.recover.plan import Plan, make_plan
-from tupli_mcap.recording.recover.segments import Channels
+from tupli_mcap.recording.recover.losses import losses
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
 __all__ = ["CutEpisode", "DamagedPlace", "LostSteps", "RecoveryReport", "recover_recording", "recovered_path"]
@@ -215,106 +216,104 @@ def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") 
     if not source.size:
         raise FormatError(f"{source.name} is empty: nothing can be saved from it; delete it")
     tail = read_tail(source)
-    gathered = gather(source, tail) if may_be_recording(source, tail) else None
-    if gathered is None or not is_recording(gathered):
+    evidence = gather(source, tail) if may_be_recording(source, tail) else None
+    if evidence is None or not is_recording(evidence):
         raise FormatError(f"{source.name} holds nothing of a tupli_mcap recording ({OTHER_TOOLS})")
-    gathered.attachments.pop(leave_out, None)
-    add_journal(gathered)
-    return _recover_ours(gathered, _layout(gathered), Container(fd, source.name, compression))
+    evidence.attachments.pop(leave_out, None)
+    add_journal(evidence)
+    return _recover_ours(evidence, _layout(evidence), Container(fd, source.name, compression))
 
 
-def _layout(gathered: Gathered) -> tuple[StepLayout, Channels] | None:
+def _layout(evidence: Evidence) -> tuple[StepLayout, Channels] | None:
     """The layout and the channels; None if the recording has no step channel and no rows.
 
     Raises:
         FormatError: the spaces are lost, so that its rows cannot be understood.
     """
-    name = gathered.source.name
+    name = evidence.source.name
     advice = 'nothing can be saved as a recording ("mcap recover" copies the messages as they are)'
     try:
-        steps = step_channels(gathered.channels, name)
+        steps = step_channels(evidence.channels, name)
         if steps:
             layout = StepLayout.from_metadata(steps[0].metadata)
-            return layout, Channels.of(gathered, layout)
+            return layout, Channels.of(evidence, layout)
     except FormatError as err:
         raise FormatError(f"{name}: the spaces of the recording are damaged ({err}); {advice}") from err
-    if gathered.pieces:
+    if evidence.pieces:
         raise FormatError(f"{name}: the spaces of the recording are lost; {advice}")
     return None
 
 
 def _recover_ours(
-    gathered: Gathered, known: tuple[StepLayout, Channels] | None, container: Container
+    evidence: Evidence, known: tuple[StepLayout, Channels] | None, container: Container
 ) -> RecoveryReport:
     report = RecoveryReport(
-        gathered.source.name,
-        finished=gathered.tail.finished,
-        journal=gathered.journal,
-        notes=[*gathered.tail.why, *gathered.notes],
+        evidence.source.name,
+        finished=evidence.tail.finished,
+        journal=evidence.journal,
+        notes=[*evidence.tail.why, *evidence.notes],
     )
-    writer = RepairWriter(container, gathered)
+    writer = RepairWriter(container, evidence)
     if known is None:
         writer.begin(None)
     else:
         layout, channels = known
-        store = gathered.store()
-        plan = make_plan(gathered, store, layout, channels)
+        store = evidence.store()
+        plan = make_plan(evidence, store, layout, channels)
         writer.begin(plan.next_episode)
         writer.steps(layout, channels, plan, store)
         _report_plan(report, plan)
-        report.infos_lost = _infos_lost(gathered, channels)
-        vector = Topics.of_step(gathered.channels[channels.steps[0]].topic).is_vector
-        report.frames_lost = frames_lost(gathered, OldCameras.of(gathered, len(channels.steps), vector))
+        report.infos_lost = _infos_lost(evidence, channels)
+        vector = Topics.of_step(evidence.channels[channels.steps[0]].topic).is_vector
+        report.frames_lost = frames_lost(evidence, OldCameras.of(evidence, len(channels.steps), vector))
     writer.finish()
-    if gathered.metadata is None:
+    if evidence.metadata is None:
         report.notes.append("the recording's metadata are lost: it has a new uuid and names no benchmark")
     elif writer.metadata_lost:
         report.notes.append(f"of the recording's metadata, {', '.join(writer.metadata_lost)} are lost")
-    report.damaged = [*_ends(gathered), *_places(gathered.damages)]
+    report.damaged = [*_ends(evidence), *_places(evidence.damages)]
     report.messages = sum(container.counts.values())
     report.attachments = len(container.attachment_indexes) - 1
-    report.attachments_lost = _attachments_lost(gathered)
+    report.attachments_lost = _attachments_lost(evidence)
     return report
 
 
 def _report_plan(report: RecoveryReport, plan: Plan) -> None:
-    kept = {episode.segment.episode for episode in plan.episodes}
-    report.episodes, report.steps = len(plan.episodes), sum(e.segment.steps for e in plan.episodes)
-    report.steps_lost = plan.lost_rows
-    report.lost = [LostSteps(n, *steps) for n, ranges in sorted(plan.lost.items()) for steps in ranges]
-    report.episodes_lost = len(set(plan.lost) - kept)
+    kept, lost = {episode.run.episode for episode in plan.episodes}, losses(plan)
+    report.episodes, report.steps = len(plan.episodes), sum(e.run.steps for e in plan.episodes)
+    report.steps_lost = lost.rows
+    report.lost = [LostSteps(n, *steps) for n, ranges in sorted(lost.steps.items()) for steps in ranges]
+    report.episodes_lost = len(set(lost.steps) - kept)
     report.cut = [
-        CutEpisode(e.segment.episode, e.segment.step, e.segment.steps, e.number)
-        for e in plan.episodes
-        if not e.whole
+        CutEpisode(e.run.episode, e.run.step, e.run.steps, e.number) for e in plan.episodes if not e.whole
     ]
     report.starts_lost, report.ends_lost = plan.lost_starts, plan.lost_ends
     report.final_states_lost = plan.lost_finals
 
 
-def _infos_lost(gathered: Gathered, channels: Channels) -> int:
+def _infos_lost(evidence: Evidence, channels: Channels) -> int:
     """Rows missing in `/info`, as far as can be told."""
     if channels.info is None:
         return 0
-    ranges = gathered.ranges(channels.info)
+    ranges = evidence.ranges(channels.info)
     stop = ranges[-1][1] if ranges else 0
-    if gathered.tail.index is not None:
-        table = gathered.tail.index.chunks
+    if evidence.tail.index is not None:
+        table = evidence.tail.index.chunks
         stop = max(stop, int(table["rows"][table["channel"] == channels.info].sum()))
     return stop - sum(b - a for a, b in ranges)
 
 
-def _attachments_lost(gathered: Gathered) -> list[str]:
+def _attachments_lost(evidence: Evidence) -> list[str]:
     """Names of the attachments that are not here, as far as anything tells."""
-    summary = gathered.tail.summary
+    summary = evidence.tail.summary
     known = set() if summary is None else set(summary.attachments)
-    known |= {attachment_name(gathered.source, damage) or INDEX_NAME for damage in gathered.damages}
-    return sorted(known - set(gathered.attachments) - {INDEX_NAME})
+    known |= {attachment_name(evidence.source, damage) or INDEX_NAME for damage in evidence.damages}
+    return sorted(known - set(evidence.attachments) - {INDEX_NAME})
 
 
-def _ends(gathered: Gathered) -> list[DamagedPlace]:
+def _ends(evidence: Evidence) -> list[DamagedPlace]:
     """Damage of the first and the last bytes of the file, from which nothing is taken."""
-    source, tail = gathered.source, gathered.tail
+    source, tail = evidence.source, evidence.tail
     found = []
     if source.read(0, min(len(MAGIC), source.size)) != MAGIC:
         found.append(DamagedPlace(0, min(len(MAGIC), source.size), "expected the magic of MCAP"))

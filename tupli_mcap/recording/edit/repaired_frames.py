@@ -17,9 +17,9 @@ from tupli_mcap.messages.frames import (
     camera_names,
     encode_pair,
 )
-from tupli_mcap.recording.recover.evidence import Gathered, PackedStore
-from tupli_mcap.recording.recover.plan import NewPlaces, PlannedEpisode
-from tupli_mcap.recording.recover.segments import intersection, message_at
+from tupli_mcap.recording.recover.episodes import NewPlaces, PlannedEpisode
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore
+from tupli_mcap.recording.recover.step_runs import intersection
 
 __all__ = ["OldCameras", "frames_lost", "kept_frames"]
 
@@ -39,32 +39,32 @@ class OldCameras(NamedTuple):
     ids: tuple[tuple[tuple[int, int], ...], ...]
 
     @classmethod
-    def of(cls, gathered: Gathered, num_envs: int, vector: bool) -> OldCameras:
+    def of(cls, evidence: Evidence, num_envs: int, vector: bool) -> OldCameras:
         """The cameras of which all channels are known, with the schemas they must have."""
-        topics = {channel.topic: channel for channel in gathered.channels.values()}
+        topics = {channel.topic: channel for channel in evidence.channels.values()}
         found: dict[str, tuple[tuple[int, int], ...]] = {}
         for name in camera_names({topic: channel.id for topic, channel in topics.items()}):
             pairs = [CameraTopics.of(name, env if vector else None) for env in range(num_envs)]
             known = [(topics.get(pair.camera), topics.get(pair.frame)) for pair in pairs]
             ids = tuple((a.id, b.id) for a, b in known if a is not None and b is not None)
-            if len(ids) == num_envs and all(_fits(gathered, *pair) for pair in known):
+            if len(ids) == num_envs and all(_fits(evidence, *pair) for pair in known):
                 found[name] = ids
         return cls(tuple(found), tuple(found.values()))
 
 
-def _fits(gathered: Gathered, camera: Channel | None, frame: Channel | None) -> bool:
+def _fits(evidence: Evidence, camera: Channel | None, frame: Channel | None) -> bool:
     wanted = ((camera, CAMERA_NAME, CAMERA_SCHEMA), (frame, FRAME_NAME, FRAME_SCHEMA))
-    schemas = [(gathered.schemas.get(c.schema_id), name, text) for c, name, text in wanted if c is not None]
+    schemas = [(evidence.schemas.get(c.schema_id), name, text) for c, name, text in wanted if c is not None]
     return all(s is not None and (s.name, s.data) == (name, text.encode()) for s, name, text in schemas)
 
 
 def kept_frames(
-    gathered: Gathered, store: PackedStore, ids: tuple[int, int], episodes: Sequence[PlannedEpisode]
+    evidence: Evidence, store: PackedStore, ids: tuple[int, int], episodes: Sequence[PlannedEpisode]
 ) -> Iterator[KeptFrame]:
     """The frames of a sub-environment's episodes, with the numbers that these have now."""
     camera, frame = ids
     pieces = NewPlaces(episodes)
-    for first, stop in intersection(gathered.ranges(camera), gathered.ranges(frame)):
+    for first, stop in intersection(evidence.ranges(camera), evidence.ranges(frame)):
         for span in store.spans(frame, store.packed(frame, first), stop - first):
             rows = store.rows(span.chunk, FRAME_LAYOUT.dtype)[span.begin : span.end]
             numbers = rows["#sequence"].tolist()
@@ -74,18 +74,18 @@ def kept_frames(
             for row, number, step, time_ns in values:
                 found = pieces.find(number, step, state=True)
                 if found is not None:
-                    picture = message_at(store, camera, store.packed(camera, row))
+                    picture = store.message(camera, store.packed(camera, row))
                     yield KeptFrame(int(time_ns), picture, encode_pair(*found))
 
 
-def frames_lost(gathered: Gathered, cameras: OldCameras) -> int:
+def frames_lost(evidence: Evidence, cameras: OldCameras) -> int:
     """Frames that are known to have been there and are not here whole."""
     lost = 0
     for pair in (pair for ids in cameras.ids for pair in ids):
-        here = intersection(*(gathered.ranges(channel) for channel in pair))
-        stops = [ranges[-1][1] for ranges in map(gathered.ranges, pair) if ranges]
-        if gathered.tail.index is not None:
-            table = gathered.tail.index.chunks
+        here = intersection(*(evidence.ranges(channel) for channel in pair))
+        stops = [ranges[-1][1] for ranges in map(evidence.ranges, pair) if ranges]
+        if evidence.tail.index is not None:
+            table = evidence.tail.index.chunks
             stops += [int(table["rows"][table["channel"] == channel].sum()) for channel in pair]
         lost += max(stops, default=0) - sum(b - a for a, b in here)
     return lost

@@ -23,13 +23,13 @@ from tupli_mcap.messages.frames import CameraTopics
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
+from tupli_mcap.recording.channels import Channels as NewChannels
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.repaired_frames import OldCameras, kept_frames
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.recover.evidence import Gathered, PackedStore
-from tupli_mcap.recording.recover.plan import IN_A_HOLE, RUNNING, NewPlaces, Plan, PlannedEpisode
-from tupli_mcap.recording.recover.segments import Channels, message_at, messages
+from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
+from tupli_mcap.recording.recover.evidence import Channels, Evidence, PackedStore
 
 __all__ = ["RECOVERED", "RepairWriter"]
 
@@ -46,20 +46,18 @@ _COPY = 1 << 20
 
 
 class RepairWriter:
-    """Writes one repaired recording; `infos_kept` counts the infos that belong to steps that are kept."""
+    """Writes one repaired recording."""
 
-    def __init__(self, container: Container, gathered: Gathered) -> None:
+    def __init__(self, container: Container, evidence: Evidence) -> None:
         self._container = container
-        self._gathered = gathered
+        self._evidence = evidence
         self._now = time.time_ns()
         self._index = IndexBuilder()
-        self.infos_kept = 0
         self.metadata_lost: list[str] = []
-        self.finals_kept = 0
 
     def begin(self, next_episode: int | None) -> None:
         """Magic, header, metadata and the attachments that are good. No later episode gets a number that was lost."""
-        container, found = self._container, self._gathered
+        container, found = self._container, self._evidence
         container.start(library())
         metadata = self._metadata_of_recording()
         if next_episode is not None:
@@ -74,11 +72,11 @@ class RepairWriter:
 
     def _metadata_of_recording(self) -> dict[str, str]:
         """The recording's metadata; what is lost or damaged of it is made anew."""
-        known = self._gathered.metadata or {}
+        known = self._evidence.metadata or {}
         found = {key: value for key, value in known.items() if key not in ("journal", "replaced")}
         made = {
             "uuid": uuid.uuid4().hex,
-            "format_version": "2" if uses_codecs(self._gathered.channels) else "1",
+            "format_version": "2" if uses_codecs(self._evidence.channels) else "1",
             "library": library(),
             "created_ns": str(self._now),
             "benchmark_id": "",
@@ -91,13 +89,13 @@ class RepairWriter:
 
     def steps(self, layout: StepLayout, old: Channels, plan: Plan, store: PackedStore) -> None:
         """Every message of the episodes that are kept."""
-        channels = self._gathered.channels
+        channels = self._evidence.channels
         vector = Topics.of_step(channels[old.steps[0]].topic).is_vector
         info = None
         if old.info is not None:
-            schema = self._gathered.schemas.get(channels[old.info].schema_id)
+            schema = self._evidence.schemas.get(channels[old.info].schema_id)
             info = None if schema is None else (schema.data.decode(), channels[old.info].metadata)
-        cameras = OldCameras.of(self._gathered, len(old.steps), vector)
+        cameras = OldCameras.of(self._evidence, len(old.steps), vector)
         envs = len(old.steps) if vector else None
         store.codecs = image_codecs(layout, channels)
         new = register_channels(
@@ -114,13 +112,13 @@ class RepairWriter:
         dtype = layout.step_message.dtype if layout.constant else None
         of: dict[int, list[PlannedEpisode]] = {}
         for episode in plan.episodes:
-            of.setdefault(episode.segment.env, []).append(episode)
+            of.setdefault(episode.run.env, []).append(episode)
         for env, channel in enumerate(old.steps):
             mine = of.get(env, [])
             at = 0
             for episode in mine:
                 rows[episode.number] = at
-                at += episode.segment.steps
+                at += episode.run.steps
             self._copy(store, channel, new.steps[env], mine, dtype, patch=True)
             for leaf, ids in zip(layout.images, new.images, strict=True):
                 image = old.images[leaf.name][env]
@@ -140,7 +138,7 @@ class RepairWriter:
         self, store: PackedStore, old: tuple[int, int], new: tuple[int, int], episodes: list[PlannedEpisode]
     ) -> None:
         """The frames of one camera, which keep their times."""
-        found = partial(kept_frames, self._gathered, store, old, episodes)
+        found = partial(kept_frames, self._evidence, store, old, episodes)
         self._put(new[0], ((frame.time_ns, frame.picture) for frame in found()))
         self._put(new[1], ((frame.time_ns, frame.pair) for frame in found()))
 
@@ -169,14 +167,14 @@ class RepairWriter:
         batch: list[bytes] = []
         size = written = 0
         for episode in episodes:
-            segment = episode.segment
-            for span in store.spans(old, store.packed(old, segment.row), segment.steps):
+            run = episode.run
+            for span in store.spans(old, store.packed(old, run.row), run.steps):
                 part = store.rows(span.chunk, dtype, keep=True)[span.begin : span.end]
                 data = bytearray(part.tobytes())
                 rows = np.frombuffer(data, dtype)
-                if patch and not (episode.head and episode.number == segment.episode):
+                if patch and not (episode.head and episode.number == run.episode):
                     rows["episode"] = episode.number
-                    rows["step"] -= segment.step
+                    rows["step"] -= run.step
                 batch.append(bytes(data))
                 size += len(data)
                 if size >= _CHUNK:
@@ -198,9 +196,9 @@ class RepairWriter:
         self, store: PackedStore, channel: int, episodes: Iterable[PlannedEpisode]
     ) -> Iterator[tuple[int, bytes]]:
         for episode in episodes:
-            segment = episode.segment
+            run = episode.run
             step = 0
-            for span in store.spans(channel, store.packed(channel, segment.row), segment.steps):
+            for span in store.spans(channel, store.packed(channel, run.row), run.steps):
                 for log_time, body in store.messages_of(span):
                     numbers = episode.number.to_bytes(4, "little") + step.to_bytes(4, "little")
                     yield log_time, numbers + bytes(body[8:])
@@ -229,43 +227,42 @@ class RepairWriter:
         store: PackedStore,
         layout: StepLayout,
         old: Channels,
-        new: Any,
+        new: NewChannels,
         plan: Plan,
         rows: dict[int, int],
     ) -> None:
-        starts = sorted(plan.episodes, key=lambda e: (e.start[0], e.number))
-        ends = sorted(plan.episodes, key=lambda e: (e.end[0], e.number))
+        starts = sorted(plan.episodes, key=lambda e: (e.start.time, e.number))
+        ends = sorted(plan.episodes, key=lambda e: (e.end.time, e.number))
         counts = itertools.accumulate(len(e.resets) + 1 for e in starts)
         start_rows = {e.number: count - 1 for e, count in zip(starts, counts, strict=True)}
         end_rows = {e.number: i for i, e in enumerate(ends)}
         with_final = [e for e in ends if e.final is not None]
         final_rows = {e.number: i for i, e in enumerate(with_final)}
-        self.finals_kept = len(with_final)
-        last = {e.segment.episode: e.number for e in plan.episodes}
+        last = {e.run.episode: e.number for e in plan.episodes}
         moved = {}
         for episode in plan.episodes:
             first = rows[episode.number]
-            text = self._metadata(episode, last[episode.segment.episode] == episode.number)
-            end = episode.end[1]._replace(first_row=first, metadata=text)
-            start = episode.start[1]._replace(first_row=first)
-            moved[episode.number] = (start, end)
+            text = self._metadata(episode, last[episode.run.episode] == episode.number)
+            end = episode.end.end._replace(first_row=first, metadata=text)
+            moved[episode.number] = end
             self._index.add(
-                first, end.length, end.episode_return, episode.start[0], episode.end[0], start.seed_number,
+                first, end.length, end.episode_return, episode.start.time, episode.end.time,
+                episode.start.start.seed_number,
                 start_rows[end.episode], end_rows[end.episode], final_rows.get(end.episode, -1),
                 end.episode, end.env, end.end, text,
             )  # fmt: skip
-        resets = {
-            e.number: [(time, reset._replace(first_row=rows[e.number])) for time, reset in e.resets]
+        told = (
+            (time, start._replace(first_row=rows[e.number]).encode())
             for e in starts
-        }
-        told = ([*resets[e.number], (e.start[0], moved[e.number][0])] for e in starts)
-        self._put(new.start, ((time, start.encode()) for found in told for time, start in found))
-        self._put(new.end, ((e.end[0], moved[e.number][1].encode()) for e in ends))
-        self._put(new.final_state, ((e.end[0], self._final(e, store, old)) for e in with_final))
+            for time, start, _ in (*e.resets, e.start)
+        )
+        self._put(new.start, told)
+        self._put(new.end, ((e.end.time, moved[e.number].encode()) for e in ends))
+        self._put(new.final_state, ((e.end.time, self._final(e, store, old)) for e in with_final))
 
     def _metadata(self, episode: PlannedEpisode, last: bool) -> str:
         """The metadata of the old episode where its end is here, and where the steps of a piece were."""
-        text = episode.end[1].metadata
+        text = episode.end.end.metadata
         if episode.whole:
             return text
         try:
@@ -274,8 +271,8 @@ class RepairWriter:
             found = {}
         values: dict[str, Any] = found if isinstance(found, dict) else {}
         origin: dict[str, Any] = {
-            "episode": episode.segment.episode,
-            "first_step": episode.segment.step,
+            "episode": episode.run.episode,
+            "first_step": episode.run.step,
             "length": episode.length,
         }
         if RECOVERED in values:
@@ -286,21 +283,17 @@ class RepairWriter:
         return json.dumps({**values, RECOVERED: origin})
 
     def _final(self, episode: PlannedEpisode, store: PackedStore, old: Channels) -> bytes:
-        env = episode.segment.env
-        if episode.final == IN_A_HOLE:
-            rest = self._gathered.finals[env, episode.segment.row + episode.segment.steps].state
-        elif episode.final in (None, RUNNING) or old.final is None:
-            rest = self._gathered.states[env]
-        else:
-            rest = message_at(store, old.final, episode.final)[8:]
-        return episode.number.to_bytes(4, "little") + env.to_bytes(4, "little") + rest
+        if old.final is None or episode.final is None or episode.final < 0:
+            return final_state(self._evidence, episode)
+        numbers = (episode.number, episode.run.env)
+        body = store.message(old.final, episode.final)
+        return b"".join(n.to_bytes(4, "little") for n in numbers) + body[8:]
 
     def _infos(self, store: PackedStore, channel: int, plan: Plan) -> Iterator[tuple[int, bytes]]:
         """The infos of steps that are kept, with the numbers these have now."""
         pieces = NewPlaces(plan.episodes)
-        for _, log_time, body in messages(store, channel):
+        for _, log_time, body in store.all_messages(channel):
             number, step = int.from_bytes(body[:4], "little"), int.from_bytes(body[4:8], "little")
             found = pieces.find(number, step)
             if found is not None:
-                self.infos_kept += 1
                 yield log_time, b"".join(n.to_bytes(4, "little") for n in found) + bytes(body[8:])

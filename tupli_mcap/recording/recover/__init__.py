@@ -1,9 +1,12 @@
-"""From what a killed process or a damaged disk left to episodes.
+"""Which episodes a killed process or a damaged disk has left: decided here alone, for readers and for repair.
 
-prefix                                      the records at the start of a file that are whole
-unfinished                                  recovery in memory, when an unfinished recording is opened
-episodes                                    the starts and ends that are missing, and the index
-step_runs                                   which episodes the steps of a channel belong to
-evidence, add_journal, segments, plan       what is good in a damaged file and its journal, and the episodes in it
-file_end                                    the summary and the index at a file's end, each by itself
+prefix, damaged       what is good in a file: up to its first damage, or wherever it lies
+find_journal          the journal of an unfinished recording
+add_journal           what the journal adds
+evidence              all of that: rows by channel and number
+step_runs             consecutive steps of an episode
+episodes              which episodes there are: start, end, final state of each
+losses                what is not there
+unfinished            recovery in memory, when an unfinished recording is opened
+file_end              the summary and the index at a file's end, each by itself
 """

@@ -1,202 +1,269 @@
-"""What the journal of an unfinished recording adds to what is good in the file: rows by number, wherever a hole is."""
+"""What the journal of an unfinished recording adds to what is good in the file."""
 
 from __future__ import annotations
 
-import bisect
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import TypeVar
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import (
+    Committed,
     CommittedRows,
     committed_records,
     rows_among,
+    rows_of,
     running_record,
     size_behind,
+    torn_rows,
 )
-from tupli_mcap.journal.file import FRAMES_AREA, JournalContents, read_journal, recorded_journal
-from tupli_mcap.journal.rows import RowDeriver
+from tupli_mcap.journal.file import EVENT_AREAS, FRAMES_AREA, JournalContents, read_journal, recorded_journal
+from tupli_mcap.journal.rows import RowDeriver, even_rows
+from tupli_mcap.mcap.container import Rows
+from tupli_mcap.mcap.records import parse_record, records
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.recover.evidence import Gathered, Piece
-from tupli_mcap.recording.recover.segments import Channels, messages
-from tupli_mcap.recording.recover.unfinished import STEPS_IN_JOURNAL, belongs, define, misplaced_journal
+from tupli_mcap.recording.recover.evidence import Channels, Evidence, PackedStore
+from tupli_mcap.recording.recover.find_journal import STEPS_IN_JOURNAL, belongs, misplaced_journal
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["add_journal"]
+__all__ = ["add_journal", "define", "take_journal", "take_rows"]
+
+_Taken = TypeVar("_Taken", Array, Rows)
 
 
-def add_journal(gathered: Gathered) -> None:
+def add_journal(evidence: Evidence) -> None:
     """Reads the journal of an unfinished recording, and takes the rows that the file does not have."""
-    if gathered.tail.finished or gathered.source.path is None:
+    if evidence.tail.finished or evidence.source.path is None:
         return
-    path = gathered.source.path
+    path = evidence.source.path
     # a journal is made before the channels
-    no_step = not gathered.channels and not gathered.damages
+    no_step = not evidence.channels and not evidence.damages
     try:
-        path = recorded_journal(path, gathered.metadata or {})
+        path = recorded_journal(path, evidence.metadata or {})
         journal = read_journal(path)
     except FileNotFoundError:
         if no_step:
             return
-        gathered.journal = "missing"
-        elsewhere = misplaced_journal(gathered.source.path, gathered.metadata or {})
+        evidence.journal = "missing"
+        elsewhere = misplaced_journal(evidence.source.path, evidence.metadata or {})
         if elsewhere is not None:
-            gathered.notes.append(f"{elsewhere} is its journal: rename that to {path.name} and recover again")
+            evidence.notes.append(f"{elsewhere} is its journal: rename that to {path.name} and recover again")
         return
     except (OSError, FormatError) as err:
-        gathered.journal = "damaged"
-        gathered.notes.append(f"the journal cannot be read ({err}): {STEPS_IN_JOURNAL}; it is left as it is")
+        evidence.journal = "damaged"
+        evidence.notes.append(f"the journal cannot be read ({err}): {STEPS_IN_JOURNAL}; it is left as it is")
         return
-    if not _belongs(gathered, journal):
+    if not _belongs(evidence, journal):
         if no_step:
             return
-        gathered.journal = "stale"
-        gathered.notes.append(f"the journal {path.name} belongs to another recording")
+        evidence.journal = "stale"
+        evidence.notes.append(f"the journal {path.name} belongs to another recording")
         return
-    gathered.journal = "used"
+    evidence.journal = "used"
     try:
-        _merge(gathered, journal)
+        take_journal(evidence, journal)
     except FormatError as err:
-        gathered.journal = "damaged"
-        gathered.notes.append(f"the journal is damaged ({err})")
+        evidence.journal = "damaged"
+        evidence.notes.append(f"the journal is damaged ({err})")
 
 
-def _belongs(gathered: Gathered, journal: JournalContents) -> bool:
+def _belongs(evidence: Evidence, journal: JournalContents) -> bool:
     """Whether the journal has the recording's uuid, or, where that is lost, one that the damaged bytes hold."""
     uuid = str(journal.info.get("uuid"))
-    if gathered.metadata is not None:
-        return belongs(journal.info, gathered.metadata)
-    for damage in gathered.damages:
-        data = gathered.source.read(damage.offset, min(damage.end - damage.offset, 1 << 16))
+    if evidence.metadata is not None:
+        return belongs(journal.info, evidence.metadata)
+    for damage in evidence.damages:
+        data = evidence.source.read(damage.offset, min(damage.end - damage.offset, 1 << 16))
         if len(uuid) == 32 and uuid.encode() in data:
-            gathered.metadata = {"uuid": uuid}
+            evidence.metadata = {"uuid": uuid}
             return True
     return False
 
 
-def _merge(gathered: Gathered, journal: JournalContents) -> None:
-    define(gathered.schemas, gathered.channels, journal, gathered.source.name)
-    steps = step_channels(gathered.channels, gathered.source.name)
-    if not steps:
-        return
-    layout = StepLayout.from_metadata(steps[0].metadata)
-    channels = Channels.of(gathered, layout)
+def take_journal(evidence: Evidence, journal: JournalContents) -> None:
+    """Takes the rows that the file does not have, and what runs, out of its journal.
+
+    With `evidence.strict`, rows that go on with those in the file (`rows_of`); else all that are missing.
+
+    Raises:
+        FormatError: the journal has not what it must have.
+    """
+    define(evidence, journal)
+    steps = step_channels(evidence.channels, evidence.source.name)
+    if steps:
+        layout = StepLayout.from_metadata(steps[0].metadata)
+        take_rows(evidence, journal, layout, Channels.of(evidence, layout))
+
+
+def take_rows(evidence: Evidence, journal: JournalContents, layout: StepLayout, channels: Channels) -> None:
+    """The same of a journal whose channels are known; takes the steps of `channels`, which may be those of the first
+    sub-environments."""
+    known = {channel: evidence.stop(channel) for channel in evidence.pieces} if evidence.strict else {}
     for name in journal.areas:
-        if name in ("events", "info") or name.startswith(FRAMES_AREA):
-            _add_log(gathered, journal, name)
-    starts = _starts(gathered, channels)
-    gathered.final_lost = journal.torn and bool(journal.info.get("vector"))
-    for env, channel in enumerate(channels.steps):
-        if layout.constant:
-            state, known = _add_rows(gathered, journal, layout, env, channel, starts)
-        else:
-            known = _add_log(gathered, journal, f"steps/{env}").get(channel, 0)
-            state = running_record(journal, f"steps/{env}", _stop(gathered, channel), layout)
-            known = known if state is None else max(known, _stop(gathered, channel))
-        stop = _stop(gathered, channel)
-        for leaf in layout.images:
-            image = channels.images[leaf.name][env]
-            pending = None
-            if image is not None:
-                dtype = layout.image_messages[leaf.name].dtype
-                committed = CommittedRows(journal, f"{leaf.name}/{env}", 0, dtype, image, rewritten=True)
-                pending = _add_images(gathered, committed, leaf, image, min(stop, known))
-                pending = pending if known >= stop else None
-            state = None if state is None or pending is None else state + pending
+        if name in EVENT_AREAS or name.startswith(FRAMES_AREA):
+            _take_log(evidence, journal, name, known)
+    # under same-step autoreset; and it is not known what else of that step was lost
+    evidence.final_lost = journal.torn and bool(journal.info.get("vector"))
+    taking = _Steps(evidence, journal, layout, channels)
+    for env in range(len(channels.steps)):
+        taking.take(env)
+    if size_behind(journal) > evidence.good_end:
+        evidence.states.clear()  # an end may be missing, and what runs be the episode after it
+
+
+def define(evidence: Evidence, journal: JournalContents) -> None:
+    """Adds the schemas and channels that the journal defines to those known.
+
+    What the journal defines is under its checksum, what the file defines outside of chunks is not.
+    """
+    where = f"{evidence.source.name}: journal"
+    try:
+        texts = [bytes.fromhex(text) for text in dict(journal.info.get("definitions", {})).values()]
+    except (TypeError, ValueError) as err:
+        raise FormatError(f"{where}: expected definitions of channels in hexadecimal digits: {err}") from err
+    for text in texts:
+        for opcode, offset, body in records(text, 0, where):
+            if opcode == Opcode.SCHEMA:
+                schema: Schema = parse_record(opcode, body, offset, where)
+                evidence.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel: Channel = parse_record(opcode, body, offset, where)
+                evidence.channels[channel.id] = channel
+
+
+def _missing(
+    evidence: Evidence, channel: int, committed: Committed[_Taken], stop: int | None = None
+) -> list[_Taken]:
+    """The committed rows before `stop` that are to be taken, in runs of consecutive ones."""
+    if evidence.strict:
+        rows = rows_of(committed, evidence.stop(channel), stop)
+        return [] if rows is None else [rows]
+    wanted = evidence.lacks(channel, committed.numbers)
+    return rows_among(committed, wanted if stop is None else wanted & (committed.numbers < stop))
+
+
+def _take_log(
+    evidence: Evidence, journal: JournalContents, name: str, in_file: Mapping[int, int]
+) -> dict[int, int]:
+    """Takes the records of a log, but for as many as are known to be `in_file`; returns the row after its last one, by
+    channel."""
+    logs = committed_records(journal, name, in_file)
+    for channel, committed in logs.items():
+        evidence.add_rows(channel, _missing(evidence, channel, committed))
+    return {channel: committed.end for channel, committed in logs.items()}
+
+
+def _take_tables(evidence: Evidence, channel: int, tables: Iterable[Array]) -> None:
+    """Takes rows of constant size, completed."""
+    found = [
+        even_rows(channel, int(rows["#sequence"][0]), rows.view(np.uint8).tobytes(), rows) for rows in tables
+    ]
+    evidence.add_rows(channel, found)
+
+
+class _Steps:
+    """Takes the steps of a journal with their images, and the states of the running ones."""
+
+    def __init__(
+        self, evidence: Evidence, journal: JournalContents, layout: StepLayout, channels: Channels
+    ) -> None:
+        self._evidence, self._journal = evidence, journal
+        self._layout, self._channels = layout, channels
+        self._store = evidence.store()  # without the steps that are taken here
+        self._starts = {} if evidence.strict else _starts(self._store, self._channels)
+
+    def take(self, env: int) -> None:
+        """Takes those of a sub-environment."""
+        channel = self._channels.steps[env]
+        take = self._take_constant if self._layout.constant else self._take_variable
+        state, known = take(env, channel)
+        stop = self._evidence.stop(channel)
+        self._evidence.beyond[channel] = max(0, known - stop)
+        for leaf in self._layout.images:
+            image = self._take_images(leaf, env, stop, known)
+            state = None if state is None or image is None else state + image
         if state is not None:
-            gathered.states[env] = state
-    if size_behind(journal) > gathered.source.size:
-        gathered.states.clear()  # an end may be missing, and what runs be the episode after it
+            self._evidence.states[env] = state
+
+    def _take_constant(self, env: int, channel: int) -> tuple[bytes | None, int]:
+        """Takes steps of constant size; returns the running state, and the row after the last one committed."""
+        evidence, layout = self._evidence, self._layout
+        committed = CommittedRows(self._journal, "steps", env, layout.step_message.dtype, channel)
+        evidence.left_out[channel] = torn_rows(committed, evidence.stop(channel))
+        tables = _missing(evidence, channel, committed)
+        for rows in tables:
+            first = int(rows["#sequence"][0])
+            RowDeriver(*self._row_before(channel, first)).fill(rows)
+            begun = self._starts.get((env, int(rows["episode"][0])))
+            if begun is not None and begun <= first:
+                same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
+                rows["step"][:same] = first - begun + np.arange(same)
+        _take_tables(evidence, channel, tables)
+        stop = evidence.stop(channel)
+        finals = {(env, hole.row): hole for hole in committed.finals(layout.state_end) if hole.row <= stop}
+        evidence.finals |= finals
+        if layout.images and (env, stop) in finals:  # the image that is running is the next state's
+            return None, committed.end
+        return committed.following(stop - 1, layout.state_end), committed.end
+
+    def _take_variable(self, env: int, channel: int) -> tuple[bytes | None, int]:
+        """The same of steps of variable size."""
+        name = f"steps/{env}"
+        known = _take_log(self._evidence, self._journal, name, {}).get(channel, 0)
+        stop = self._evidence.stop(channel)
+        state = running_record(self._journal, name, stop, self._layout)
+        return state, known if state is None else max(known, stop)
+
+    def _row_before(self, channel: int, first: int) -> tuple[int, int, int]:
+        """Episode, step and time (ns) of the row before one, where it is in the file."""
+        if not first or self._evidence.lacks(channel, np.array([first - 1]))[0]:
+            return -1, -1, 0
+        (span,) = self._store.spans(channel, self._store.packed(channel, first - 1), 1)
+        row = self._store.rows(span.chunk, self._layout.step_message.dtype)[span.begin]
+        return int(row["episode"]), int(row["step"]), int(row["#log_time"])
+
+    def _take_images(self, leaf: Leaf, env: int, steps: int, known: int) -> bytes | None:
+        """Takes the images of steps before `steps`; returns the running state's.
+
+        Where the journal does not know a step as committed (`known` is the row after those), its image may be another
+        one: in a journal that was read or copied before the file, a reset has written over it since.
+        """
+        evidence, channel = self._evidence, self._channels.images[leaf.name][env]
+        if channel is None:
+            if evidence.strict:
+                raise FormatError(
+                    f"expected a channel for the images of {leaf.name!r}, sub-environment {env}, found none"
+                )
+            return None
+        dtype = self._layout.image_messages[leaf.name].dtype
+        # resets write over them
+        committed = CommittedRows(self._journal, f"{leaf.name}/{env}", 0, dtype, channel, rewritten=True)
+        tables = _missing(evidence, channel, committed, min(steps, known))
+        for rows in tables:
+            rows["#publish_time"] = rows["#log_time"]
+        in_file = evidence.stop(channel)
+        _take_tables(evidence, channel, tables)
+        # where the file is ahead, a live writer may have been writing over that row while it was read
+        running = committed.row(steps) if known >= steps >= in_file else None
+        if running is None:
+            return None
+        data: bytes = leaf.as_values(running["data"]).tobytes()
+        return data
 
 
-def _stop(gathered: Gathered, channel: int) -> int:
-    """The row after the last one that is here."""
-    pieces = gathered.pieces.get(channel)
-    return pieces[-1].stop if pieces else 0
-
-
-def _piece(gathered: Gathered, first: int, rows: int, data: bytes) -> Piece:
-    return Piece(first, rows, len(data), gathered.loaded.add(data))
-
-
-def _add_log(gathered: Gathered, journal: JournalContents, name: str) -> dict[int, int]:
-    """Takes the records of a log; returns the row after its last one, by channel."""
-    logs = committed_records(journal, name)
-    for channel, records in logs.items():
-        runs = rows_among(records, gathered.lacks(channel, records.numbers))
-        gathered.add(
-            channel, [_piece(gathered, rows.first, len(rows.offsets), bytes(rows.data)) for rows in runs]
-        )
-    return {channel: records.end for channel, records in logs.items()}
-
-
-def _starts(gathered: Gathered, channels: Channels) -> dict[tuple[int, int], int]:
+def _starts(store: PackedStore, channels: Channels) -> dict[tuple[int, int], int]:
     """First rows of episodes, by sub-environment and number."""
     found = {}
-    if channels.start is not None and gathered.pieces.get(channels.start):
-        for _, _, body in messages(gathered.store(), channels.start):
-            try:
-                start = EpisodeStart.decode(body)
-            except FormatError:
-                continue
-            found[start.env, start.episode] = start.first_row
+    for _, _, body in store.all_messages(channels.start):
+        try:
+            start = EpisodeStart.decode(body)
+        except FormatError:
+            continue
+        found[start.env, start.episode] = start.first_row
     return found
-
-
-def _add_rows(
-    gathered: Gathered,
-    journal: JournalContents,
-    layout: StepLayout,
-    env: int,
-    channel: int,
-    starts: dict[tuple[int, int], int],
-) -> tuple[bytes | None, int]:
-    """Takes the steps of a sub-environment; returns its running state, and the row after the last one committed."""
-    dtype = layout.step_message.dtype
-    committed = CommittedRows(journal, "steps", env, dtype, channel)
-    pieces = []
-    for rows in rows_among(committed, gathered.lacks(channel, committed.numbers)):
-        first = int(rows["#sequence"][0])
-        last = _row_before(gathered, channel, first, dtype)
-        RowDeriver(*last).fill(rows)
-        begun = starts.get((env, int(rows["episode"][0])))
-        if begun is not None and begun <= first:
-            same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
-            rows["step"][:same] = first - begun + np.arange(same)
-        pieces.append(_piece(gathered, first, len(rows), rows.view(np.uint8).tobytes()))
-    gathered.add(channel, pieces)
-    stop = _stop(gathered, channel)
-    finals = {(env, hole.row): hole for hole in committed.finals(layout.state_end) if hole.row <= stop}
-    gathered.finals |= finals
-    if layout.images and (env, stop) in finals:  # the image that is running is the next state's
-        return None, committed.end
-    return committed.following(stop - 1, layout.state_end), committed.end
-
-
-def _row_before(gathered: Gathered, channel: int, first: int, dtype: np.dtype[Any]) -> tuple[int, int, int]:
-    """Episode, step and time (ns) of the row before one, where it is here."""
-    pieces = gathered.pieces.get(channel, [])
-    at = bisect.bisect_left(pieces, first, key=lambda piece: piece.stop)
-    if at == len(pieces) or pieces[at].stop != first:
-        return -1, -1, 0
-    row = np.frombuffer(gathered.loaded[pieces[at].number], dtype)[-1]
-    return int(row["episode"]), int(row["step"]), int(row["#log_time"])
-
-
-def _add_images(
-    gathered: Gathered, committed: CommittedRows, leaf: Leaf, channel: int, stop: int
-) -> bytes | None:
-    """Takes the images of steps before `stop`; returns the running state's."""
-    pieces = []
-    wanted = gathered.lacks(channel, committed.numbers) & (committed.numbers < stop)
-    for rows in rows_among(committed, wanted):
-        rows["#publish_time"] = rows["#log_time"]
-        first = int(rows["#sequence"][0])
-        pieces.append(_piece(gathered, first, len(rows), rows.view(np.uint8).tobytes()))
-    gathered.add(channel, pieces)
-    running = committed.row(stop)
-    data: bytes | None = None if running is None else leaf.as_values(running["data"]).tobytes()
-    return data

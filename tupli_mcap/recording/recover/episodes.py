@@ -1,259 +1,325 @@
-"""What the writer of an unfinished recording could not do: the missing starts and ends of episodes, and the index."""
+"""Which episodes there are, from all that is here of them: runs of steps, starts, ends, final states, the index.
+
+An episode whose steps are all here is one. Where rows are missing in between, each run of consecutive steps becomes an
+episode: the first keeps the number, only that with the old last step ends as the old one did.
+"""
 
 from __future__ import annotations
 
 import bisect
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
-import numpy as np
-from mcap.records import Channel
-
-from tupli_mcap.journal.committed import FinalHole
-from tupli_mcap.journal.logs import group_records
-from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
-from tupli_mcap.mcap.records import BODY
-from tupli_mcap.mcap.source import Source
-from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart, record
-from tupli_mcap.messages.frames import FRAME_LAYOUT
+from tupli_mcap.errors import FormatError
+from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, Topics, parse
-from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
-from tupli_mcap.recording.contents import Contents
-from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.recover.prefix import Scan
-from tupli_mcap.recording.recover.step_runs import Run, runs
+from tupli_mcap.recording.index import EpisodeIndex
+from tupli_mcap.recording.recover.evidence import Channels, Evidence, PackedStore
+from tupli_mcap.recording.recover.step_runs import Ranges, StepRun, step_runs
 
-__all__ = ["Unwritten", "chunk_table", "complete"]
+__all__ = [
+    "IN_A_HOLE",
+    "RUNNING",
+    "End",
+    "NewPlaces",
+    "Plan",
+    "PlannedEpisode",
+    "Start",
+    "final_state",
+    "make_plan",
+]
+
+RUNNING, IN_A_HOLE = -1, -2  # instead of the row of a final state: where in the journal it is
+
+
+class Start(NamedTuple):
+    """The start of an episode, and its time (ns); `row` is its place in `/episode_start`, None if it is to be made."""
+
+    time: int
+    start: EpisodeStart
+    row: int | None = None
+
+
+class End(NamedTuple):
+    """The same of an end."""
+
+    time: int
+    end: EpisodeEnd
+    row: int | None = None
 
 
 @dataclass
-class Unwritten:
-    """What the journal adds to the file, as rows that are not in it; `pending` are states by sub-environment.
+class Told:
+    """What the messages of the episode channels and the index say, by episode.
 
-    `finals`: what follows the last steps of episodes, by sub-environment and the row after.
+    `resets` are those without a step before an episode's. `ignored` are ends whose steps are not all here.
     """
 
-    rows: list[Rows] = field(default_factory=list)
-    pending: dict[int, bytes] = field(default_factory=dict)
-    finals: dict[tuple[int, int], FinalHole] = field(default_factory=dict)
-    left_out: int = 0  # steps in the journal that a power loss may have torn
-    final_lost: bool = (
-        False  # a final state that is not there may have been: `pending` may be of the next episode
-    )
+    starts: dict[int, Start] = field(default_factory=dict)
+    resets: dict[int, list[Start]] = field(default_factory=dict)
+    ends: dict[int, End] = field(default_factory=dict)
+    finals: dict[int, int] = field(default_factory=dict)  # rows of `/final_state`
+    index: dict[int, int] = field(default_factory=dict)  # places in the index
+    ignored: list[int] = field(default_factory=list)
 
 
-def chunk_table(found: Scan, memory: list[Rows]) -> np.ndarray[Any, Any]:
-    """The chunks of the file, and rows in memory, as CHUNK_ROWS."""
-    extra = [
-        (IN_MEMORY + i, 0, len(rows.data), rows.first, len(rows.offsets), 0, 0, rows.channel, 0, 0)
-        for i, rows in enumerate(memory)
-    ]
-    return np.array([*found.chunks, *extra], CHUNK_ROWS)
+class PlannedEpisode(NamedTuple):
+    """An episode that there is. `whole`: all of it is here.
+
+    `head`, `tail`: its first step was the old one's first, its last one the old one's last. `length`: of the old
+    episode, None if not known. `final`: its row in `/final_state` (as packed), RUNNING, IN_A_HOLE, or None if there is
+    none. `orphan`: metadata of the old episode, whose last step is not here. `resets`: without a step, before it.
+    """
+
+    number: int
+    run: StepRun
+    whole: bool
+    head: bool
+    tail: bool
+    length: int | None
+    start: Start
+    end: End
+    final: int | None
+    orphan: str = ""
+    resets: tuple[Start, ...] = ()
 
 
-_START, _END, _FINAL = EPISODE_START, EPISODE_END, FINAL_STATE
+@dataclass
+class Plan:
+    """The episodes in the order of their rows, and what had to be made.
+
+    `here`, `totals`: rows that are kept, and how many there were, by sub-environment.
+    """
+
+    told: Told
+    here: dict[int, Ranges]
+    totals: list[int]
+    episodes: list[PlannedEpisode] = field(default_factory=list)
+    lost_starts: list[int] = field(default_factory=list)
+    lost_ends: list[int] = field(default_factory=list)
+    lost_finals: list[int] = field(default_factory=list)
+    next_episode: int = 0
 
 
-class _Episodes:
-    """Starts and ends found so far, and those that are made: `made` has (channel, row, record)."""
+class NewPlaces:
+    """The episodes that are made of each old one, by the steps that they have of it."""
 
-    def __init__(self, store: ChunkStore, topics: dict[str, int]) -> None:
-        self.starts: dict[int, tuple[int, int, EpisodeStart]] = {}
-        self.ends: dict[int, tuple[int, int, EpisodeEnd]] = {}
-        self.finals: dict[int, int] = {}
-        self.made: list[tuple[int, int, bytes]] = []
-        self._channels = {topic: topics[topic] for topic in (_START, _END, _FINAL)}
-        self._counts = {topic: store.count(channel) for topic, channel in self._channels.items()}
-        self._times = dict.fromkeys(self._channels, 0)
-        for row, (time, body) in enumerate(_messages(store, topics[_START])):
-            start = EpisodeStart.decode(body)
-            self.starts[start.episode] = (row, time, start)
-            self._times[_START] = time
-        for row, (time, body) in enumerate(_messages(store, topics[_END])):
-            end = EpisodeEnd.decode(body)
-            self.ends[end.episode] = (row, time, end)
-            self._times[_END] = time
-        for row, (time, body) in enumerate(_messages(store, topics[_FINAL])):
-            self.finals[int.from_bytes(body[:4], "little")] = row
-            self._times[_FINAL] = time
+    def __init__(self, episodes: Iterable[PlannedEpisode]) -> None:
+        self._of: dict[int, list[PlannedEpisode]] = {}
+        for episode in sorted(episodes, key=lambda episode: episode.run.step):
+            self._of.setdefault(episode.run.episode, []).append(episode)
 
-    def drop_ends(self, available: list[int]) -> int:
-        """Forgets ends whose steps were lost with the end of the file; returns a number beyond those of all of them."""
-        beyond = 0
-        for number, (_, _, end) in list(self.ends.items()):
-            _, _, start = self.starts.get(number, (0, 0, end))
-            here = end.env < len(available) and end.first_row + end.length <= available[end.env]
-            if not here or (start.env, start.first_row) != (end.env, end.first_row):
-                del self.ends[number]
-                beyond = max(beyond, number + 1)
-        return beyond
+    def find(self, number: int, step: int, *, state: bool = False) -> tuple[int, int] | None:
+        """Which step of which new episode a step of an old one is now; None if it is in none.
 
-    def make_start(self, start: EpisodeStart, time: int) -> None:
-        row, time = self._make(time, _START, start.encode())
-        self.starts[start.episode] = (row, time, start)
-
-    def make_end(self, end: EpisodeEnd, time: int, final_state: bytes | None) -> None:
-        """`final_state`: the body of the message, if there is none yet."""
-        if final_state is not None:
-            self.finals[end.episode], _ = self._make(time, _FINAL, final_state)
-        row, time = self._make(time, _END, end.encode())
-        self.ends[end.episode] = (row, time, end)
-
-    def _make(self, time: int, topic: str, body: bytes) -> tuple[int, int]:
-        """The row of a message, and its time: that asked for, or the latest of its channel.
-
-        Each channel by itself: how far an earlier recovery came with the others must change nothing.
+        With `state` it is the number of a state: that after an episode's last step belongs to it.
         """
-        channel, row = self._channels[topic], self._counts[topic]
-        time = max(time, self._times[topic])
-        self.made.append((channel, row, record(channel, row, time, body)))
-        self._counts[topic], self._times[topic] = row + 1, time
-        return row, time
-
-
-def _messages(store: ChunkStore, channel: int) -> Iterator[tuple[int, memoryview]]:
-    for chunk in store.chunks(channel):
-        data = memoryview(store.load(chunk))
-        for start, end in store.messages(chunk):
-            yield int.from_bytes(data[start + 15 : start + 23], "little"), data[start + BODY : end]
-
-
-def complete(
-    source: Source, found: Scan, layout: StepLayout, steps: list[int], tail: Unwritten, contents: Contents
-) -> None:
-    """Makes the missing starts and ends of episodes, and the index."""
-    topics = {c.topic: c.id for c in found.channels.values()}
-    if not topics.keys() >= {_START, _END, _FINAL}:
-        return
-    store = ChunkStore(source, chunk_table(found, tail.rows), [bytes(r.data) for r in tail.rows], 1 << 26)
-    episodes = _Episodes(store, topics)
-    available = [_available(store, topics, layout, found.channels[channel]) for channel in steps]
-    tail.left_out += sum(map(store.count, steps)) - sum(available)
-    contents.used_episodes = max(episodes.drop_ends(available), _beyond_frames(store, topics))
-    found_runs = _Runs(store, layout, steps, available, episodes)
-    _make_starts(episodes, found_runs, tail)
-    _make_ends(episodes, found_runs, store, tail)
-    tail.rows += group_records(memoryview(b"".join(made for *_, made in sorted(episodes.made))))
-    contents.memory = [bytes(rows.data) for rows in tail.rows]
-    contents.table = chunk_table(found, tail.rows)
-    contents.tail = tail.rows
-    contents.index = _index(episodes, contents.table)
-
-
-class _Runs:
-    """The rows of episodes that have no start or no end."""
-
-    def __init__(
-        self,
-        store: ChunkStore,
-        layout: StepLayout,
-        steps: list[int],
-        available: list[int],
-        episodes: _Episodes,
-    ) -> None:
-        self._store, self.layout = store, layout
-        self.steps, self.available = steps, available
-        # starts made for episodes that have steps and none, and the times of their first steps
-        self.unstarted: list[tuple[EpisodeStart, int]] = []
-        self._begun: dict[int, list[Run]] = {}  # of episodes without an end, by sub-environment, in order
-        for env, channel in enumerate(steps):
-            last = -1
-            for run in runs(store, layout, channel, 0, available[env]):
-                if run.episode != last and run.episode not in episodes.starts:
-                    start = EpisodeStart(run.episode, env, run.row, False, False, "", "", "{}")
-                    self.unstarted.append((start, run.first_time))
-                if run.episode not in episodes.ends:
-                    self._begun.setdefault(env, []).append(run)
-                last = run.episode
-
-    def of(self, start: EpisodeStart) -> Run | None:
-        """The rows of an episode without an end, from where it starts; None if it has no step."""
-        mine = self._begun.get(start.env, [])
-        at = bisect.bisect_right(mine, start.first_row, key=lambda run: run.row) - 1
-        if at < 0 or mine[at].episode != start.episode:
+        parts = self._of.get(number, [])
+        at = bisect.bisect_right(parts, step, key=lambda part: part.run.step) - 1
+        if at < 0 or step - parts[at].run.step >= parts[at].run.steps + state:
             return None
-        run, before = mine[at], start.first_row - mine[at].row
-        if before == 0 or before >= run.steps:
-            return run if before == 0 else None
-        channel = self.steps[start.env]  # its start is wrong: some of its steps come before it
-        rest = runs(self._store, self.layout, channel, start.first_row, run.steps - before, keep=True)
-        return next(rest)
+        return parts[at].number, step - parts[at].run.step
 
 
-def _make_starts(episodes: _Episodes, found: _Runs, tail: Unwritten) -> None:
-    """Makes the missing starts, in the order of time."""
-    missing = []
-    for start, time in found.unstarted:
-        hole = tail.finals.get((start.env, start.first_row))
-        missing.append((time if hole is None else hole.time_ns, start.episode, start))
-    for time, _, start in sorted(missing):
-        episodes.make_start(start, time)
+def final_state(evidence: Evidence, episode: PlannedEpisode) -> bytes:
+    """The message of a final state that is RUNNING or IN_A_HOLE, with the episode's number."""
+    run = episode.run
+    is_hole = episode.final == IN_A_HOLE
+    state = evidence.finals[run.env, run.stop].state if is_hole else evidence.states[run.env]
+    return episode.number.to_bytes(4, "little") + run.env.to_bytes(4, "little") + state
 
 
-def _make_ends(episodes: _Episodes, found: _Runs, store: ChunkStore, tail: Unwritten) -> None:
-    """Makes the missing ends, in the order of time."""
-    missing = []
-    running = [episodes.starts[number][2] for number in set(episodes.starts) - set(episodes.ends)]
-    for start in sorted(running, key=lambda start: (start.env, start.first_row)):  # each chunk once
-        number = start.episode
-        run = found.of(start)
-        if run is not None:  # a reset without a step is no episode
-            missing.append((run.last_time, number, start, run))
-    for time, number, start, run in sorted(missing, key=lambda made: made[:2]):
-        how = TERMINAL if run.terminal else TIMEOUT if run.timeout else INTERRUPTED
-        if how == INTERRUPTED:  # what is there is that of a later step, which was lost
-            episodes.finals.pop(number, None)
-        final = None
-        if number not in episodes.finals:
-            final = _final_state(found, store, tail, start.env, run)
-        if final is not None:
-            final = number.to_bytes(4, "little") + start.env.to_bytes(4, "little") + final
-        has_final = final is not None or number in episodes.finals
-        end = EpisodeEnd(number, start.env, run.row, run.steps, run.total, how, has_final, "{}")
-        episodes.make_end(end, time, final)
+def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channels: Channels) -> Plan:
+    """Decides what becomes of every row that is here.
+
+    Raises:
+        FormatError: with `evidence.strict`, a step, a start or an end cannot be decoded.
+    """
+    runs = list(step_runs(evidence, store, layout, channels))
+    here: dict[int, Ranges] = {env: [] for env in range(len(channels.steps))}
+    for run in runs:
+        here[run.env].append((run.row, run.stop))
+    told = _read_told(evidence, store, channels)
+    if evidence.strict:
+        _ignore_ends(told, here)
+    _add_index(told, evidence.tail.index)
+    plan = Plan(told, here, _totals(evidence, channels, told))
+    return _Planner(evidence, plan, runs, channels, images=bool(layout.images)).run()
 
 
-def _final_state(found: _Runs, store: ChunkStore, tail: Unwritten, env: int, run: Run) -> bytes | None:
-    """The state after a run, from the journal; None if it is not there."""
-    stop, ended = run.row + run.steps, run.terminal or run.timeout
-    hole = tail.finals.get((env, stop))
-    if ended and hole is not None and not found.layout.images:  # images are where the next ones are by now
-        return hole.state
-    at_end = stop == found.available[env] == store.count(found.steps[env])
-    return tail.pending.get(env) if at_end and not (ended and tail.final_lost) else None
+# ---- what is told
 
 
-def _beyond_frames(store: ChunkStore, topics: dict[str, int]) -> int:
-    """A number beyond those of the episodes that frames show: the steps of some may be lost."""
-    beyond = 0
-    for topic, channel in topics.items():
-        if (place := parse(topic)) is not None and place.kind == "frame":
-            for chunk in store.chunks(channel):
-                beyond = max(beyond, int(store.rows(chunk, FRAME_LAYOUT.dtype)["episode"].max()) + 1)
-    return beyond
-
-
-def _index(episodes: _Episodes, table: np.ndarray[Any, Any]) -> EpisodeIndex:
-    builder = IndexBuilder()
-    for number in sorted(episodes.ends):
-        if number not in episodes.starts:
+def _read_told(evidence: Evidence, store: PackedStore, channels: Channels) -> Told:
+    """Starts, ends and final states that are here; in repair, messages that cannot be decoded are passed over."""
+    told = Told()
+    for row, time, body in store.all_messages(channels.start):
+        try:
+            start = EpisodeStart.decode(body)
+        except FormatError:
+            if evidence.strict:
+                raise
             continue
-        start_row, start_time, start = episodes.starts[number]
-        end_row, end_time, end = episodes.ends[number]
-        seed = start.seed_number
-        final = episodes.finals.get(number, -1) if end.has_final_state else -1
-        row = EpisodeRow(
-            end.first_row, end.length, end.episode_return, start_time, end_time, seed, start_row, end_row, final,
-            number, end.env, end.end,
+        if start.episode in told.starts:
+            told.resets.setdefault(start.episode, []).append(told.starts[start.episode])
+        told.starts[start.episode] = Start(time, start, row)
+    for row, time, body in store.all_messages(channels.end):
+        try:
+            end = EpisodeEnd.decode(body)
+        except FormatError:
+            if evidence.strict:
+                raise
+            continue
+        told.ends[end.episode] = End(time, end, row)
+    for row, _, body in store.all_messages(channels.final):
+        told.finals[int.from_bytes(body[:4], "little")] = row
+    return told
+
+
+def _ignore_ends(told: Told, here: dict[int, Ranges]) -> None:
+    """Forgets the ends whose steps are not all here, or whose first row is not their start's."""
+    for number, (_, end, _) in list(told.ends.items()):
+        rows = here.get(end.env, [])
+        start = told.starts[number].start if number in told.starts else end
+        begins = (start.env, start.first_row) == (end.env, end.first_row)
+        if not begins or end.first_row + end.length > (rows[-1][1] if rows else 0):
+            del told.ends[number]
+            told.ignored.append(number)
+
+
+def _add_index(told: Told, index: EpisodeIndex | None) -> None:
+    """Takes the ends that only the index has."""
+    if index is None:
+        return
+    for i, row in enumerate(index.episodes):
+        told.index[int(row["episode"])] = i
+        if int(row["episode"]) in told.ends:
+            continue
+        try:
+            metadata = index.metadata_text(i)
+        except FormatError:
+            continue
+        end = EpisodeEnd(
+            int(row["episode"]), int(row["env"]), int(row["first_row"]), int(row["length"]), float(row["return"]),
+            int(row["end"]), int(row["final_row"]) >= 0, metadata,
         )  # fmt: skip
-        builder.add(*row, end.metadata)
-    return EpisodeIndex.decode(builder.encode(table.tobytes()), "recovered index")
+        told.ends[end.episode] = End(int(row["end_time"]), end)
 
 
-def _available(store: ChunkStore, topics: dict[str, int], layout: StepLayout, channel: Channel) -> int:
-    """Steps of a sub-environment that are whole: of which all images are there."""
-    mine = Topics.of_step(channel.topic)
-    images = [topics.get(mine.image(leaf.name), 0) for leaf in layout.images]
-    return min(store.count(one) for one in (channel.id, *images))
+def _totals(evidence: Evidence, channels: Channels, told: Told) -> list[int]:
+    """Rows that each sub-environment had, as far as anything tells."""
+    totals = [evidence.stop(channel) for channel in channels.steps]
+    statistics = evidence.tail.statistics
+    for env, channel in enumerate(channels.steps):
+        ids = [channel, *(images[env] for images in channels.images.values())]
+        if statistics is not None:
+            counts = (statistics.channel_message_counts.get(i, 0) for i in ids if i is not None)
+            totals[env] = max(totals[env], *counts)
+    for _, end, _ in told.ends.values():
+        if end.env < len(totals):
+            totals[end.env] = max(totals[end.env], end.first_row + end.length)
+    return totals
+
+
+# ---- the plan
+
+
+class _Planner:
+    def __init__(
+        self, evidence: Evidence, plan: Plan, runs: list[StepRun], channels: Channels, *, images: bool
+    ) -> None:
+        self._evidence, self._plan, self._told = evidence, plan, plan.told
+        self._runs, self._images = runs, images
+        told = self._told
+        known = [run.episode for run in runs] + list(told.starts) + list(told.ends) + list(told.index)
+        left_out = (evidence.metadata or {}).get("next_episode", "")
+        self._next = max([*known, int(left_out) - 1 if left_out.isdecimal() else -1]) + 1
+        starts = [] if channels.start is None else evidence.ranges(channels.start)
+        self._starts_whole = all(first == 0 for first, _ in starts)  # none is missing between those here
+        self._taken: set[int] = set()
+        # whether there can be no row after the last one that is known
+        self._knows_totals = not evidence.tail.finished or evidence.tail.statistics is not None
+
+    def run(self) -> Plan:
+        for run in self._runs:
+            self._plan.episodes.append(self._episode(run))
+        self._plan.next_episode = self._next
+        return self._plan
+
+    def _length(self, run: StepRun) -> int | None:
+        """The steps of the old episode, if that is known."""
+        told = self._told.ends.get(run.episode)
+        if told is None or told.end.env != run.env:
+            return None
+        return told.end.length if told.end.first_row == run.row - run.step else None
+
+    def _episode(self, run: StepRun) -> PlannedEpisode:
+        length = self._length(run)
+        last = self._knows_totals and run.stop == self._plan.totals[run.env]
+        ended = run.terminal or run.timeout
+        tail = run.step + run.steps == length if length is not None else ended or run.closed or last
+        head = run.step == 0
+        number = run.episode
+        if number in self._taken:
+            number, self._next = self._next, self._next + 1
+        self._taken.add(number)
+        final = self._final(run, last=last) if tail else None
+        start = self._start(run, number, head=head)
+        end = self._end(run, number, length, final is not None, head=head, tail=tail)
+        told = self._told.ends.get(run.episode)
+        resets = self._told.resets.get(number, []) if head else []
+        return PlannedEpisode(
+            number, run, head and tail and number == run.episode, head, tail, length, start, end, final,
+            orphan="" if told is None or tail else told.end.metadata,
+            resets=tuple(reset for reset in resets if reset.start.env == run.env),
+        )  # fmt: skip
+
+    def _final(self, run: StepRun, *, last: bool) -> int | None:
+        """Where the final state of an episode is whose last step is here."""
+        told = self._told.ends.get(run.episode)
+        if told is not None and not told.end.has_final_state:
+            return None
+        ended = run.terminal or run.timeout
+        # without an end, one that is here is that of a step that was not finished
+        unfinished = told is None and not ended and not self._evidence.tail.finished
+        if run.episode in self._told.finals and not unfinished:
+            return self._told.finals[run.episode]
+        if ended and not self._images and (run.env, run.stop) in self._evidence.finals:
+            return IN_A_HOLE  # with images, they are where the next ones are by now
+        runs = last and told is None and run.env in self._evidence.states
+        if runs and not (ended and self._evidence.final_lost):
+            return RUNNING
+        self._plan.lost_finals.append(run.episode)
+        return None
+
+    def _start(self, run: StepRun, number: int, *, head: bool) -> Start:
+        if not head:
+            return Start(run.first_time, EpisodeStart(number, run.env, 0, False, True, "", "", "{}"))
+        if run.episode in self._told.starts and number == run.episode:
+            told = self._told.starts[run.episode]
+            if told.start.env == run.env:
+                return told
+        hole = self._evidence.finals.get((run.env, run.row))
+        if hole is None or not self._starts_whole:
+            self._plan.lost_starts.append(run.episode)
+        seed, time = "", run.first_time if hole is None else hole.time_ns
+        index = self._evidence.tail.index
+        if index is not None and number in self._told.index:
+            row = index.episodes[self._told.index[number]]
+            seed, time = str(int(row["seed"])) if row["has_seed"] else "", int(row["start_time"])
+        return Start(time, EpisodeStart(number, run.env, 0, False, False, seed, "", "{}"))
+
+    def _end(
+        self, run: StepRun, number: int, length: int | None, has_final: bool, *, head: bool, tail: bool
+    ) -> End:
+        told = self._told.ends.get(run.episode) if tail and length is not None else None
+        how = TERMINAL if run.terminal else TIMEOUT if run.timeout else INTERRUPTED
+        metadata, time, total, row = "{}", run.last_time, run.total, None
+        if told is not None:
+            time, metadata, how, row = told.time, told.end.metadata, told.end.end, told.row
+            if head:
+                total = told.end.episode_return
+        elif tail and self._evidence.tail.finished:
+            self._plan.lost_ends.append(run.episode)
+        return End(time, EpisodeEnd(number, run.env, 0, run.steps, total, how, has_final, metadata), row)

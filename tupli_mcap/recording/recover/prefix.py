@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Schema
+from mcap.records import Metadata, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import chunk_records
@@ -18,61 +17,56 @@ from tupli_mcap.mcap.summary import foreign
 from tupli_mcap.mcap.walk import Chunk, Found, Walk
 from tupli_mcap.recording.contents import RECORDING_METADATA, check_metadata
 from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.recover.evidence import Evidence, Piece
+from tupli_mcap.recording.recover.file_end import Tail
 
-__all__ = [
-    "Scan",
-    "head",
-    "metadata_at",
-    "scan",
-]
+__all__ = ["head", "metadata_at", "prefix"]
 
 
-@dataclass
-class Scan:
-    """What a scan found. `unindexed` are the rows of a last chunk whose message index is missing."""
+def prefix(source: Source, *, only_metadata: bool = False) -> Evidence:
+    """What a reader takes of a file: its records until it ends, is damaged, or its data section ends.
 
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    metadata_indexes: list[MetadataIndex] = field(default_factory=list)
-    attachments: dict[str, AttachmentIndex] = field(default_factory=dict)
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: list[tuple[int, ...]] = field(default_factory=list)
-    counts: dict[int, int] = field(default_factory=dict)
-    unindexed: Rows | None = None
-    profile: str = ""
-    end: int = len(MAGIC)
+    The rows of a last chunk without its message index are taken, too, but `good_end` is before it. With
+    `only_metadata`, the records before the first chunk.
 
-
-def scan(source: Source, *, only_metadata: bool = False) -> Scan:
-    """Reads records until the file ends, is damaged, or its data section ends. Executes nothing, raises nothing
-    for a damaged tail."""
-    found, walk = Scan(), Walk(source)
-    waiting: tuple[tuple[int, ...], Rows] | None = None
+    Raises:
+        FormatError: the chunks of a channel do not hold its rows without gaps. Nothing is raised for a damaged end.
+    """
+    evidence, walk = Evidence(source, Tail(), strict=True, good_end=len(MAGIC)), Walk(source)
+    waiting: tuple[tuple[int, ...], Rows] | None = None  # a chunk whose message index comes next
     for opcode, position, length in walk.places():
         if opcode == Opcode.MESSAGE_INDEX:
             if waiting is None:
                 break
-            found.chunks.append(waiting[0])
-            channel, rows = waiting[0][7], waiting[0][4]
-            found.counts[channel] = found.counts.get(channel, 0) + rows
+            entry, rows = waiting
+            _check_follows(evidence, rows)
+            evidence.pieces.setdefault(rows.channel, []).append(Piece(rows.first, len(rows.offsets), entry))
             waiting = None
         elif waiting is not None or (opcode == Opcode.CHUNK and only_metadata):
             break
         elif opcode == Opcode.HEADER:  # whatever it says is no part of the recording
-            found.profile = _profile(source, position, length)
+            evidence.profile = _profile(source, position, length)
         else:
             record = walk.at(position)
             if isinstance(record, str) or record.repaired:
                 break
             if record.chunk is not None:
-                waiting = _chunk(source, record, record.chunk, found)
-            if waiting is None and not _take(source, record, found):
+                waiting = _chunk(evidence, record, record.chunk)
+            if waiting is None and not _take(evidence, record):
                 break
         if waiting is None:
-            found.end = position + length
+            evidence.good_end = position + length
     if waiting is not None:
-        found.unindexed = waiting[1]
-    return found
+        _check_follows(evidence, waiting[1])
+        evidence.add_rows(waiting[1].channel, [waiting[1]])
+    return evidence
+
+
+def _check_follows(evidence: Evidence, rows: Rows) -> None:
+    if rows.first != evidence.stop(rows.channel):
+        raise FormatError(
+            f"{evidence.source.name}: the chunks of channel {rows.channel} do not hold its rows without gaps"
+        )
 
 
 def _profile(source: Source, position: int, length: int) -> str:
@@ -80,56 +74,54 @@ def _profile(source: Source, position: int, length: int) -> str:
     return body[4 : 4 + int.from_bytes(body[:4], "little")].decode(errors="replace")
 
 
-def _take(source: Source, record: Found, found: Scan) -> bool:
+def _take(evidence: Evidence, record: Found) -> bool:
     """Takes a record outside of chunks; False where the data ends."""
     if record.attachment is not None:
         if record.attachment.name == INDEX_NAME:
             return False
-        found.attachments[record.attachment.name] = record.attachment
+        evidence.attachments[record.attachment.name] = record.attachment
         return True
     if record.opcode not in (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL):
         return False
-    parsed = parse_record(record.opcode, record.body, record.offset, source.name)
+    parsed = parse_record(record.opcode, record.body, record.offset, evidence.source.name)
     if isinstance(parsed, Metadata):
-        found.metadata[parsed.name] = parsed.metadata
-        found.metadata_indexes.append(MetadataIndex(record.offset, record.length, parsed.name))
+        evidence.metadata_indexes.append(MetadataIndex(record.offset, record.length, parsed.name))
+        if parsed.name == RECORDING_METADATA:
+            evidence.metadata = parsed.metadata
     elif isinstance(parsed, Schema):
-        found.schemas[parsed.id] = parsed
+        evidence.schemas[parsed.id] = parsed
     else:
-        found.channels[parsed.id] = parsed
+        evidence.channels[parsed.id] = parsed
     return True
 
 
-def _chunk(source: Source, record: Found, chunk: Chunk, found: Scan) -> tuple[tuple[int, ...], Rows] | None:
-    """A chunk's row of the chunk table, and its rows; None if they are no good. Definitions in it are remembered: they
-    are under the chunk's CRC, which those outside of chunks have not."""
+def _chunk(evidence: Evidence, record: Found, chunk: Chunk) -> tuple[tuple[int, ...], Rows] | None:
+    """A chunk's row of the chunk table, and its rows; None if they are no good.
+
+    Takes the definitions in it: they are under the chunk's CRC, which those outside of chunks have not.
+    """
     try:
-        content = chunk_records(chunk.data, source.name, chunk.packed)
+        content = chunk_records(chunk.data, evidence.source.name, chunk.packed)
     except FormatError:
         return None
-    found.schemas |= {schema.id: schema for schema in content.schemas}
-    found.channels |= {channel.id: channel for channel in content.channels}
+    evidence.schemas |= {schema.id: schema for schema in content.schemas}
+    evidence.channels |= {channel.id: channel for channel in content.channels}
     headers = content.headers
     data = bytes(chunk.data[content.skip :])
     rows = Rows(content.channel, content.first, data, headers["#offset"], headers["#log_time"])
     return content.row(record.offset, record.length, chunk), rows
 
 
-def is_ours(found: Scan) -> bool:
-    """True if the header names our profile."""
-    return found.profile == PROFILE
-
-
 def head(source: Source) -> dict[str, str]:
     """The metadata of a recording, from its first records. Raises FormatError if they are missing or not ours."""
-    found = scan(source, only_metadata=True)
-    if RECORDING_METADATA not in found.metadata:
-        if is_ours(found) or found.profile == "":
+    evidence = prefix(source, only_metadata=True)
+    if evidence.metadata is None:
+        if evidence.profile in (PROFILE, ""):
             raise FormatError(
                 f"{source.name}: the file is cut off or damaged before its first step; nothing can be read from it"
             )
-        raise foreign(source, f"its profile is {found.profile!r}")
-    return check_metadata(source, found.metadata[RECORDING_METADATA])
+        raise foreign(source, f"its profile is {evidence.profile!r}")
+    return check_metadata(source, evidence.metadata)
 
 
 def metadata_at(path: Path) -> dict[str, str]:

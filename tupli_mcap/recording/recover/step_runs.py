@@ -15,8 +15,9 @@ from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.recover.evidence import Channels, Evidence, PackedStore
 
-__all__ = ["Run", "StepFacts", "runs", "runs_in", "step_facts", "sum_up"]
+__all__ = ["Ranges", "StepFacts", "StepRun", "intersection", "runs_in", "step_facts", "step_runs"]
 
 _TIME, _BEFORE_TIME = struct.Struct("<q"), 15  # of a Message record
 
@@ -59,65 +60,105 @@ def step_facts(
         yield facts
 
 
-class Run(NamedTuple):
-    """Consecutive rows of one episode, up to a flag: their first one, how many, their rewards, times in ns."""
+class StepRun(NamedTuple):
+    """Consecutive rows that are here, of consecutive steps of one episode, up to a flag; times in ns.
 
+    `closed`: the row after it is here and another episode's.
+    """
+
+    env: int
     row: int
     steps: int
     episode: int
+    step: int
     total: float
     terminal: bool
     timeout: bool
     first_time: int
     last_time: int
+    closed: bool
+
+    @property
+    def stop(self) -> int:
+        """The row after the last one."""
+        return self.row + self.steps
 
 
-def runs(
-    store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int, *, keep: bool = False
-) -> Iterator[Run]:
-    """The runs of the rows `first:first + count`, in their order; chunks are cached with `keep`.
+Ranges = list[tuple[int, int]]
+
+
+def intersection(a: Ranges, b: Ranges) -> Ranges:
+    """What two lists of ranges have in common."""
+    found: Ranges = []
+    i = j = 0
+    while i < len(a) and j < len(b):
+        low, high = max(a[i][0], b[j][0]), min(a[i][1], b[j][1])
+        if low < high:
+            found.append((low, high))
+        if a[i][1] < b[j][1]:
+            i += 1
+        else:
+            j += 1
+    return found
+
+
+def step_runs(
+    evidence: Evidence, store: PackedStore, layout: StepLayout, channels: Channels
+) -> Iterator[StepRun]:
+    """The runs of all sub-environments, in the order of their rows; of steps whose images are all here.
 
     Raises:
-        FormatError: as `step_facts`, or a row is no step of the layout.
+        FormatError: as `step_facts`; with `evidence.strict`, a row is no step of the layout.
     """
-    last: Run | None = None
-    row = first
-    for facts in step_facts(store, layout, channel, first, count, keep=keep):
-        if facts.bad:
-            raise FormatError(next(iter(facts.bad.values())))
-        for run in runs_in(facts, row, last):
-            if last is not None and run.row != last.row:
+    for env, channel in enumerate(channels.steps):
+        here = evidence.ranges(channel)
+        for ids in channels.images.values():
+            image = ids[env]
+            here = intersection(here, [] if image is None else evidence.ranges(image))
+        for first, stop in here:
+            last: StepRun | None = None
+            row, at = first, store.packed(channel, first)
+            # a chunk may hold many of the ranges
+            for facts in step_facts(store, layout, channel, at, stop - first, keep=not evidence.strict):
+                if facts.bad and evidence.strict:
+                    raise FormatError(next(iter(facts.bad.values())))
+                for run in runs_in(facts, env, row, last):
+                    if last is not None and run.row != last.row:
+                        yield last._replace(closed=last.stop == run.row)
+                    last = run
+                row += len(facts.episode)
+            if last is not None:
                 yield last
-            last = run
-        row += len(facts.episode)
-    if last is not None:
-        yield last
 
 
-def runs_in(facts: StepFacts, row: int, last: Run | None) -> Iterator[Run]:
+def runs_in(facts: StepFacts, env: int, row: int, last: StepRun | None) -> Iterator[StepRun]:
     """The runs of one batch of rows, which starts at `row`; the first one may go on with the last one before."""
-    n = len(facts.episode)
-    if not n:
-        return
+    episode, step = facts.episode.astype(np.int64), facts.step.astype(np.int64)
     flagged = (facts.terminal != 0) | (facts.timeout != 0)
-    begins = np.flatnonzero((facts.episode[1:] != facts.episode[:-1]) | flagged[:-1]) + 1
-    edges = [0, *begins.tolist(), n]
-    begin, end = np.array(edges[:-1]), np.array(edges[1:]) - 1
-    found = zip(
-        itertools.pairwise(edges),
-        facts.episode[begin].tolist(),
-        (facts.terminal[end] != 0).tolist(),
-        (facts.timeout[end] != 0).tolist(),
-        facts.time[begin].tolist(),
-        facts.time[end].tolist(),
-        strict=True,
-    )
-    for (low, high), episode, terminal, timeout, first_time, last_time in found:
-        at, steps, total = row + low, high - low, 0.0
-        if low == 0 and last is not None and last.episode == episode and not (last.terminal or last.timeout):
-            at, steps, total, first_time = last.row, last.steps + steps, last.total, last.first_time
-        total = sum_up(facts.reward[low:high], total)
-        yield Run(at, steps, episode, total, terminal, timeout, first_time, last_time)
+    breaks = (episode[1:] != episode[:-1]) | (step[1:] != step[:-1] + 1) | flagged[:-1]
+    edges = {0, len(episode), *(np.flatnonzero(breaks) + 1).tolist()}
+    edges |= set(facts.bad) | {i + 1 for i in facts.bad}
+    for begin, end in itertools.pairwise(sorted(edges)):
+        if begin in facts.bad:
+            continue
+        run = StepRun(
+            env, row + begin, end - begin, int(episode[begin]), int(step[begin]), 0.0,
+            bool(facts.terminal[end - 1]), bool(facts.timeout[end - 1]),
+            int(facts.time[begin]), int(facts.time[end - 1]), False,
+        )  # fmt: skip
+        if last is not None and _goes_on(last, run):
+            run = run._replace(
+                row=last.row, steps=last.steps + run.steps, step=last.step,
+                total=last.total, first_time=last.first_time,
+            )  # fmt: skip
+        yield run._replace(total=sum_up(facts.reward[begin:end], run.total))
+
+
+def _goes_on(run: StepRun, following: StepRun) -> bool:
+    """Whether the first row of one run is the next step of another one."""
+    next_one = run.stop, run.episode, run.step + run.steps
+    together = next_one == (following.row, following.episode, following.step)
+    return together and not (run.terminal or run.timeout)
 
 
 def sum_up(rewards: Array, total: float = 0.0) -> float:

@@ -22,8 +22,8 @@ from tupli_mcap.messages.topics import Topics, parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.open import read_contents
+from tupli_mcap.recording.recover.find_journal import belongs, misplaced_journal
 from tupli_mcap.recording.recover.prefix import head, metadata_at
-from tupli_mcap.recording.recover.unfinished import belongs, misplaced_journal
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
 if TYPE_CHECKING:
@@ -117,14 +117,14 @@ def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: S
     if contents.complete or source.size == contents.data_end:
         return
     from tupli_mcap.recording.recover.add_journal import add_journal
-    from tupli_mcap.recording.recover.evidence import gather
+    from tupli_mcap.recording.recover.damaged import gather
     from tupli_mcap.recording.recover.file_end import read_tail
 
-    gathered = gather(source, read_tail(source))
-    add_journal(gathered)
+    evidence = gather(source, read_tail(source))
+    add_journal(evidence)
     for channel in contents.channels:
         kept = int(contents.table["rows"][contents.table["channel"] == channel].sum())
-        found = sum(stop - first for first, stop in gathered.ranges(channel))
+        found = sum(stop - first for first, stop in evidence.ranges(channel))
         if found > kept:
             raise RecordingError(
                 f"{writer.path} is damaged at offset {contents.data_end}: appending would lose {found - kept} "

@@ -1,0 +1,174 @@
+"""What is good in the file of a damaged recording: chunks, definitions and attachments wherever they lie."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Metadata, Schema
+
+from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records
+from tupli_mcap.mcap.container import MAGIC, PROFILE
+from tupli_mcap.mcap.records import check_crc, message_index, parse_record
+from tupli_mcap.mcap.source import Source
+from tupli_mcap.mcap.walk import Chunk, ChunkClaim, Damage, Found, Walk
+from tupli_mcap.recording.contents import (
+    CHANNEL_KEYS,
+    RECORDING_KEYS,
+    RECORDING_METADATA,
+    check_version,
+    is_ours,
+)
+from tupli_mcap.recording.index import INDEX_NAME
+from tupli_mcap.recording.recover.evidence import Evidence, Piece, RepairedChunk
+from tupli_mcap.recording.recover.file_end import Tail
+
+__all__ = ["gather", "is_recording", "may_be_recording"]
+
+_HEAD = 4096  # the recording's metadata record begins within so many bytes
+
+
+def gather(source: Source, tail: Tail) -> Evidence:
+    """Reads the whole file once, its journal not yet; raises nothing for what is damaged.
+
+    Raises:
+        NewerVersionError: the recording's format is not known.
+    """
+    evidence = Evidence(source, tail)
+    if tail.summary is not None:
+        evidence.schemas, evidence.channels = dict(tail.summary.schemas), dict(tail.summary.channels)
+    chunks: dict[int, list[_FoundChunk]] = {}
+    indexed: ChunkRecords | None = None  # of the last chunk, whose message index comes next
+    for found in Walk(source, known=tail.known_chunks(), end=tail.data_end):
+        if isinstance(found, Damage):
+            evidence.damages.append(found)
+        elif found.chunk is not None:
+            indexed = _take_chunk(evidence, found, found.chunk, chunks)
+        else:
+            if found.opcode == Opcode.MESSAGE_INDEX and indexed is not None:
+                _check_index(evidence, found, indexed)
+            indexed = None
+            _take(evidence, found)
+    for channel, mine in chunks.items():
+        _take_rows(evidence, channel, mine)
+    evidence.damages.sort(key=lambda damage: damage.offset)
+    evidence.good_end = evidence.damages[0].offset if evidence.damages else source.size
+    return evidence
+
+
+class _FoundChunk(NamedTuple):
+    offset: int
+    length: int
+    piece: Piece
+    repaired: str  # what is wrong in its header
+
+
+def _check_index(evidence: Evidence, found: Found, records: ChunkRecords) -> None:
+    number, entries = message_index(found.body)
+    if number != records.channel or not np.array_equal(entries, records.index_entries()):
+        _add_damage(evidence, found, "the message index says other than its chunk holds")
+
+
+def _add_damage(evidence: Evidence, found: Found, why: str) -> None:
+    """What is wrong with a record that is whole."""
+    evidence.damages.append(Damage(found.offset, found.offset + found.length, why, found.opcode))
+
+
+def _take(evidence: Evidence, found: Found) -> None:
+    """Takes a record that is no chunk."""
+    name = evidence.source.name
+    if found.attachment is not None:
+        if found.attachment.name != INDEX_NAME:
+            evidence.attachments[found.attachment.name] = found.attachment
+    elif found.opcode == Opcode.HEADER:
+        evidence.profile = parse_record(found.opcode, found.body, found.offset, name).profile
+    elif found.opcode == Opcode.METADATA:
+        record: Metadata = parse_record(found.opcode, found.body, found.offset, name)
+        if record.name == RECORDING_METADATA and evidence.metadata is None:
+            _take_metadata(evidence, record.metadata, found)
+    elif found.opcode == Opcode.SCHEMA:
+        schema: Schema = parse_record(found.opcode, found.body, found.offset, name)
+        evidence.schemas.setdefault(schema.id, schema)
+    elif found.opcode == Opcode.CHANNEL:
+        channel: Channel = parse_record(found.opcode, found.body, found.offset, name)
+        if _is_whole(evidence, channel, found):
+            evidence.channels.setdefault(channel.id, channel)
+
+
+def _take_metadata(evidence: Evidence, values: dict[str, str], found: Found) -> None:
+    try:
+        evidence.metadata = check_crc(values, RECORDING_KEYS, "the recording's metadata")
+    except FormatError as err:
+        _add_damage(evidence, found, str(err))
+    else:
+        check_version(evidence.metadata, evidence.source.name)
+
+
+def _is_whole(evidence: Evidence, channel: Channel, found: Found) -> bool:
+    """Whether a channel's metadata have the checksum they say."""
+    try:
+        if is_ours(channel.topic):
+            check_crc(channel.metadata, CHANNEL_KEYS, f"the metadata of channel {channel.topic!r:.80}")
+    except FormatError as err:
+        _add_damage(evidence, found, str(err))
+        return False
+    return True
+
+
+def _take_chunk(
+    evidence: Evidence, found: Found, chunk: Chunk, chunks: dict[int, list[_FoundChunk]]
+) -> ChunkRecords | None:
+    """Adds a chunk to those of its channel; returns what is in it, None if that is no good."""
+    try:
+        records = chunk_records(chunk.data, "the chunk", chunk.packed)
+        if not chunk.crc:
+            raise FormatError("the chunk has no CRC")
+    except FormatError as err:
+        _add_damage(evidence, found, str(err))
+        return None
+    if evidence.tail.summary is None:  # these have a CRC, those outside of chunks have none
+        evidence.schemas |= {schema.id: schema for schema in records.schemas}
+        evidence.channels |= {channel.id: channel for channel in records.channels}
+    channel, count, size = records.channel, len(records.headers), len(chunk.data)
+    piece = Piece(records.first, count, records.row(found.offset, found.length, chunk))
+    if found.repaired:
+        claim = ChunkClaim(found.length, size, chunk.compression, chunk.crc)
+        place = RepairedChunk(found.offset, claim, records.skip)
+        piece = evidence.load(place, channel, records.first, count, size - records.skip)
+    mine = chunks.setdefault(channel, [])
+    mine.append(_FoundChunk(found.offset, found.length, piece, found.repaired))
+    return records
+
+
+def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> None:
+    """Takes the chunks of a channel, in whatever order they lie in the file."""
+    left = set(evidence.add(channel, [chunk.piece for chunk in chunks]))
+    for chunk in chunks:
+        if chunk.piece in left:
+            why = "the chunk holds rows that another one holds"
+            evidence.damages.append(Damage(chunk.offset, chunk.offset + chunk.length, why, Opcode.CHUNK))
+        elif chunk.repaired:
+            evidence.damages.append(Damage(chunk.offset, chunk.offset + 49, chunk.repaired, -1))
+
+
+def may_be_recording(source: Source, tail: Tail) -> bool:
+    """Whether the file is to be looked at as one of ours: False if it says that it is something else."""
+    if tail.index is not None or source.size < len(MAGIC) + 9:
+        return True
+    if tail.summary is not None and RECORDING_METADATA in tail.summary.metadata:
+        return True
+    if RECORDING_METADATA.encode() in source.read(0, min(source.size, _HEAD)):
+        return True
+    header = Walk(source).at(len(MAGIC))
+    if isinstance(header, str) or header.opcode != Opcode.HEADER:
+        return True
+    profile: str = parse_record(header.opcode, header.body, header.offset, source.name).profile
+    return profile == PROFILE
+
+
+def is_recording(evidence: Evidence) -> bool:
+    """Whether the file is one of ours, as far as it can be told."""
+    known = evidence.profile == PROFILE or evidence.metadata is not None or evidence.tail.index is not None
+    return known or any("observation_space" in channel.metadata for channel in evidence.channels.values())
