@@ -14,7 +14,7 @@ from zlib import crc32
 
 import numpy as np
 
-from tupli_mcap.journal.file import LogArea
+from tupli_mcap.journal.file import Journal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
 
@@ -90,8 +90,8 @@ class EventLog:
 
     def __init__(
         self,
-        area: LogArea,
-        buffer: memoryview,
+        journal: Journal,
+        name: str,
         sink: Sink,
         sequences: dict[int, int],
         time_ns: int,
@@ -106,10 +106,11 @@ class EventLog:
         self._last = 0  # where the last message began
         self._last_channel = 0
         self._can_drop = False
-        self.move(area, buffer)
+        self.move(journal, name)
 
-    def move(self, area: LogArea, buffer: memoryview) -> None:
-        """Goes on in another journal; everything must have been flushed."""
+    def move(self, journal: Journal, name: str) -> None:
+        """Goes on in the area `name` of another journal; everything must have been flushed."""
+        area, buffer = journal.log_area(name), journal.buffer(name)
         self._records = buffer[LOG_HEADER : LOG_HEADER + area.capacity]
         self._commit, self._behind = buffer[:8].cast("Q"), buffer[8:16].cast("Q")
         self._capacity = area.capacity

@@ -50,38 +50,22 @@ def register_channels(
     Raises:
         RecordingError: a channel of that topic has another schema.
     """
-    known = {channel.topic: channel.id for channel in container.channels.values()}
-    schemas = {schema.name: schema.id for schema in container.schemas.values()}
-
-    def channel(topic: str, schema: str, text: str, metadata: Mapping[str, str]) -> int:
-        if topic in known:
-            old = container.schemas[container.channels[known[topic]].schema_id]
-            if old.data != text.encode():
-                raise RecordingError(
-                    f"{name} records {topic} with other fields; choose the same, or another file"
-                )
-            return known[topic]
-        if schema not in schemas:
-            schemas[schema] = container.add_schema(schema, text)
-        return container.add_channel(topic, schemas[schema], metadata)
-
-    description = layout.to_metadata()
+    channel, description = _Registrar(container, name).channel, layout.to_metadata()
     environments = [Topics.of(i) for i in ([None] if sub_environments is None else range(sub_environments))]
     steps = [
         channel(topics.step, STEP_SCHEMA, layout.step_schema, {**description, "env": str(i)})
         for i, topics in enumerate(environments)
     ]
-    images = [
-        [
-            channel(
-                topics.image(leaf.name),
-                *((CAMERA_NAME, CAMERA_SCHEMA) if leaf.name in png else (IMAGE_NAME, IMAGE_SCHEMA)),
-                {"env": str(i), "leaf": leaf.name, **({CODEC: "png"} if leaf.name in png else {})},
-            )
-            for i, topics in enumerate(environments)
-        ]
-        for leaf in layout.images
-    ]
+    images = []
+    for leaf in layout.images:
+        schema = (CAMERA_NAME, CAMERA_SCHEMA) if leaf.name in png else (IMAGE_NAME, IMAGE_SCHEMA)
+        about = {"leaf": leaf.name, **({CODEC: "png"} if leaf.name in png else {})}
+        images.append(
+            [
+                channel(topics.image(leaf.name), *schema, {"env": str(i), **about})
+                for i, topics in enumerate(environments)
+            ]
+        )
     others = (
         channel(FINAL_STATE, FINAL_STATE_SCHEMA, layout.final_schema, description),
         channel(EPISODE_START, START_NAME, START_SCHEMA, {}),
@@ -89,15 +73,35 @@ def register_channels(
         None if info is None else channel(INFO, "tupli_mcap/msg/Info", info[0], info[1]),
     )
     pairs: list[tuple[int, int]] = []
-    for name in cameras:
-        pairs = []
-        for i, topics in enumerate(environments):
-            about = {"env": str(i), "camera": name}
-            pairs.append(
-                (
-                    channel(topics.camera(name), CAMERA_NAME, CAMERA_SCHEMA, {}),
-                    channel(topics.frame(name), FRAME_NAME, FRAME_SCHEMA, about),
-                )
+    for camera in cameras:
+        pairs = [
+            (
+                channel(topics.camera(camera), CAMERA_NAME, CAMERA_SCHEMA, {}),
+                channel(topics.frame(camera), FRAME_NAME, FRAME_SCHEMA, {"env": str(i), "camera": camera}),
             )
+            for i, topics in enumerate(environments)
+        ]
     container.codecs = image_codecs(layout, container.channels)
     return Channels(steps, images, *others, pairs)
+
+
+class _Registrar:
+    """Adds channels to the container of the recording `name`, or finds those that are there."""
+
+    def __init__(self, container: Container, name: str) -> None:
+        self._container, self._name = container, name
+        self._known = {channel.topic: channel for channel in container.channels.values()}
+        self._schemas = {schema.name: schema.id for schema in container.schemas.values()}
+
+    def channel(self, topic: str, schema: str, text: str, metadata: Mapping[str, str]) -> int:
+        """The id of a topic's channel; RecordingError if it has another schema."""
+        container, schemas, known = self._container, self._schemas, self._known.get(topic)
+        if known is not None:
+            if container.schemas[known.schema_id].data != text.encode():
+                raise RecordingError(
+                    f"{self._name} records {topic} with other fields; choose the same, or another file"
+                )
+            return known.id
+        if schema not in schemas:
+            schemas[schema] = container.add_schema(schema, text)
+        return container.add_channel(topic, schemas[schema], metadata)

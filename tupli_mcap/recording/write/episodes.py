@@ -15,7 +15,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
-from tupli_mcap.journal.file import LogArea
+from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import FRONT, EvenRecords, EventLog, Sink
 from tupli_mcap.mcap.crc import crc32_each
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS
@@ -72,8 +72,8 @@ class EpisodeLog(EventLog):
 
     def __init__(
         self,
-        area: LogArea,
-        buffer: memoryview,
+        journal: Journal,
+        name: str,
         sink: Sink,
         channels: Channels,
         counts: dict[int, int],
@@ -85,7 +85,7 @@ class EpisodeLog(EventLog):
         self._index = index
         self._running: dict[int, StartedEpisode] = {}  # started, and to be ended by what rows tell
         super().__init__(
-            area, buffer, sink, {channel: counts[channel] for channel in ids}, time_ns, file_size
+            journal, name, sink, {channel: counts[channel] for channel in ids}, time_ns, file_size
         )
 
     def start(self, number: int, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:

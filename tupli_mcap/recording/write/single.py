@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from tupli_mcap.errors import StepError
@@ -12,13 +12,12 @@ from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.variable.widening import variable_dtypes
 from tupli_mcap.recording.write.infos import InfoRecorder
+from tupli_mcap.recording.write.rows.contract import Put
 from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
 from tupli_mcap.spaces.exact import check_structure, decide_dtype, exact_array, leaf_value
 
 __all__ = ["SingleRecorder", "decide_layout"]
-
-Put = Callable[[Any, Any, Any, Any, Any], None]
 
 
 def decide_layout(

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.vector.utils import batch_space, iterate
+from gymnasium.vector.utils import batch_space
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
@@ -17,7 +17,8 @@ from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.infos import InfoRecorder
-from tupli_mcap.recording.write.rows.variable import Encoder, StepLog, leaf_encoders
+from tupli_mcap.recording.write.rows.contract import BatchStore
+from tupli_mcap.recording.write.rows.variable import Encoder, each_of, leaf_encoders
 from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.vector_infos import check_infos, final_states, info_of, reset_info_of
@@ -108,7 +109,7 @@ class VectorRecorder:
         if self._writer.vector is None:
             self._first = copy.deepcopy(states)
             return
-        self._put_states(states, chosen if mask is not None else None)
+        self._writer.vector.put_state(states, mask)
         self._writer.sync_step()
 
     def _replace_facts(self, i: int, facts: ResetFacts) -> None:
@@ -116,34 +117,8 @@ class VectorRecorder:
         before, self._facts[i] = self._facts[i], facts
         self._earlier[i] = [*self._earlier[i], *([before] if before else [])] if facts.goes_on else []
 
-    def _put_states(self, states: Any, chosen: Iterable[Any] | None) -> None:
-        store = self._writer.vector
-        if isinstance(store, VectorRows):
-            mask = None
-            if chosen is not None:
-                mask = np.zeros(self._n, dtype=np.bool_)
-                mask[list(chosen)] = True
-            store.put_state(states, mask)
-            for sinks, leaf in zip(self._writer.images, self._writer.layout.images, strict=True):  # type: ignore[union-attr]
-                images = leaf_value(states, leaf)
-                for i in range(self._n) if mask is None else np.flatnonzero(mask):
-                    sinks[i].put_first(sinks[i].check(images[i]))
-        elif store is not None:
-            wanted = set(range(self._n) if chosen is None else (int(i) for i in chosen))
-            for i, state in enumerate(self._each(self._observations, states)):
-                if i in wanted:
-                    store[i].begin_episode(0)
-                    store[i].put_state(state)
-
     def _each(self, space: Any, batch: Any) -> list[Any]:
-        """A batch's values by sub-environment; StepError if they are not as many, or the batch is no such thing."""
-        try:
-            values = list(iterate(space, batch))
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError) as err:
-            raise StepError(f"expected a batch of {space}, found {shorten(batch)}") from err
-        if len(values) != self._n:
-            raise StepError(f"expected {self._n} values in a batch of {space}, found {len(values)}")
-        return values
+        return each_of(space, batch, self._n)
 
     # ---- steps
 
@@ -158,12 +133,7 @@ class VectorRecorder:
         if self._writer.closed:
             raise self._writer.why_stopped()
         if not self._was_reset or self._refused:
-            why = (
-                "the step before this one could not be recorded"
-                if self._refused
-                else "there was no reset yet"
-            )
-            raise StepError(f"{why}; call env.reset() to go on")
+            raise self._needs_reset()
         resets = self._autoreset
         try:
             rewards, terminals, timeouts = self._numbers_of(rewards, terminals, timeouts)
@@ -211,6 +181,12 @@ class VectorRecorder:
         else:
             self._note_resets(~active, infos)
         return active
+
+    def _needs_reset(self) -> StepError:
+        refused = "the step before this one could not be recorded"
+        return StepError(
+            f"{refused if self._refused else 'there was no reset yet'}; call env.reset() to go on"
+        )
 
     def _numbers_of(self, rewards: Any, terminals: Any, timeouts: Any) -> tuple[Array, Array, Array]:
         """Rewards and flags as arrays; the rewards' shape is checked when they are stored."""
@@ -287,7 +263,8 @@ class VectorRecorder:
             )
         schema = None if self._infos is None else self._infos.codec.schema()
         self._writer.begin(layout, self._n, vector=True, info_schema=schema)
-        self._put_states(self._first, None)
+        if self._writer.vector is not None:
+            self._writer.vector.put_state(self._first)
         self._first = None
 
     def _batch_layout(self, states: list[Any], actions: list[Any], rewards: list[Any]) -> StepLayout:
@@ -351,7 +328,10 @@ class VectorRecorder:
         waiting = sorted(i for i in self._waiting if active is None or active[i])
         if not waiting:
             return
-        writer, counts, facts_of = self._writer, self._counts(), self._facts
+        writer, store, facts_of = self._writer, self._writer.vector, self._facts
+        if store is None:
+            return
+        counts = store.row_counts()
         for i in waiting:
             facts, facts_of[i] = facts_of[i], None
             if facts is None:  # stepped on after an end, without a reset
@@ -362,8 +342,6 @@ class VectorRecorder:
                     writer.keep_start()
                 self._earlier[i] = []
             self._episodes[i] = writer.start_episode(i, counts[i], facts)
-            if isinstance(writer.vector, list):
-                writer.vector[i].begin_episode(writer.next_episode - 1)
         first = writer.next_episode - len(waiting)
         self._episode_numbers[waiting] = range(first, writer.next_episode)
         self._lengths[waiting] = 0
@@ -416,11 +394,6 @@ class VectorRecorder:
                 self._writer.next_episode -= 1
                 self._facts[i] = ResetFacts(None, None, "", "{}", now)
 
-    def _counts(self) -> list[int]:
-        """The rows of each sub-environment so far."""
-        store: Any = self._writer.vector
-        return store.counts.tolist() if isinstance(store, VectorRows) else [log.count for log in store]
-
     def _store(
         self,
         actions: Any,
@@ -434,38 +407,15 @@ class VectorRecorder:
     ) -> None:
         """Checks the whole batch, then starts episodes, then writes: a batch is recorded or refused as one."""
         store = self._writer.vector
-        final_states = {i: self._encode_final(state) for i, state in finals.items()} if finals else None
-        if isinstance(store, VectorRows):
-            images = self._check_images(states) if self._writer.images else []
-            batch = store.check(actions, states, rewards)
-            if self._fresh:
-                self._start(active)
-            if final_states:
-                self._put_finals(final_states)
-            for sinks, column in images:
-                for i in range(self._n):
-                    if active is None or active[i]:
-                        sinks[i].put(column[i])
-                    else:
-                        sinks[i].put_first(column[i])
-            store.put(batch, terminals, timeouts, self._numbers, active, ends=ends)
+        if store is None:
             return
-        logs: list[StepLog] = store  # type: ignore[assignment]
-        resets, steps = {}, {}
-        each = zip(self._each(self._actions, actions), self._each(self._observations, states), strict=True)
-        for i, (action, state) in enumerate(each):
-            if active is not None and not active[i]:
-                resets[i] = logs[i].prepare_state(state)
-            else:
-                steps[i] = logs[i].prepare(action, state, rewards[i], terminals[i], timeouts[i])
+        final_states = {i: self._encode_final(state) for i, state in finals.items()} if finals else None
+        batch = store.check(actions, states, rewards, terminals, timeouts, active)
         if self._fresh:
             self._start(active)
         if final_states:
             self._put_finals(final_states)
-        for i, reset in resets.items():
-            logs[i].commit_state(reset)
-        for i, step in steps.items():
-            logs[i].commit(step)
+        store.put(batch, terminals, timeouts, self._numbers, active, ends=ends)
 
     def _put_finals(self, finals: dict[int, bytes]) -> None:
         """Ahead of the steps: the states that these bring are the next episodes' first ones."""
@@ -473,15 +423,6 @@ class VectorRecorder:
         if running:
             row = self._writer.put_final_states([(episode, finals[i]) for i, episode in running])
             self._final_rows.update((i, row + k) for k, (i, _) in enumerate(running))
-
-    def _check_images(self, states: Any) -> list[tuple[Any, Any]]:
-        found = []
-        for sinks, leaf in zip(self._writer.images, self._writer.layout.images, strict=True):  # type: ignore[union-attr]
-            batch = leaf_value(states, leaf)
-            if np.shape(batch)[:1] != (self._n,):
-                raise StepError(f"{leaf.path}: expected {self._n} images, found shape {np.shape(batch)}")
-            found.append((sinks, [sinks[i].check(batch[i]) for i in range(self._n)]))
-        return found
 
     def _encode_final(self, state: Any) -> bytes:
         """A final state that is in no row, as it follows `episode` and `env` in `/final_state`."""
@@ -507,6 +448,7 @@ class VectorRecorder:
         """Ends the running episodes of sub-environments: (sub-environment, how). `known`: the running states are their
         final ones."""
         writer, final_rows, now = self._writer, self._final_rows, None
+        store = writer.vector
         for i, how in ends:
             episode, self._episodes[i] = self._episodes[i], None
             text, self._texts[i] = self._texts[i], "{}"
@@ -519,13 +461,13 @@ class VectorRecorder:
             if i in final_rows:
                 writer.end_episode(*facts, None, text, final_rows.pop(i), now)
             else:
-                writer.end_episode(*facts, self._pending_state(i) if known else None, text, -1, now)
+                state = self._pending_state(store, i) if known and store is not None else None
+                writer.end_episode(*facts, state, text, -1, now)
 
-    def _pending_state(self, i: int) -> bytes:
-        store: Any = self._writer.vector
-        final: bytes = store.pending_state(i) if isinstance(store, VectorRows) else store[i].pending_state()
-        for sinks in self._writer.images:
-            final += sinks[i].pending()
+    def _pending_state(self, store: BatchStore, i: int) -> bytes:
+        final = store.pending_state(i)
+        for stores in self._writer.images:
+            final += stores[i].pending()
         return final
 
     @property

@@ -43,11 +43,9 @@ from tupli_mcap.recording.write.areas import plan_areas
 from tupli_mcap.recording.write.compressing import ChunkWorker
 from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
 from tupli_mcap.recording.write.options import RecordOptions, check_place
+from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore, ToFile
 from tupli_mcap.recording.write.rows.images import ImageRows
-from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.rows.stores import Stores
-from tupli_mcap.recording.write.rows.variable import StepLog
-from tupli_mcap.recording.write.rows.vector import VectorRows
 
 __all__ = [
     "EPISODE_AND_ENV",
@@ -93,8 +91,8 @@ class RecordingWriter:
         self.next_episode = 0
         self.journal: Journal | None = None
         self._stores: Stores | None = None
-        self.rows: SingleRows | StepLog | None = None
-        self.vector: VectorRows | list[StepLog] | None = None
+        self.rows: StepStore | None = None
+        self.vector: BatchStore | None = None
         self._durable = options.durability != "os"
         self.syncs_steps = self._sealed = options.durability == "step"
         self.images: list[list[ImageRows]] = []
@@ -261,10 +259,10 @@ class RecordingWriter:
         layout, channels = self._laid(), self.channels
         self.journal = self._new_journal(areas)
         self.journal.publish(durable=self._durable, replaced=self.replaced)
+        file = ToFile(self.add_chunk, self._start_chunks, self._grow, self._durable, self._sealed)
         self._stores = stores = Stores(
-            layout, channels, self.container, self.journal, self.index, self.add_chunk, self._start_chunks,
-            vector=self.is_vector, sealed=self._sealed, durable=self._durable, grow=self._grow,
-        )  # fmt: skip
+            layout, channels, self.container, self.journal, self.index, file, vector=self.is_vector
+        )
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
         self.events, self.infos, self.frames = stores.events, stores.infos, stores.frames
 

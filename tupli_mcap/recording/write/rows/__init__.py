@@ -1,5 +1,6 @@
 """Rows that are not in the file yet, a class for each kind of channel; they commit, and hand over full chunks.
 
+contract          what all of them keep to
 single, vector    steps of constant size, of one environment and of many
 variable          steps of variable size
 images            the images of a leaf

@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.journal.file import RowArea
+from tupli_mcap.journal.file import Journal
+from tupli_mcap.journal.logs import Sink
 from tupli_mcap.journal.seals import seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import CDR_HEADER, RECORD_HEADER
 from tupli_mcap.messages.encode_rows import HOLE, SEQUENCE_OFFSET
 from tupli_mcap.messages.layout import ImageLayout
-from tupli_mcap.recording.write.rows.single import Sink, StartChunks
+from tupli_mcap.recording.write.rows.contract import StartChunks
 from tupli_mcap.spaces.exact import exact_array
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = [
-    "ImageRows",
-]
+__all__ = ["ImageRows"]
 
 
 # sequence, log_time, publish_time, the CDR header, and the stamp of an image: they follow each other, and one call
@@ -37,8 +36,8 @@ class ImageRows:
         self,
         leaf: Leaf,
         layout: ImageLayout,
-        area: RowArea,
-        buffer: memoryview,
+        journal: Journal,
+        name: str,
         channel: int,
         sink: Sink,
         first: int = 0,
@@ -61,12 +60,13 @@ class ImageRows:
         self._time = time_ns
         self._half = self._row = 0
         self._uint8 = np.dtype(np.uint8)
-        self.move(area, buffer)
+        self.move(journal, name)
 
-    def move(self, area: RowArea, buffer: memoryview) -> None:
-        """Goes on in another journal, with the rows before the running one in the file: only that one moves."""
+    def move(self, journal: Journal, name: str) -> None:
+        """Goes on in the area `name` of another journal, with the rows before the running one in the file."""
         running = self._rows[self._half, self._row].copy() if hasattr(self, "_rows") else None
-        self._area = area
+        self._area = area = journal.row_area(name)
+        buffer = journal.buffer(name)
         self._full, self._row_size = area.rows, area.row_size
         self._buffer = buffer
         self._row = self._half = self._flushed = self._start = 0

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeRows, StartedEpisode
-from tupli_mcap.journal.file import RowArea
+from tupli_mcap.journal.file import Journal
+from tupli_mcap.journal.logs import Sink
 from tupli_mcap.journal.rows import RowDeriver, even_rows
 from tupli_mcap.journal.seals import STATE, seal
-from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.encode_rows import (
     EPISODE_AND_STEP,
@@ -33,8 +33,6 @@ __all__ = [
 
 # of a single environment: what is done once a half finds cold caches, and takes as long for few rows as for many
 CHUNKS_PER_HALF = 2
-Sink = Callable[[Rows], None]
-StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]  # begins to make chunks; the result writes them
 
 
 class SingleRows:
@@ -46,11 +44,11 @@ class SingleRows:
     def __init__(
         self,
         layout: StepLayout,
-        area: RowArea,
-        buffer: memoryview,
+        journal: Journal,
+        name: str,
         channel: int,
         sink: Sink,
-        images: list[ImageSink],
+        images: Sequence[ImageSink],
         first: int = 0,
         deriver: RowDeriver | None = None,
         *,
@@ -59,8 +57,8 @@ class SingleRows:
         self._sealed = sealed
         self._layout = layout
         self._dtype = layout.step_message.dtype
-        self._area = area
-        self._buffer = buffer
+        self._area = area = journal.row_area(name)
+        self._buffer = buffer = journal.buffer(name)
         self._sequence: Array = np.frombuffer(buffer, self._dtype)["#sequence"].reshape(2, area.rows + 1)
         self._channel = channel
         self._sink = sink

@@ -8,17 +8,19 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium.vector.utils import batch_space, iterate
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
-from tupli_mcap.journal.file import LogArea
+from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import FRONT, LOG_HEADER, Sink, as_rows, group_records
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.spaces.exact import exact_array, exact_flag, leaf_value, structure_check
+from tupli_mcap.spaces.exact import exact_array, exact_flag, leaf_value, shorten, structure_check
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Encoder", "StepLog", "leaf_encoders"]
+__all__ = ["Encoder", "StepLog", "StepLogs", "each_of", "leaf_encoders"]
 
 Encoder = Callable[[Any, bytearray, int], None]
 _DOUBLE = struct.Struct("<d")
@@ -94,8 +96,8 @@ class StepLog:
     def __init__(
         self,
         layout: StepLayout,
-        area: LogArea,
-        buffer: memoryview,
+        journal: Journal,
+        name: str,
         channel: int,
         sink: Sink,
         images: Sequence[Any],
@@ -118,11 +120,12 @@ class StepLog:
         self.count = first
         self.total: Any = 0.0
         self.grow: Callable[[int], None] | None = None
-        self.move(area, buffer)
+        self.move(journal, name)
 
-    def move(self, area: LogArea, buffer: memoryview) -> None:
-        """Goes on in another journal, with everything committed in the file: only the running record moves."""
-        self._area = area
+    def move(self, journal: Journal, name: str) -> None:
+        """Goes on in the area `name` of another journal, with everything committed in the file."""
+        self._area = area = journal.log_area(name)
+        buffer = journal.buffer(name)
         self._records = [buffer[h * area.half + LOG_HEADER : (h + 1) * area.half] for h in range(2)]
         self._ends = [buffer[h * area.half : h * area.half + 8].cast("Q") for h in range(2)]
         self._half = self._position = self._emitted = 0
@@ -248,3 +251,84 @@ class StepLog:
         elif sizes:
             (first,) = _SEQUENCE.unpack_from(records, _SEQUENCE_AT)
             self._sink(as_rows(self._channel, first, bytearray(records), sizes, sealed=True))
+
+
+class PreparedBatch(NamedTuple):
+    """What a batch is for each sub-environment: a step, or the state of a reset."""
+
+    steps: dict[int, PreparedStep]
+    resets: dict[int, PreparedState]
+
+
+class StepLogs:
+    """The steps of sub-environments whose messages vary in size, in a log for each of them."""
+
+    def __init__(self, layout: StepLayout, logs: Sequence[StepLog]) -> None:
+        self.logs = logs
+        self._observations = batch_space(layout.observation_space, len(logs))
+        self._actions = batch_space(layout.action_space, len(logs))
+
+    def row_counts(self) -> list[int]:
+        """The rows of each channel so far, those of earlier sessions included."""
+        return [log.count for log in self.logs]
+
+    def put_state(self, states: Any, mask: Array | None = None) -> None:
+        """The states of a reset: of all sub-environments, or of those in `mask`."""
+        for i, state in enumerate(each_of(self._observations, states, len(self.logs))):
+            if mask is None or mask[i]:
+                self.logs[i].begin_episode(0)
+                self.logs[i].put_state(state)
+
+    def check(
+        self,
+        actions: Any,
+        states: Any,
+        rewards: Array,
+        terminals: Array,
+        timeouts: Array,
+        active: Array | None,
+    ) -> PreparedBatch:
+        """A batch as `put` takes it; StepError if it cannot be stored."""
+        n, prepared = len(self.logs), PreparedBatch({}, {})
+        each = zip(each_of(self._actions, actions, n), each_of(self._observations, states, n), strict=True)
+        for i, (action, state) in enumerate(each):
+            if active is None or active[i]:
+                step = self.logs[i].prepare(action, state, rewards[i], terminals[i], timeouts[i])
+                prepared.steps[i] = step
+            else:
+                prepared.resets[i] = self.logs[i].prepare_state(state)
+        return prepared
+
+    def put(
+        self,
+        batch: PreparedBatch,
+        terminals: Array,
+        timeouts: Array,
+        numbers: Array,
+        active: Array | None,
+        *,
+        ends: bool,
+    ) -> None:
+        """Writes a checked batch; `numbers` are those of the episodes, plus 2**32 times the steps."""
+        for i, reset in batch.resets.items():
+            self.logs[i].commit_state(reset)
+        for i, step in batch.steps.items():
+            episode_and_step = int(numbers[i])
+            if episode_and_step < 1 << 32:
+                self.logs[i].begin_episode(episode_and_step)
+            self.logs[i].commit(step)
+
+    def pending_state(self, i: int) -> bytes:
+        """As `StepLog.pending_state`, of one sub-environment."""
+        return self.logs[i].pending_state()
+
+
+def each_of(space: Any, batch: Any, n: int) -> list[Any]:
+    """A batch's values by sub-environment; StepError if they are not as many, or the batch is no such thing."""
+    try:
+        values = list(iterate(space, batch))
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as err:
+        raise StepError(f"expected a batch of {space}, found {shorten(batch)}") from err
+    if len(values) != n:
+        raise StepError(f"expected {n} values in a batch of {space}, found {len(values)}")
+    return values

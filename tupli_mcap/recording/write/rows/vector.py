@@ -14,15 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.errors import StepError
 from tupli_mcap.journal.derive import EpisodeRows, StartedEpisode
-from tupli_mcap.journal.file import RowArea
+from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
-from tupli_mcap.recording.write.rows.single import StartChunks
+from tupli_mcap.recording.write.rows.contract import StartChunks
+from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -30,6 +32,8 @@ __all__ = ["HOLE", "VectorRows"]
 
 _ACTION, _REWARD, _STATE = range(3)
 _BOOL = np.dtype(np.bool_)  # those may hold other bytes than 0 and 1
+_Values = list[tuple[Array, Any, int]]  # of a leaf: its place in the rows, and 1 if that is in the next ones
+Batch = tuple[_Values, Sequence[tuple[Sequence[ImageRows], list[Array]]]]
 
 
 class _Field(NamedTuple):
@@ -48,40 +52,34 @@ class VectorRows:
     def __init__(
         self,
         layout: StepLayout,
-        area: RowArea,
-        buffer: memoryview,
+        journal: Journal,
+        name: str,
         channels: Sequence[int],
         start_chunks: StartChunks,
+        images: Sequence[Sequence[ImageRows]],
         counts: Array,
         time_ns: int = 0,
         *,
         durable: bool = False,
         sealed: bool = False,
     ) -> None:
-        self._durable = durable
-        self._sealed = sealed
-        self._buffer = buffer
-        message = layout.step_message
+        self._durable, self._sealed = durable, sealed
         self._layout = layout
-        self._area = area
+        self._area = area = journal.row_area(name)
+        self._buffer = journal.buffer(name)
         self._start_chunks = start_chunks
+        self._images = list(zip(images, layout.images, strict=True))
         self._channels = list(channels)
         n = len(channels)
-        self._rows: Array = np.frombuffer(buffer, message.dtype).reshape(2, n, area.rows + 1)
-        headers = b"".join(message.header(channel, HOLE) for channel in channels)
-        heads = np.dtype(
-            {"names": ["head"], "formats": [f"V{BODY}"], "offsets": [0], "itemsize": area.row_size}
-        )
-        self._rows.view(heads)["head"] = np.frombuffer(headers, f"V{BODY}")[None, :, None]
         self.counts = counts  # rows of each channel so far (uint32)
         self._ones = np.ones_like(counts)
-        self._half = 0
-        self._row = 0
-        self._flushed = 0
+        self._half = self._row = self._flushed = 0
         self._now = time_ns
         self._times = np.zeros((2, area.rows), np.uint64)  # of the rows in the journal, the same for a batch
         self._offsets = np.arange(area.rows, dtype=np.uint64) * np.uint64(area.row_size)
         self._write_chunks: Callable[[], None] | None = None  # of the half that is not running
+        self._make_views()
+        self._fill_heads()
         # what rows tell of their episodes goes there; None while they tell nothing
         self._events: EpisodeLog | None = None
         self._told = 0  # rows of the running half that have told it
@@ -93,8 +91,15 @@ class VectorRows:
             *((_STATE, field) for field in self._state),
         ]
         self._nested = any(leaf.keys for leaf in layout.leaves)
-        self._flags = (self._rows["terminal"], self._rows["timeout"])
         self._flagged = bytearray(2 * area.rows)  # where a flag may be set: a new journal is zeros
+        self._state_end = layout.state_end
+
+    def _make_views(self) -> None:
+        """The places of the rows' fields in the journal."""
+        area, n = self._area, len(self._channels)
+        table = np.frombuffer(self._buffer, self._layout.step_message.dtype)
+        self._rows: Array = table.reshape(2, n, area.rows + 1)
+        self._flags = (self._rows["terminal"], self._rows["timeout"])
         pairs = np.dtype(
             {
                 "names": ["times", "numbers"],
@@ -105,19 +110,35 @@ class VectorRows:
         )
         self._pair, self._numbers = self._rows.view(pairs)["times"], self._rows.view(pairs)["numbers"]
         self._sequence = self._rows["#sequence"]
-        self._state_bytes: Array = np.frombuffer(buffer, np.uint8).reshape(2, n, area.rows + 1, area.row_size)
-        self._state_end = layout.state_end
+        self._state_bytes: Array = np.frombuffer(self._buffer, np.uint8).reshape(*self._rows.shape, -1)
+
+    def _fill_heads(self) -> None:
+        """What is the same in all rows of a channel; all of them are holes."""
+        message = self._layout.step_message
+        headers = b"".join(message.header(channel, HOLE) for channel in self._channels)
+        heads = np.dtype(
+            {"names": ["head"], "formats": [f"V{BODY}"], "offsets": [0], "itemsize": self._area.row_size}
+        )
+        self._rows.view(heads)["head"] = np.frombuffer(headers, f"V{BODY}")[None, :, None]
 
     def _writer(self, leaf: Leaf, ahead: int) -> _Field:
         view = None if leaf.size == 0 else self._rows[leaf.name]
         return _Field(leaf, view, self._layout.dtypes[leaf.name], (len(self._channels), *leaf.shape), ahead)
 
-    def check(self, action: Any, state: Any, reward: Any) -> list[tuple[Array, Any, int]]:
+    def row_counts(self) -> list[int]:
+        """The rows of each channel so far, those of earlier sessions included."""
+        counts: list[int] = self.counts.tolist()
+        return counts
+
+    def check(
+        self, actions: Any, states: Any, rewards: Any, terminals: Array, timeouts: Array, active: Array | None
+    ) -> Batch:
         """A batch as `put` takes it; StepError if it cannot be stored."""
+        images = self._check_images(states) if self._images else ()
         if self._nested:
-            check_structure(self._layout.action_space, action, "action")
-            check_structure(self._layout.observation_space, state, "state")
-        values, roots = [], (action, reward, state)
+            check_structure(self._layout.action_space, actions, "action")
+            check_structure(self._layout.observation_space, states, "state")
+        values, roots = [], (actions, rewards, states)
         for root, (leaf, view, dtype, shape, ahead) in self._fields:
             value = leaf_value(roots[root], leaf) if leaf.keys else roots[root]
             if (
@@ -127,24 +148,37 @@ class VectorRows:
                 value = exact_array(value, dtype, shape, leaf.path)
             if view is not None:
                 values.append((view, value, ahead))
-        return values
+        return values, images
 
-    def put_state(self, state: Any, mask: Array | None = None) -> None:
+    def _check_images(self, states: Any) -> list[tuple[Sequence[ImageRows], list[Array]]]:
+        found, n = [], len(self._channels)
+        for stores, leaf in self._images:
+            batch = leaf_value(states, leaf)
+            if np.shape(batch)[:1] != (n,):
+                raise StepError(f"{leaf.path}: expected {n} images, found shape {np.shape(batch)}")
+            found.append((stores, [stores[i].check(batch[i]) for i in range(n)]))
+        return found
+
+    def put_state(self, states: Any, mask: Array | None = None) -> None:
         """The states of a reset: of all sub-environments, or of those in `mask`."""
         for leaf, view, dtype, shape, _ in self._state:
-            value = exact_array(leaf_value(state, leaf), dtype, shape, leaf.path)
+            value = exact_array(leaf_value(states, leaf), dtype, shape, leaf.path)
             if view is None:
                 continue
             if mask is None:
                 view[self._half, :, self._row] = value
             else:
                 view[self._half, mask, self._row] = value[mask]
+        for stores, leaf in self._images:
+            images = leaf_value(states, leaf)
+            for i in range(len(stores)) if mask is None else np.flatnonzero(mask).tolist():
+                stores[i].put_first(stores[i].check(images[i]))
 
     def put(
         self,
-        batch: Sequence[tuple[Array, Any, int]],
-        terminal: Array,
-        timeout: Array,
+        batch: Batch,
+        terminals: Array,
+        timeouts: Array,
         numbers: Array,
         active: Array | None,
         *,
@@ -157,13 +191,20 @@ class VectorRows:
             active: which sub-environments took a step; None: all of them.
             ends: a flag is set.
         """
+        values, images = batch
+        for stores, pictures in images:  # before the steps, of which there are never more
+            for i, picture in enumerate(pictures):
+                if active is None or active[i]:
+                    stores[i].put(picture)
+                else:
+                    stores[i].put_first(picture)
         half, row = self._half, self._row
-        for view, value, ahead in batch:
+        for view, value, ahead in values:
             view[half, :, row + ahead] = value
         place = half * self._area.rows + row
         if ends or self._flagged[place]:
-            self._flags[0][half, :, row] = terminal
-            self._flags[1][half, :, row] = timeout
+            self._flags[0][half, :, row] = terminals
+            self._flags[1][half, :, row] = timeouts
             self._flagged[place] = ends
         self._numbers[half, :, row] = numbers
         self._now = now = max(time.time_ns(), self._now)

@@ -1,0 +1,139 @@
+"""What all stores of rows have in common.
+
+1. A row is committed by one store of a machine word, once all of it is in the journal: whoever reads the journal finds
+   the whole row, or nothing of it.
+2. Committed rows stay in the journal until they are in the file: at every moment the two together hold each of them. A
+   half is written over only when its chunks are in the file.
+3. The running row, of which a state is known and the step is not, is in the journal too; it moves with its store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.journal.file import Journal
+from tupli_mcap.journal.logs import Sink
+from tupli_mcap.mcap.container import Rows
+
+__all__ = ["BatchStore", "MovingStore", "Put", "RowStore", "StartChunks", "StepStore", "ToFile"]
+
+Put = Callable[[Any, Any, Any, Any, Any], None]
+StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]  # begins to make chunks; the result writes them
+
+
+class ToFile(NamedTuple):
+    """How rows come into the file.
+
+    Attributes:
+        add_chunk: writes a chunk, durably where that is asked for.
+        start_chunks: begins to compress several chunks; what it returns writes them, durably where that is asked for.
+        grow: called with the size of a step that is larger than the journal.
+        durable: chunks are on the disk before their rows are used again.
+        sealed: rows in the journal carry checksums.
+    """
+
+    add_chunk: Sink
+    start_chunks: StartChunks
+    grow: Callable[[int], None]
+    durable: bool = False
+    sealed: bool = False
+
+
+class RowStore(Protocol):
+    """Keeps rows in an area of the journal until they are in the file."""
+
+    def flush(self) -> None:
+        """Writes the committed rows that are not in the file yet."""
+        ...
+
+
+class MovingStore(RowStore, Protocol):
+    """One that may have a journal together with steps of variable size, for which the journal grows."""
+
+    def move(self, journal: Journal, name: str) -> None:
+        """Goes on in the area `name` of another journal. Everything committed must be in the file: only the running row
+        moves."""
+        ...
+
+
+class StepStore(Protocol):
+    """The steps of one environment.
+
+    Attributes:
+        count: rows of the channel so far, those of earlier sessions included.
+        total: the running episode's return so far; 0 while rows tell of it.
+    """
+
+    @property
+    def count(self) -> int: ...
+
+    @property
+    def total(self) -> Any: ...
+
+    @property
+    def put(self) -> Put:
+        """Completes and commits the running row (action, state, reward, terminal, timeout); the state starts the next
+        one. StepError if something cannot be stored exactly, and then nothing has changed."""
+        ...
+
+    @property
+    def put_state(self) -> Callable[[Any], None]:
+        """Starts the running row over: the state of a reset."""
+        ...
+
+    def begin_episode(self, episode: int) -> None:
+        """The rows from the running one on belong to `episode`."""
+        ...
+
+    def pending_state(self) -> bytes:
+        """The CDR bytes of the running row's state, as they follow `episode` and `env` in `/final_state`."""
+        ...
+
+
+class BatchStore(Protocol):
+    """The steps of the sub-environments of a vector environment. Batches have the sub-environments first."""
+
+    def row_counts(self) -> list[int]:
+        """The rows of each channel so far, those of earlier sessions included."""
+        ...
+
+    def put_state(self, states: Any, mask: Array | None = None) -> None:
+        """The states of a reset: of all sub-environments, or of those in `mask`."""
+        ...
+
+    def check(
+        self,
+        actions: Any,
+        states: Any,
+        rewards: Array,
+        terminals: Array,
+        timeouts: Array,
+        active: Array | None,
+    ) -> Any:
+        """A batch as `put` takes it; StepError if it cannot be stored."""
+        ...
+
+    def put(
+        self,
+        batch: Any,
+        terminals: Array,
+        timeouts: Array,
+        numbers: Array,
+        active: Array | None,
+        *,
+        ends: bool,
+    ) -> None:
+        """Writes a checked batch.
+
+        Args:
+            numbers: of each sub-environment's episode, plus 2**32 times the step (uint64).
+            active: which sub-environments took a step; None: all of them.
+            ends: a flag is set.
+        """
+        ...
+
+    def pending_state(self, i: int) -> bytes:
+        """As `StepStore.pending_state`, of one sub-environment."""
+        ...
