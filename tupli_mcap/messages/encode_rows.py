@@ -103,12 +103,16 @@ class _Source:
 
 @dataclass
 class _Packed:
-    """Format pieces and argument expressions of one `struct` call, at growing offsets."""
+    """Format pieces and argument expressions of one `struct` call, at growing offsets.
+
+    `stores` are the lines that write the leaves which are too large for it.
+    """
 
     start: int
     offset: int
-    format: str = "<"
+    format: str = ""
     args: list[str] = field(default_factory=list)
+    stores: list[str] = field(default_factory=list)
 
     def add(self, offset: int, code: str, size: int, arg: str) -> None:
         if offset > self.offset:
@@ -116,6 +120,17 @@ class _Packed:
         self.format += code
         self.args.append(arg)
         self.offset = offset + size
+
+
+@dataclass
+class _Code:
+    """What the functions of one layout consist of, see `_ENCODER`; and the objects that their lines name."""
+
+    put: list[str]
+    put_state: list[str]
+    put_next: list[str]
+    amount: str
+    names: dict[str, Any]
 
 
 def _check_leaves(layout: StepLayout) -> None:
@@ -144,72 +159,17 @@ def make_row_encoder(
         SpaceError: the layout has more than 4,096 leaves.
     """
     _check_leaves(layout)
-    message = layout.step_message
-    size = message.record_size
-    source = _Source()
-    after_state = [leaf.name for leaf in (*layout.action, *layout.reward) if leaf.size] + ["terminal"]
-    begin = BODY + message.offset(after_state[0])
-    tail = _Packed(begin, begin)
-    stores: list[str] = []
-    _structure_checks(source, layout.action_space, "action")
-    _fields(source, layout, layout.action, "action", tail, stores)
-    _fields(source, layout, layout.reward, "reward", tail, stores)
-    tail.add(BODY + message.offset("terminal"), "?", 1, "terminal")
-    tail.add(BODY + message.offset("timeout"), "?", 1, "timeout")
-    tail.add(size, f"{PREFIX}s", PREFIX, "prefix")
-    state = _Source(source.names)
-    head = _Packed(0, 0)
-    head.add(0, f"{PREFIX}s", PREFIX, "prefix")
-    _structure_checks(state, layout.observation_space, "state")
-    state_stores: list[str] = []
-    _fields(state, layout, layout.state, "state", head, state_stores)
-    next_state = [line.replace("offset +", f"offset + {size} +") for line in state_stores]
-    shifted = _shift(head, size, tail)
-    puts, firsts = [], []
-    for i, leaf in enumerate(layout.images):
-        check = source.bind("check", images[i].check)
-        state.lines.append(f"image{i} = {check}({_access(source, 'state', leaf.keys)})")
-        puts.append(f"{source.bind('put_image', images[i].put)}(image{i})")
-        firsts.append(f"{source.bind('put_first', images[i].put_first)}(image{i})")
-    flags = [_flag(source, "terminal"), _flag(source, "timeout")]
-    put_lines = [
-        *flags,
-        *source.lines,
-        *state.lines,
-        f"pack(buffer, offset + {shifted.start}, {', '.join(shifted.args)})",
-        *stores,
-        *next_state,
-        *puts,
-    ]
-    first_lines = [
-        *state.lines,
-        f"pack_state(buffer, offset, {', '.join(head.args)})",
-        *state_stores,
-        *firsts,
-    ]
-    next_lines = [
-        *state.lines,
-        f"pack_state(buffer, offset + {size}, {', '.join(['started', *head.args[1:]])})",
-        *next_state,
-    ]
-    amount = "reward"
-    if layout.reward_space is not None:
-        put_lines.append(f"amount = {source.bind('total', layout.reward_total)}(reward)")
-        amount = "amount"
-    text = _render(
-        put_lines, first_lines, next_lines, size, amount, "" if seal is None else "        seal(offset)\n"
-    )
+    code = _code(layout, images)
+    text = _render(code, layout.step_message.record_size, is_sealed=seal is not None)
     namespace = dict(
-        source.names,
+        code.names,
         buffer=buffer,
         first=first,
-        header=message.header(channel),
+        header=layout.step_message.header(channel),
         numbers=EPISODE_AND_STEP.pack,
         time_at=_TIME.unpack_from,
         switch=switch,
         seal=seal,
-        pack=Struct(shifted.format).pack_into,
-        pack_state=Struct(head.format).pack_into,
         commit=COMMIT.pack_into,
         time_ns=time.time_ns,
         refusals=(RecordingError, MemoryError),  # of the chunk of images that the step has filled
@@ -217,83 +177,151 @@ def make_row_encoder(
         view=np.frombuffer(buffer, np.uint8),
     )
     exec(compile(text, "<tupli_mcap row encoder>", "exec"), namespace)
-    encoder = namespace.pop(
-        "encoder"
-    )  # a name in its own globals would keep the buffer until garbage is collected
+    # a name in its own globals would keep the buffer until garbage is collected
+    encoder = namespace.pop("encoder")
     return RowEncoder(**encoder(), state_end=layout.state_end, source=text)
 
 
-def _shift(head: _Packed, size: int, tail: _Packed) -> _Packed:
-    """`tail`, followed by the state of the next row (the prefix itself is already in `tail`)."""
-    joined = _Packed(tail.start, tail.offset, tail.format, list(tail.args))
-    joined.format += head.format[1:].removeprefix(f"{PREFIX}s")
-    joined.args += head.args[1:]
-    joined.offset = size + head.offset
-    return joined
+def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
+    size, source = layout.step_message.record_size, _Source()
+    tail = _tail(source, layout)
+    state = _Source(source.names)
+    head = _head(state, layout)
+    puts, firsts = [], []
+    for i, leaf in enumerate(layout.images):
+        check = source.bind("check", images[i].check)
+        state.lines.append(f"image{i} = {check}({_access(source, 'state', leaf.keys)})")
+        puts.append(f"{source.bind('put_image', images[i].put)}(image{i})")
+        firsts.append(f"{source.bind('put_first', images[i].put_first)}(image{i})")
+    flags = [_flag(source, "terminal"), _flag(source, "timeout")]
+    next_stores = [line.replace("offset +", f"offset + {size} +") for line in head.stores]
+    args = ", ".join([*tail.args, *head.args])
+    put = [
+        *flags, *source.lines, *state.lines, f"pack(buffer, offset + {tail.start}, {args})",
+        *tail.stores, *next_stores, *puts,
+    ]  # fmt: skip
+    amount = "reward"
+    if layout.reward_space is not None:
+        amount = "amount"
+        put.append(f"amount = {source.bind('total', layout.reward_total)}(reward)")
+    first_row, next_row = ", ".join(["prefix", *head.args]), ", ".join(["started", *head.args])
+    put_state = [*state.lines, f"pack_state(buffer, offset, {first_row})", *head.stores, *firsts]
+    put_next = [*state.lines, f"pack_state(buffer, offset + {size}, {next_row})", *next_stores]
+    names = dict(
+        source.names,
+        pack=Struct(f"<{tail.format}{head.format}").pack_into,
+        pack_state=Struct(f"<{PREFIX}s{head.format}").pack_into,
+    )
+    return _Code(put, put_state, put_next, amount, names)
 
 
-def _render(
-    put_lines: Sequence[str],
-    first_lines: Sequence[str],
-    next_lines: Sequence[str],
-    size: int,
-    amount: str,
-    committed: str,
-) -> str:
-    """The source. What changes from row to row is in cells of a closure: attributes take twice the bytecode."""
+def _tail(source: _Source, layout: StepLayout) -> _Packed:
+    """The end of a row, behind its state, and the beginning of the next one up to its state."""
+    message = layout.step_message
+    after_state = [leaf.name for leaf in (*layout.action, *layout.reward) if leaf.size] + ["terminal"]
+    begin = BODY + message.offset(after_state[0])
+    packed = _Packed(begin, begin)
+    _structure_checks(source, layout.action_space, "action")
+    _fields(source, layout, layout.action, "action", packed)
+    _fields(source, layout, layout.reward, "reward", packed)
+    packed.add(BODY + message.offset("terminal"), "?", 1, "terminal")
+    packed.add(BODY + message.offset("timeout"), "?", 1, "timeout")
+    packed.add(message.record_size, f"{PREFIX}s", PREFIX, "prefix")
+    return packed
+
+
+def _head(source: _Source, layout: StepLayout) -> _Packed:
+    """The state of a row."""
+    packed = _Packed(PREFIX, PREFIX)
+    _structure_checks(source, layout.observation_space, "state")
+    _fields(source, layout, layout.state, "state", packed)
+    return packed
+
+
+# what changes from row to row is in cells of a closure: attributes take twice the bytecode
+_ENCODER = """\
+def encoder():
+    offset = start = last = end = 0
+    sequence, prefix, total = first, b'', 0.0
+
+{put}{put_plain}\
+    def put_state(state):
+        try:
+{first_lines}\
+        except Exception as err:
+            raise diagnose(None, state, None, err) from err
+
+    def put_next(episode, state):
+        nonlocal offset, prefix, total
+        started = header + numbers(episode, 0)
+        try:
+{next_lines}\
+        except Exception as err:
+            raise diagnose(None, state, None, err) from err
+        before, = time_at(buffer, (last if offset == start else offset - {size}) + {log_time})
+        now = time_ns()
+        commit(buffer, offset + {sequence}, {hole}, now if now > before else before)
+        prefix, total = started, 0.0
+        offset += {size}
+        if offset == end:
+            switch()
+
+    def move(new_start, new_last, new_end):
+        nonlocal offset, start, last, end
+        offset = start = new_start
+        last, end = new_last, new_end
+
+    def begin(new_prefix, new_total):
+        nonlocal prefix, total
+        prefix, total = new_prefix, new_total
+
+    return dict(
+        put=put, put_plain=put_plain, put_state=put_state, put_next=put_next, move=move, begin=begin,
+        offset=lambda: offset, count=lambda: sequence, total=lambda: total,
+    )
+"""
+_PUT = """\
+    def {name}(action, state, reward, terminal, timeout):
+        nonlocal {changed}
+        try:
+{lines}\
+        except refusals:
+            raise
+        except Exception as err:
+            raise diagnose(action, state, reward, err) from err
+        commit(buffer, offset + {sequence}, sequence, time_ns())
+{committed}\
+        sequence += 1
+{counted}\
+        offset += {size}
+        if offset == end:
+            switch()
+
+"""
+
+
+def _render(code: _Code, size: int, *, is_sealed: bool) -> str:
+    """The source."""
 
     def block(lines: Sequence[str]) -> str:
         return "".join(f"            {line}\n" for line in lines)
 
-    def put(name: str, counted: str) -> str:
-        return (
-            f"    def {name}(action, state, reward, terminal, timeout):\n"
-            f"        nonlocal offset, sequence{', total' if counted else ''}\n"
-            "        try:\n" + block(put_lines) + "        except refusals:\n"
-            "            raise\n"
-            "        except Exception as err:\n"
-            "            raise diagnose(action, state, reward, err) from err\n"
-            f"        commit(buffer, offset + {SEQUENCE_OFFSET}, sequence, time_ns())\n"
-            f"{committed}"
-            "        sequence += 1\n"
-            f"{counted}"
-            f"        offset += {size}\n"
-            "        if offset == end:\n"
-            "            switch()\n\n"
-        )
+    def put(name: str, changed: str, counted: str) -> str:
+        committed = "        seal(offset)\n" if is_sealed else ""
+        return _PUT.format(
+            name=name, changed=changed, lines=block(code.put), sequence=SEQUENCE_OFFSET,
+            committed=committed, counted=counted, size=size,
+        )  # fmt: skip
 
-    return (
-        "def encoder():\n"
-        "    offset = start = last = end = 0\n"
-        "    sequence, prefix, total = first, b'', 0.0\n\n"
-        + put("put", f"        total += {amount}\n")
-        + put("put_plain", "")
-        + "    def put_state(state):\n"
-        "        try:\n" + block(first_lines) + "        except Exception as err:\n"
-        "            raise diagnose(None, state, None, err) from err\n\n"
-        "    def put_next(episode, state):\n"
-        "        nonlocal offset, prefix, total\n"
-        "        started = header + numbers(episode, 0)\n"
-        "        try:\n" + block(next_lines) + "        except Exception as err:\n"
-        "            raise diagnose(None, state, None, err) from err\n"
-        f"        before, = time_at(buffer, (last if offset == start else offset - {size}) + {SEQUENCE_OFFSET + 4})\n"
-        "        now = time_ns()\n"
-        f"        commit(buffer, offset + {SEQUENCE_OFFSET}, {HOLE}, now if now > before else before)\n"
-        "        prefix, total = started, 0.0\n"
-        f"        offset += {size}\n"
-        "        if offset == end:\n"
-        "            switch()\n\n"
-        "    def move(new_start, new_last, new_end):\n"
-        "        nonlocal offset, start, last, end\n"
-        "        offset = start = new_start\n"
-        "        last, end = new_last, new_end\n\n"
-        "    def begin(new_prefix, new_total):\n"
-        "        nonlocal prefix, total\n"
-        "        prefix, total = new_prefix, new_total\n\n"
-        "    return dict(\n"
-        "        put=put, put_plain=put_plain, put_state=put_state, put_next=put_next, move=move, begin=begin,\n"
-        "        offset=lambda: offset, count=lambda: sequence, total=lambda: total,\n"
-        "    )\n"
+    return _ENCODER.format(
+        put=put("put", "offset, sequence, total", f"        total += {code.amount}\n"),
+        put_plain=put("put_plain", "offset, sequence", ""),
+        first_lines=block(code.put_state),
+        next_lines=block(code.put_next),
+        size=size,
+        sequence=SEQUENCE_OFFSET,
+        log_time=SEQUENCE_OFFSET + 4,
+        hole=HOLE,
     )
 
 
@@ -319,9 +347,7 @@ def _access(source: _Source, root: str, keys: Sequence[Any]) -> str:
     return root + "".join(f"[{part}]" for part in parts)
 
 
-def _fields(
-    source: _Source, layout: StepLayout, leaves: Sequence[Leaf], root: str, packed: _Packed, stores: list[str]
-) -> None:
+def _fields(source: _Source, layout: StepLayout, leaves: Sequence[Leaf], root: str, packed: _Packed) -> None:
     for i, leaf in enumerate(leaves):
         if leaf.apart:
             continue
@@ -335,12 +361,10 @@ def _fields(
         value = f"{root[0]}{i}" if leaf.keys else root
         if leaf.keys:
             source.lines.append(f"{value} = {access}")
-        _leaf(source, leaf, dtype, value, offset, packed, stores)
+        _leaf(source, leaf, dtype, value, offset, packed)
 
 
-def _leaf(
-    source: _Source, leaf: Leaf, dtype: DType, value: str, offset: int, packed: _Packed, stores: list[str]
-) -> None:
+def _leaf(source: _Source, leaf: Leaf, dtype: DType, value: str, offset: int, packed: _Packed) -> None:
     nbytes = leaf.size * dtype.itemsize
     if leaf.kind == "scalar" and dtype.kind in "iu":
         exact = source.bind("exact", _exact_int(leaf, dtype))
@@ -379,7 +403,7 @@ def _leaf(
         if is_bool and not large:  # made by a view, perhaps
             source.lines.append(f"if {raw}.translate(None, {_BOOLS!r}): {raw} = {exact}({value})")
         if large:
-            stores.append(
+            packed.stores.append(
                 f"view[offset + {offset}:offset + {offset + nbytes}].view({kind}).reshape({shape})[...] = {raw}"
             )
         else:
