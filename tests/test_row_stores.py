@@ -102,11 +102,6 @@ class Subject:
 
         return finish
 
-    def records_of(self, contents: JournalContents, channel: int, first: int) -> list[int]:
-        """As `taken`, from a log."""
-        committed = committed_records(contents, self.area().name).get(channel)
-        return [] if committed is None else self.numbers(rows_of(committed, first))
-
     def numbers(self, rows: Rows) -> list[int]:
         data = memoryview(rows.data).cast("B")
         begins = [*rows.offsets.tolist(), len(data)]
@@ -215,10 +210,18 @@ class Vector(OfRows):
         none, numbers = np.zeros(3, np.bool_), np.full(3, n << 32, np.uint64)
         states, actions = np.full((3, 9), n + 1.0), np.full(3, n)
         batch = self.store.check(actions, states, np.full(3, float(n)), none, none, None)
-        self.store.put(batch, none, none, numbers, None, ends=False)
+        self.store.put(batch, numbers, ends=False)
 
 
-class Variable(Subject):
+class OfRecords(Subject):
+    """Records of any size."""
+
+    def taken(self, contents: JournalContents, channel: int, first: int) -> list[int]:
+        committed = committed_records(contents, self.area().name).get(channel)
+        return [] if committed is None else self.numbers(rows_of(committed, first))
+
+
+class Variable(OfRecords):
     def area(self) -> LogArea:
         return LogArea("steps/0", 400, 2)
 
@@ -233,9 +236,6 @@ class Variable(Subject):
 
     def put(self, n: int) -> None:
         self.store.put(n, self.text(n + 1), float(n), False, False)
-
-    def taken(self, contents: JournalContents, channel: int, first: int) -> list[int]:
-        return self.records_of(contents, channel, first)
 
     def number(self, record: Any) -> int:
         found = MessageDecoder(TEXT).step(record[BODY:])
@@ -287,7 +287,7 @@ class Images(Subject):
         return only(*row["data"].flat)
 
 
-class Records(Subject):
+class Records(OfRecords):
     """Two channels, whose records are put together."""
 
     channels = (1, 2)
@@ -302,9 +302,6 @@ class Records(Subject):
 
     def put(self, n: int) -> None:
         self.store.append(n + 1, (1, bytes([n]) * (n + 1)), (2, bytes([n]) * 20))
-
-    def taken(self, contents: JournalContents, channel: int, first: int) -> list[int]:
-        return self.records_of(contents, channel, first)
 
     def number(self, record: Any) -> int:
         return only(*record[BODY:])
@@ -374,10 +371,10 @@ def test_a_store_moves_with_its_running_row(
 class CommitsBefore(VectorRows):
     """Says that a row is there before it is."""
 
-    def put(self, batch: Any, *given: Any, ends: bool) -> None:
+    def put(self, batch: Any, numbers: Any, *, ends: bool) -> None:
         self._sequence[self._half, :, self._row] = self.counts
         self._pair[self._half, :, self._row] = 1
-        super().put(batch, *given, ends=ends)
+        super().put(batch, numbers, ends=ends)
 
 
 class WaitsForNothing(ImageRows):

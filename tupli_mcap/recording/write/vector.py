@@ -140,8 +140,7 @@ class VectorRecorder:
             if infos.__class__ is not dict:
                 infos = check_infos(infos, self._n)
             begins = self._writer.vector is None
-            if begins:
-                self._begin(actions, states, rewards)
+            store = self._writer.vector or self._begin(actions, states, rewards)
             done = terminals | timeouts
             flags = done.tobytes()
             any_done = flags != self._none
@@ -156,12 +155,26 @@ class VectorRecorder:
                     resets.check_steps(self._ended, done, rewards)
             elif resets.is_assumed or ended.tobytes() != flags:
                 self._check_resets(holes, done, rewards)
-            self._store(actions, states, rewards, terminals, timeouts, active, finals, any_done)
+            # the whole batch is checked, then episodes are started, then it is written: recorded or refused as one
+            final_states = {i: self._encode_final(state) for i, state in finals.items()} if finals else None
+            batch = store.check(actions, states, rewards, terminals, timeouts, active)
+            if self._fresh:
+                self._start(store.row_counts(), active)
+            if final_states:
+                self._put_finals(final_states)
+            store.put(batch, self._numbers, ends=any_done)
             if begins:
                 self._writer.take_place()
         except StepError:
             self.refuse()
             raise
+        self._count_step(rewards, ended, active, infos, any_done=any_done)
+        return self._everybody if active is None else active
+
+    def _count_step(
+        self, rewards: Array, ended: Array, active: Array | None, infos: Any, *, any_done: bool
+    ) -> None:
+        """What the batch just written leaves for the next one to know."""
         if not self._told:
             totals = (
                 rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1, dtype=np.float64)
@@ -169,18 +182,17 @@ class VectorRecorder:
             self._totals += totals if active is None else totals * active
         self._ended = ended
         if any_done:
-            resets.has_ended = True
+            self._autoreset.has_ended = True
         if active is None:
             self._lengths += self._ones
             self._any_ended = any_done
-            return self._everybody
+            return
         self._lengths += active
         self._any_ended = any_done and bool(np.count_nonzero(ended))
         if self._told:
             self._begin_told(~active, infos)
         else:
             self._note_resets(~active, infos)
-        return active
 
     def _needs_reset(self) -> StepError:
         refused = "the step before this one could not be recorded"
@@ -248,7 +260,7 @@ class VectorRecorder:
             if episode is not None:
                 self._infos.put(self._writer, episode.number, int(self._lengths[i]) - 1, entries[i])
 
-    def _begin(self, actions: Any, states: Any, rewards: Array) -> None:
+    def _begin(self, actions: Any, states: Any, rewards: Array) -> BatchStore:
         if self._spaces.constant:
             batches = [self._first, states], [actions], [rewards]
             layout = self._batch_layout(*batches)
@@ -263,9 +275,11 @@ class VectorRecorder:
             )
         schema = None if self._infos is None else self._infos.codec.schema()
         self._writer.begin(layout, self._n, vector=True, info_schema=schema)
-        if self._writer.vector is not None:
-            self._writer.vector.put_state(self._first)
+        store = self._writer.vector
+        assert store is not None
+        store.put_state(self._first)
         self._first = None
+        return store
 
     def _batch_layout(self, states: list[Any], actions: list[Any], rewards: list[Any]) -> StepLayout:
         """`decide_layout` on whole batches: only dtypes are decided, shapes are checked when a batch is stored."""
@@ -324,14 +338,12 @@ class VectorRecorder:
             raise
         self._end(late)
 
-    def _start(self, active: Array | None) -> None:
+    def _start(self, counts: Sequence[int], active: Array | None) -> None:
+        """Starts the episodes of the sub-environments that wait for one and take a step; `counts` are their rows."""
         waiting = sorted(i for i in self._waiting if active is None or active[i])
         if not waiting:
             return
-        writer, store, facts_of = self._writer, self._writer.vector, self._facts
-        if store is None:
-            return
-        counts = store.row_counts()
+        writer, facts_of = self._writer, self._facts
         for i in waiting:
             facts, facts_of[i] = facts_of[i], None
             if facts is None:  # stepped on after an end, without a reset
@@ -393,29 +405,6 @@ class VectorRecorder:
             if not self._ended[i]:  # begun, and no step yet
                 self._writer.next_episode -= 1
                 self._facts[i] = ResetFacts(None, None, "", "{}", now)
-
-    def _store(
-        self,
-        actions: Any,
-        states: Any,
-        rewards: Array,
-        terminals: Array,
-        timeouts: Array,
-        active: Array | None,
-        finals: dict[int, Any],
-        ends: bool,
-    ) -> None:
-        """Checks the whole batch, then starts episodes, then writes: a batch is recorded or refused as one."""
-        store = self._writer.vector
-        if store is None:
-            return
-        final_states = {i: self._encode_final(state) for i, state in finals.items()} if finals else None
-        batch = store.check(actions, states, rewards, terminals, timeouts, active)
-        if self._fresh:
-            self._start(active)
-        if final_states:
-            self._put_finals(final_states)
-        store.put(batch, terminals, timeouts, self._numbers, active, ends=ends)
 
     def _put_finals(self, finals: dict[int, bytes]) -> None:
         """Ahead of the steps: the states that these bring are the next episodes' first ones."""

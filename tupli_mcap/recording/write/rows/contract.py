@@ -112,24 +112,17 @@ class BatchStore(Protocol):
         timeouts: Array,
         active: Array | None,
     ) -> Any:
-        """A batch as `put` takes it; StepError if it cannot be stored."""
+        """A batch as `put` takes it; StepError if it cannot be stored.
+
+        `active`: which sub-environments took a step; None: all of them. The others were reset.
+        """
         ...
 
-    def put(
-        self,
-        batch: Any,
-        terminals: Array,
-        timeouts: Array,
-        numbers: Array,
-        active: Array | None,
-        *,
-        ends: bool,
-    ) -> None:
+    def put(self, batch: Any, numbers: Array, *, ends: bool) -> None:
         """Writes a checked batch.
 
         Args:
             numbers: of each sub-environment's episode, plus 2**32 times the step (uint64).
-            active: which sub-environments took a step; None: all of them.
             ends: a flag is set.
         """
         ...

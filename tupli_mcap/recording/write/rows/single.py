@@ -15,21 +15,12 @@ from tupli_mcap.journal.logs import Sink
 from tupli_mcap.journal.rows import RowDeriver, even_rows
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.records import BODY
-from tupli_mcap.messages.encode_rows import (
-    EPISODE_AND_STEP,
-    HOLE,
-    ImageSink,
-    make_row_encoder,
-)
+from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP, HOLE, ImageSink, make_row_encoder
 from tupli_mcap.messages.episodes import EpisodeEnd
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
 
-__all__ = [
-    "CHUNKS_PER_HALF",
-    "HOLE",
-    "SingleRows",
-]
+__all__ = ["CHUNKS_PER_HALF", "SingleRows"]
 
 # of a single environment: what is done once a half finds cold caches, and takes as long for few rows as for many
 CHUNKS_PER_HALF = 2

@@ -269,11 +269,11 @@ class StepLogs:
         self._actions = batch_space(layout.action_space, len(logs))
 
     def row_counts(self) -> list[int]:
-        """The rows of each channel so far, those of earlier sessions included."""
+        """As `BatchStore.row_counts`."""
         return [log.count for log in self.logs]
 
     def put_state(self, states: Any, mask: Array | None = None) -> None:
-        """The states of a reset: of all sub-environments, or of those in `mask`."""
+        """As `BatchStore.put_state`."""
         for i, state in enumerate(each_of(self._observations, states, len(self.logs))):
             if mask is None or mask[i]:
                 self.logs[i].begin_episode(0)
@@ -288,38 +288,28 @@ class StepLogs:
         timeouts: Array,
         active: Array | None,
     ) -> PreparedBatch:
-        """A batch as `put` takes it; StepError if it cannot be stored."""
-        n, prepared = len(self.logs), PreparedBatch({}, {})
+        """As `BatchStore.check`."""
+        n, batch = len(self.logs), PreparedBatch({}, {})
         each = zip(each_of(self._actions, actions, n), each_of(self._observations, states, n), strict=True)
         for i, (action, state) in enumerate(each):
             if active is None or active[i]:
-                step = self.logs[i].prepare(action, state, rewards[i], terminals[i], timeouts[i])
-                prepared.steps[i] = step
+                batch.steps[i] = self.logs[i].prepare(action, state, rewards[i], terminals[i], timeouts[i])
             else:
-                prepared.resets[i] = self.logs[i].prepare_state(state)
-        return prepared
+                batch.resets[i] = self.logs[i].prepare_state(state)
+        return batch
 
-    def put(
-        self,
-        batch: PreparedBatch,
-        terminals: Array,
-        timeouts: Array,
-        numbers: Array,
-        active: Array | None,
-        *,
-        ends: bool,
-    ) -> None:
-        """Writes a checked batch; `numbers` are those of the episodes, plus 2**32 times the steps."""
+    def put(self, batch: PreparedBatch, numbers: Array, *, ends: bool) -> None:
+        """As `BatchStore.put`."""
         for i, reset in batch.resets.items():
             self.logs[i].commit_state(reset)
+        episodes_and_steps = numbers.tolist()
         for i, step in batch.steps.items():
-            episode_and_step = int(numbers[i])
-            if episode_and_step < 1 << 32:
-                self.logs[i].begin_episode(episode_and_step)
+            if episodes_and_steps[i] < 1 << 32:  # its first step
+                self.logs[i].begin_episode(episodes_and_steps[i])
             self.logs[i].commit(step)
 
     def pending_state(self, i: int) -> bytes:
-        """As `StepLog.pending_state`, of one sub-environment."""
+        """As `BatchStore.pending_state`."""
         return self.logs[i].pending_state()
 
 

@@ -28,12 +28,10 @@ from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["HOLE", "VectorRows"]
+__all__ = ["VectorRows"]
 
 _ACTION, _REWARD, _STATE = range(3)
 _BOOL = np.dtype(np.bool_)  # those may hold other bytes than 0 and 1
-_Values = list[tuple[Array, Any, int]]  # of a leaf: its place in the rows, and 1 if that is in the next ones
-Batch = tuple[_Values, Sequence[tuple[Sequence[ImageRows], list[Array]]]]
 
 
 class _Field(NamedTuple):
@@ -44,6 +42,20 @@ class _Field(NamedTuple):
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     ahead: int
+
+
+class CheckedBatch(NamedTuple):
+    """What `VectorRows.put` writes.
+
+    `values` are those of leaves, each with its place in the rows and 1 if that is in the next ones; `images` are by
+    leaf, each with the stores of the sub-environments.
+    """
+
+    values: list[tuple[Array, Any, int]]
+    images: Sequence[tuple[Sequence[ImageRows], list[Array]]]
+    terminals: Array
+    timeouts: Array
+    active: Array | None
 
 
 class VectorRows:
@@ -126,14 +138,14 @@ class VectorRows:
         return _Field(leaf, view, self._layout.dtypes[leaf.name], (len(self._channels), *leaf.shape), ahead)
 
     def row_counts(self) -> list[int]:
-        """The rows of each channel so far, those of earlier sessions included."""
+        """As `BatchStore.row_counts`."""
         counts: list[int] = self.counts.tolist()
         return counts
 
     def check(
         self, actions: Any, states: Any, rewards: Any, terminals: Array, timeouts: Array, active: Array | None
-    ) -> Batch:
-        """A batch as `put` takes it; StepError if it cannot be stored."""
+    ) -> CheckedBatch:
+        """As `BatchStore.check`."""
         images = self._check_images(states) if self._images else ()
         if self._nested:
             check_structure(self._layout.action_space, actions, "action")
@@ -148,7 +160,7 @@ class VectorRows:
                 value = exact_array(value, dtype, shape, leaf.path)
             if view is not None:
                 values.append((view, value, ahead))
-        return values, images
+        return CheckedBatch(values, images, terminals, timeouts, active)
 
     def _check_images(self, states: Any) -> list[tuple[Sequence[ImageRows], list[Array]]]:
         found, n = [], len(self._channels)
@@ -160,7 +172,7 @@ class VectorRows:
         return found
 
     def put_state(self, states: Any, mask: Array | None = None) -> None:
-        """The states of a reset: of all sub-environments, or of those in `mask`."""
+        """As `BatchStore.put_state`."""
         for leaf, view, dtype, shape, _ in self._state:
             value = exact_array(leaf_value(states, leaf), dtype, shape, leaf.path)
             if view is None:
@@ -174,25 +186,10 @@ class VectorRows:
             for i in range(len(stores)) if mask is None else np.flatnonzero(mask).tolist():
                 stores[i].put_first(stores[i].check(images[i]))
 
-    def put(
-        self,
-        batch: Batch,
-        terminals: Array,
-        timeouts: Array,
-        numbers: Array,
-        active: Array | None,
-        *,
-        ends: bool,
-    ) -> None:
-        """Writes a checked batch.
-
-        Args:
-            numbers: of each sub-environment's episode, plus 2**32 times the step (uint64).
-            active: which sub-environments took a step; None: all of them.
-            ends: a flag is set.
-        """
-        values, images = batch
-        for stores, pictures in images:  # before the steps, of which there are never more
+    def put(self, batch: CheckedBatch, numbers: Array, *, ends: bool) -> None:
+        """As `BatchStore.put`."""
+        values, images, terminals, timeouts, active = batch
+        for stores, pictures in images:  # a committed step has the image of the state after it
             for i, picture in enumerate(pictures):
                 if active is None or active[i]:
                     stores[i].put(picture)
@@ -255,7 +252,7 @@ class VectorRows:
             self._events.extend(self._episodes.take(self._rows[half, :, told:end], pending))
 
     def pending_state(self, i: int) -> bytes:
-        """The CDR bytes of a sub-environment's running state, as they follow `episode` and `env` in `/final_state`."""
+        """As `BatchStore.pending_state`."""
         area = self._area
         start = self._half * area.half + i * area.block + self._row * area.row_size
         return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
