@@ -34,11 +34,11 @@ from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.cli.app import app
 from tupli_mcap.errors import MissingExtraError, RecordingError
 from tupli_mcap.journal.file import journal_path
-from tupli_mcap.live.follow import Follower, NewSteps, follow
-from tupli_mcap.live.target import parse_target
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
-from tupli_mcap.viewer.live import Sketch
+from tupli_mcap.viewer.live.follow import Follower, NewSteps, follow
+from tupli_mcap.viewer.live.rerun_panels import LivePanels
+from tupli_mcap.viewer.live.target import parse_target
 
 MIXED = spaces.Dict(
     {
@@ -392,12 +392,12 @@ def test_the_overview_counts_all_episodes(tmp_path: Path) -> None:
         roll(env, 10_000)
         follower = follow(env.path, env._writer.uuid, 0)
         assert follower is not None
-        picture = Sketch("many")(follower)
-        assert picture is not None
+        panels = LivePanels("many")
+        assert panels.decide(follower)
         stream = rr.RecordingStream("many")
         stream.save(tmp_path / "r.rrd")
-        picture.declare(stream)
-        picture.send(stream, follower)
+        panels.declare(stream)
+        panels.send(stream, follower)
         stream.flush()
     assert "10,000 episodes" in last_card(tmp_path / "r.rrd")
 
@@ -997,7 +997,7 @@ def test_live_costs_nothing_where_it_is_not_asked_for(tmp_path: Path) -> None:
         "import sys, gymnasium as gym\nfrom tupli_mcap import RecordEpisodes\n"
         f"env = RecordEpisodes(gym.make('CartPole-v1'), {str(tmp_path / 'r.mcap')!r})\nenv.reset()\nenv.step(0)\n"
         "import threading\nassert threading.active_count() == 1\n"
-        "assert not {'tupli_mcap.live', 'rerun', 'foxglove'} & set(sys.modules)\nenv.close()\n"
+        "assert not {'tupli_mcap.viewer.live', 'rerun', 'foxglove'} & set(sys.modules)\nenv.close()\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 

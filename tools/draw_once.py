@@ -19,8 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import viewed
 
 from tupli_mcap import viewer
-from tupli_mcap.viewer.binary import viewer_program
-from tupli_mcap.viewer.process import free_port
+from tupli_mcap.viewer.process import free_port, viewer_program
 
 _SECONDS = 60.0
 _ENOUGH = 0.03  # of the window is in colour where curves are drawn

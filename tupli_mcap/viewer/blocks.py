@@ -1,4 +1,4 @@
-"""Episodes as blocks of rows: what is sent at once, with its place on the timelines."""
+"""Episodes as blocks of rows: what is sent to Rerun at once, and where its rows lie on the timelines."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ from tupli_mcap.recording import Columns, Recording
 from tupli_mcap.recording.blocks import Block as Steps
 from tupli_mcap.recording.blocks import blocks
 
-__all__ = ["TIMELINES", "Block", "Finals", "Piece", "blocks_of", "row_counts"]
+__all__ = ["Block", "Finals", "Piece", "blocks_of", "row_counts"]
 
-TIMELINES = ("step", "episode_time", "time")
-_MAX_ROWS = 65_536  # larger chunks make the viewer no faster
+_MAX_ROWS = 65_536  # Rerun's viewer is no faster with larger chunks
 _MAX_BYTES = 32 << 20
 
 
 class Piece(NamedTuple):
-    """Rows `begin:end` of a block: one episode from `step` on; `last` if they include its last step."""
+    """Rows `begin:end` of a block: the episode at `position`, from `step` on.
+
+    how_ended: `TERMINAL`, `TIMEOUT` or `INTERRUPTED` if they include its last step, else None.
+    """
 
     begin: int
     end: int
     position: int
     step: int
-    last: bool
+    how_ended: int | None
 
 
 class Finals(NamedTuple):
@@ -91,7 +93,7 @@ def _moved(pieces: Sequence[Piece], before: Array) -> list[Piece]:
     ends = np.array([piece.end for piece in pieces])
     shifts = np.searchsorted(before, ends, side="right").tolist()
     return [
-        Piece(piece.begin + earlier, piece.end + shift, piece.position, piece.step, piece.last)
+        piece._replace(begin=piece.begin + earlier, end=piece.end + shift)
         for piece, earlier, shift in zip(pieces, [0, *shifts[:-1]], shifts, strict=True)
     ]
 
@@ -138,9 +140,10 @@ def _rows_at_once(recording: Recording) -> int:
 def _shown(recording: Recording, block: Steps, first: int) -> Block:
     """A block whose first row has the number `first`."""
     starts, ends, earlier = block.starts, block.starts + block.lengths, np.arange(len(block.rows))
+    columns = (starts, ends, block.positions, block.rows["end"])
     pieces = [
-        Piece(start, end, position, block.first_step, block.whole)
-        for start, end, position in zip(starts.tolist(), ends.tolist(), block.positions.tolist(), strict=True)
+        Piece(start, end, position, block.first_step, how_ended if block.whole else None)
+        for start, end, position, how_ended in zip(*(column.tolist() for column in columns), strict=True)
     ]
     number = np.arange(first, first + len(block)) + np.repeat(earlier, block.lengths)
     return Block(recording, block.columns, pieces, number, block.columns.times, _finals(block, ends, first))

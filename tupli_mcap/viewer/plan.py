@@ -15,8 +15,8 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.about import plain, send_about
-from tupli_mcap.viewer.arrange import blueprint_of
 from tupli_mcap.viewer.blocks import Block, blocks_of, row_counts
+from tupli_mcap.viewer.blueprints import blueprint_of
 from tupli_mcap.viewer.panels import PALETTE, Place
 from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk

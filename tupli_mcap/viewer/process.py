@@ -1,9 +1,11 @@
-"""The viewer's process: started on 127.0.0.1, waited for, ended."""
+"""The viewer's program, which comes with rerun-sdk, and its process: started on 127.0.0.1, waited for, ended."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -16,21 +18,66 @@ from pathlib import Path
 from types import FrameType
 from typing import IO
 
-from tupli_mcap.viewer.sdk import ViewerError
+from tupli_mcap.viewer.sdk import ViewerError, rerun_sdk, version_of
 
 __all__ = [
     "LOCAL",
+    "answers",
     "end",
     "free_port",
     "has_display",
+    "run_quietly",
     "scratch",
     "start",
     "stopped_by_signals",
+    "viewer_program",
     "wait_for_ports",
 ]
 
 LOCAL = "127.0.0.1"
 _PATIENCE = 30.0  # seconds until a viewer that does not answer is given up
+
+
+def viewer_program() -> Path:
+    """The program `rerun`: the one of the installed rerun-sdk, else one on the PATH of the same version.
+
+    Raises:
+        ViewerError: there is none, or it is of another version than the data would be.
+    """
+    sdk = rerun_sdk().__version__
+    again = f"install it with pip install --force-reinstall rerun-sdk=={sdk}"
+    spec = importlib.util.find_spec("rerun_cli")
+    for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
+        program = Path(folder) / "rerun"
+        if program.is_file():
+            return program
+    found = shutil.which("rerun")
+    if found is None:
+        raise ViewerError(f"there is no viewer: expected the program 'rerun' of rerun-sdk {sdk}; {again}")
+    told = run_quietly(Path(found), "--version")
+    if version_of(told) != version_of(sdk):
+        raise ViewerError(
+            f"expected the viewer {found} to be of version {sdk}, as rerun-sdk is, found {told.strip()[:80]!r}; {again}"
+        )
+    return Path(found)
+
+
+def run_quietly(program: Path, *arguments: str) -> str:
+    """What the program prints.
+
+    Raises:
+        ViewerError: it cannot be run, or fails.
+    """
+    try:
+        done = subprocess.run(
+            [program, *arguments], capture_output=True, text=True, errors="replace", check=False, timeout=600
+        )
+    except (OSError, subprocess.TimeoutExpired) as err:
+        raise ViewerError(f"the viewer {program} cannot be run: {err}") from err
+    if done.returncode:
+        last = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
+        raise ViewerError(f"{program.name} {' '.join(arguments[:2])} failed: {last[:200]}")
+    return done.stdout
 
 
 def has_display() -> bool:
@@ -47,7 +94,16 @@ def free_port() -> int:
         return int(found.getsockname()[1])
 
 
-def start(program: Path, *arguments: str, log: IO[bytes]) -> subprocess.Popen[bytes]:
+def answers(host: str, port: int, seconds: float = 0.25) -> bool:
+    """Whether something listens there."""
+    try:
+        socket.create_connection((host, port), seconds).close()
+    except OSError:
+        return False
+    return True
+
+
+def start(program: Path, *arguments: str, log: IO[bytes] | int) -> subprocess.Popen[bytes]:
     """Starts the viewer in a session of its own, so that a Ctrl-C reaches this process only.
 
     Raises:
@@ -76,12 +132,10 @@ def wait_for_ports(process: subprocess.Popen[bytes], ports: list[int], log: Path
     until = time.monotonic() + _PATIENCE
     left = list(ports)
     while left and time.monotonic() < until and process.poll() is None:
-        with socket.socket() as probe:
-            probe.settimeout(0.2)
-            if probe.connect_ex((LOCAL, left[0])) == 0:
-                left.pop(0)
-                continue
-        time.sleep(0.02)
+        if answers(LOCAL, left[0]):
+            left.pop(0)
+        else:
+            time.sleep(0.02)
     if left:
         words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         last = next((line for line in reversed(words) if "rror" in line), words[-1] if words else "nothing")

@@ -15,9 +15,19 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, escaped, magnitudes, title_of
-from tupli_mcap.viewer.panels import Panel, Rewards, Series
-from tupli_mcap.viewer.pictures import Camera, Grid, HeatMap, Picture
-from tupli_mcap.viewer.words import Lanes, LiveInfos, Words, infos_of
+from tupli_mcap.viewer.panels import (
+    Camera,
+    Grid,
+    HeatMap,
+    Lanes,
+    LiveInfos,
+    Panel,
+    Picture,
+    Rewards,
+    Series,
+    Words,
+    infos_of,
+)
 
 __all__ = ["Scene", "live_scene", "scene_of"]
 

@@ -15,16 +15,17 @@ from urllib.parse import quote, urlsplit
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording.edit.replacing import replacing
-from tupli_mcap.viewer.binary import run_quietly, viewer_program
 from tupli_mcap.viewer.plan import Plan
 from tupli_mcap.viewer.process import (
     LOCAL,
     end,
     free_port,
     has_display,
+    run_quietly,
     scratch,
     start,
     stopped_by_signals,
+    viewer_program,
     wait_for_ports,
 )
 from tupli_mcap.viewer.sdk import ViewerError

@@ -27,7 +27,7 @@ from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
 if TYPE_CHECKING:
-    from tupli_mcap.live import LiveSession
+    from tupli_mcap.viewer.live import LiveSession
 
 __all__ = ["EpisodeWrapper", "check_kind", "metadata_of"]
 
@@ -224,7 +224,7 @@ def _live_session(writer: RecordingWriter, live: str | None, env: Any) -> LiveSe
     """The live view of a recording that has just been opened."""
     if live is None:
         return None
-    from tupli_mcap.live import open_session
+    from tupli_mcap.viewer.live import open_session
 
     spec = getattr(env, "spec", None)
     return open_session(writer, live, writer.path.name if spec is None else f"{spec.id} {writer.path.name}")

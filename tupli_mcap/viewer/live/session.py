@@ -15,8 +15,8 @@ import sys
 import warnings
 
 from tupli_mcap.errors import missing_extra
-from tupli_mcap.live.target import parse_target
 from tupli_mcap.recording.write.writer import RecordingWriter
+from tupli_mcap.viewer.live.target import parse_target
 
 __all__ = ["LiveSession", "open_session"]
 

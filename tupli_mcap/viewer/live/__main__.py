@@ -1,8 +1,8 @@
-"""The process that shows a rollout: it follows the recording until nobody records any more.
+"""The process that shows a rollout: follows the recording until nobody records any more.
 
-The recorder tells it on stdin which files there are: path, UUID, and where in the file this session begins, as a line
-of JSON each. It needs to say nothing else: who closes a recording, or is killed, lets go of its lock. The process
-sleeps 50 times as long as it kept a core busy, and longer while no viewer is there.
+The recorder writes a line of JSON to its stdin for each file: path, UUID, and the offset at which this session begins.
+It says nothing else: a recorder that closes its file, or is killed, lets go of the file's lock. The process sleeps 50
+times as long as it kept a core busy, and longer while no viewer is there.
 """
 
 from __future__ import annotations
@@ -17,66 +17,66 @@ from pathlib import Path
 from typing import Protocol
 
 from tupli_mcap.errors import TupliError
-from tupli_mcap.live.follow import Follower, follow
-from tupli_mcap.live.target import Target, parse_target
 from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.viewer.live.follow import Follower, follow
+from tupli_mcap.viewer.live.target import Target, parse_target
 
 __all__ = ["LiveView"]
 
 _SHORTEST_REST = 1 / 20  # seconds between two looks
-_IDLE_REST = 0.25  # the same where nobody looks
+_IDLE_REST = 0.25  # the same while there is no viewer
 _LONGEST_REST = 3.0
-_REST = 50.0  # times as long as showing kept a core busy
-_PATIENCE = 60.0  # seconds for the recorder to tell of a file
+_REST = 50.0  # times as long as the last look kept a core busy
+_PATIENCE = 60.0  # seconds for the recorder to name a file
 
 
 class LiveView(Protocol):
     """A viewer, or a server that viewers connect to."""
 
     def show(self, follower: Follower) -> bool:
-        """Shows what is new. May take a while; must return, and say False, where there is nobody to see it."""
+        """Shows what is new; may take a while. Returns False if there is no viewer to see it."""
         ...
 
     def go_on(self, path: Path) -> None:
-        """What is shown next is in another file of the same rollout."""
+        """Goes on with another file of the same rollout."""
         ...
 
     def close(self) -> None:
-        """Lets go of the viewer, which stays as it is."""
+        """Lets go of the viewer, which stays open."""
         ...
 
 
 class _Files:
-    """The files that the recorder tells of, in their order."""
+    """The files that the recorder names on stdin, in their order."""
 
     def __init__(self) -> None:
-        self._stdin = open(0, "rb", buffering=0)  # noqa: SIM115 - not buffered, so that `select` sees what is left
+        self._stdin = open(0, "rb", buffering=0)  # noqa: SIM115 - `select` does not see what a buffer holds
         self._is_open = True
-        self._told: list[tuple[str, str, int]] = []
+        self._waiting: list[tuple[str, str, int]] = []
 
     def wait(self, seconds: float) -> None:
-        """Rests, unless the recorder says something, closes or dies."""
+        """Sleeps; ends early if the recorder names a file, closes or dies."""
         if not self._is_open:
             time.sleep(seconds)
         elif select.select([self._stdin], [], [], seconds)[0]:
             line = self._stdin.readline()
             self._is_open = bool(line)
             if line:
-                self._told.append(tuple(json.loads(line)))
+                self._waiting.append(tuple(json.loads(line)))
 
     def next(self, seconds: float) -> tuple[str, str, int] | None:
-        """The next file; None if the recorder does not tell of one in time."""
-        if not self._told:
+        """The next file; None if the recorder does not name one in time."""
+        if not self._waiting:
             self.wait(seconds)
-        return self._told.pop(0) if self._told else None
+        return self._waiting.pop(0) if self._waiting else None
 
 
 def _run(view: LiveView, files: _Files) -> None:
-    """Shows one file after the other, each until nobody records it any more."""
+    """Shows the files one after the other, each until nobody records it any more."""
     file = files.next(_PATIENCE)
     while file is not None:
         _show(view, files, *file)
-        file = files.next(0)  # told before the file before it was closed
+        file = files.next(0)  # a recorder that goes on names it before it closes the last one
         if file is not None:
             view.go_on(Path(file[0]))
 
@@ -87,7 +87,7 @@ def _show(view: LiveView, files: _Files, path: str, uuid: str, begin: int) -> No
     while not is_over:
         files.wait(rest)
         began = time.process_time()
-        is_over = not is_locked(Path(path))  # before the look: what came until then is shown
+        is_over = not is_locked(Path(path))  # asked before the look, so that the last look sees everything
         if follower is None:
             follower = follow(Path(path), uuid, begin)
         seen = False
@@ -100,23 +100,22 @@ def _show(view: LiveView, files: _Files, path: str, uuid: str, begin: int) -> No
 
 def _view_of(target: Target, title: str) -> LiveView:
     if target.kind == "foxglove":
-        from tupli_mcap.live.foxglove_view import FoxgloveView
+        from tupli_mcap.viewer.live.foxglove_view import FoxgloveView
 
         return FoxgloveView(target, title)
-    from tupli_mcap.live.rerun_view import RerunView
-    from tupli_mcap.viewer.live import Sketch
+    from tupli_mcap.viewer.live.rerun_view import RerunView
 
-    return RerunView(target, title, Sketch, _say)
+    return RerunView(target, title, _say)
 
 
 def _say(text: str) -> None:
-    """Tells the user, who sees what the recorder's process writes to stderr."""
+    """Writes to stderr, which is that of the recorder's process."""
     with contextlib.suppress(OSError, ValueError):
         print(f"tupli-mcap: {text}", file=sys.stderr, flush=True)
 
 
 def main() -> None:
-    """Whatever happens here is said once, and the rollout goes on."""
+    """Shows the rollout. Whatever fails here is said once, and the recorder goes on."""
     live, title = sys.argv[1:]
     try:
         view = _view_of(parse_target(live), title)
@@ -129,7 +128,7 @@ def main() -> None:
         _say(f"the live view has ended ({type(err).__name__}: {err}); the recording goes on")
     with contextlib.suppress(Exception):
         view.close()
-    os._exit(0)  # the viewer's library would wait for a viewer that takes nothing
+    os._exit(0)  # at a plain exit, the viewer's library would wait for a viewer that takes nothing
 
 
 if __name__ == "__main__":

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-import socket
 from typing import NamedTuple
 
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.viewer.process import LOCAL, answers
 
 __all__ = ["Target", "parse_target"]
 
 RERUN_PORT, FOXGLOVE_PORT = 9876, 8765
-_LOCAL = "127.0.0.1"
 _URL = re.compile(
     r"(?P<scheme>[a-z+]+)://(?P<host>\[[0-9a-fA-F:.]+\]|[^/:\[\]@?#\s]+)(:(?P<port>\d{1,5}))?(?P<path>/\S*)?"
 )
@@ -26,13 +25,9 @@ class Target(NamedTuple):
     port: int
     url: str = ""
 
-    def answers(self, seconds: float = 0.25) -> bool:
+    def answers(self) -> bool:
         """True if something listens there."""
-        try:
-            with socket.create_connection((self.host.strip("[]"), self.port), timeout=seconds):
-                return True
-        except OSError:
-            return False
+        return answers(self.host.strip("[]"), self.port)
 
 
 def parse_target(text: str) -> Target:
@@ -42,9 +37,9 @@ def parse_target(text: str) -> Target:
         RecordingError: it names none.
     """
     if text == "rerun":
-        return Target("rerun", _LOCAL, RERUN_PORT)
+        return Target("rerun", LOCAL, RERUN_PORT)
     if text == "foxglove":
-        return Target("foxglove", _LOCAL, FOXGLOVE_PORT)
+        return Target("foxglove", LOCAL, FOXGLOVE_PORT)
     found = _URL.fullmatch(text) if isinstance(text, str) else None
     port = int(found["port"] or 0) if found else 0
     if found and port < 1 << 16:

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.panels import Place, flat_values, named
+from tupli_mcap.viewer.panels.panel import Place, flat_values, named
 from tupli_mcap.viewer.sending import Times, blob_array, column_of, send_blobs, send_tensors
 
 __all__ = ["Camera", "Grid", "HeatMap", "Picture"]
@@ -161,9 +162,6 @@ class Camera:
         """Nothing: frames say all themselves."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        import pyarrow as pa
-        import rerun as rr
-
         if self.name not in block.recording.cameras:  # another recording beside it may have one
             return
         for piece in block.pieces:
@@ -171,16 +169,22 @@ class Camera:
             steps = frames.steps
             chosen = np.flatnonzero((steps >= piece.step) & (steps < piece.step + piece.end - piece.begin))
             for few in np.array_split(chosen, -(-len(chosen) // _FRAMES_AT_ONCE)) if len(chosen) else ():
-                encoded = [frames.encoded(int(i)) for i in few]
                 at = times.at(steps[few] - piece.step + piece.begin)
-                ends = np.cumsum([0, *(len(frame.data) for frame in encoded)])
-                blobs = blob_array(np.frombuffer(b"".join(frame.data for frame in encoded), np.uint8), ends)
-                kinds = pa.array([f"image/{frame.form}" for frame in encoded], pa.utf8())
-                columns = [
-                    column_of(rr.EncodedImage.descriptor_blob(), blobs),
-                    column_of(rr.EncodedImage.descriptor_media_type(), kinds),
-                ]
-                place.stream.send_columns(place.root + self.entity, at.columns, columns)
+                self.send_frames(place, [frames.encoded(int(i)) for i in few], at)
+
+    def send_frames(self, place: Place, frames: Sequence[EncodedFrame], times: Times) -> None:
+        """Sends one frame a row."""
+        import pyarrow as pa
+        import rerun as rr
+
+        ends = np.cumsum([0, *(len(frame.data) for frame in frames)])
+        blobs = blob_array(np.frombuffer(b"".join(frame.data for frame in frames), np.uint8), ends)
+        kinds = pa.array([f"image/{frame.form}" for frame in frames], pa.utf8())
+        columns = [
+            column_of(rr.EncodedImage.descriptor_blob(), blobs),
+            column_of(rr.EncodedImage.descriptor_media_type(), kinds),
+        ]
+        place.stream.send_columns(place.root + self.entity, times.columns, columns)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         return _side_by_side(self.title, roots, self.entity)

@@ -19,7 +19,6 @@ from mcap.opcode import Opcode
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import FRAMES_AREA, JournalContents, read_journal, recorded_journal
-from tupli_mcap.live.episodes import EpisodeNews, messages_of
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.records import (
@@ -48,6 +47,7 @@ from tupli_mcap.recording.recover.find_journal import belongs
 from tupli_mcap.recording.recover.prefix import prefix
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
+from tupli_mcap.viewer.live.episodes import EpisodeNews, messages_of
 
 __all__ = ["Follower", "NewInfo", "NewSteps", "follow"]
 

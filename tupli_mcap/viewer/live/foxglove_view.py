@@ -9,11 +9,11 @@ from typing import Any
 import foxglove
 import numpy as np
 
-from tupli_mcap.live.follow import Follower, NewSteps
-from tupli_mcap.live.target import Target
 from tupli_mcap.mcap.records import RECORD_HEADER
 from tupli_mcap.messages.images.codecs import CODEC
 from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
+from tupli_mcap.viewer.live.follow import Follower, NewSteps
+from tupli_mcap.viewer.live.target import Target
 
 __all__ = ["FoxgloveView"]
 

@@ -22,7 +22,7 @@ from tupli_mcap.recording.recover.evidence import Evidence
 from tupli_mcap.recording.recover.step_runs import StepRun, runs_in
 
 if TYPE_CHECKING:
-    from tupli_mcap.live.follow import NewSteps
+    from tupli_mcap.viewer.live.follow import NewSteps
 
 __all__ = ["EpisodeNews", "messages_of"]
 

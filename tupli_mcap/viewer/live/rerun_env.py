@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.live.follow import Follower, NewInfo, NewSteps
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER
 from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block, Piece
-from tupli_mcap.viewer.panels import Panel, Place, Rewards, Series
-from tupli_mcap.viewer.pictures import Camera, HeatMap
+from tupli_mcap.viewer.live.follow import Follower, NewInfo, NewSteps
+from tupli_mcap.viewer.panels import Camera, HeatMap, LiveInfos, Panel, Place, Rewards, Series
 from tupli_mcap.viewer.scene import Scene
 from tupli_mcap.viewer.sending import Times, send_scalars
-from tupli_mcap.viewer.words import LiveInfos
 
 __all__ = ["MOST_INFOS", "LiveEnv", "columns_of"]
 
@@ -30,20 +29,13 @@ MOST_INFOS = 300
 _IMAGES = 3
 _MAP_STEPS = 400
 _CDR = BODY - RECORD_HEADER.size
-_TERMINAL, _TIMEOUT, _INTERRUPTED = range(3)
+_NOTHING: Any = None  # in place of a recording: panels that ask for one are not sent blocks of a live view
 
 
 class _Columns(NamedTuple):
     states: Any
     actions: Any
     rewards: Any
-
-
-@dataclass(frozen=True)
-class _Ends:
-    """What panels ask a recording: how its episodes ended, by position."""
-
-    index: dict[str, Array]
 
 
 class _NewestMap:
@@ -192,24 +184,18 @@ class LiveEnv:
                     rows += self._shift
                     times = steps.facts.time[rows - steps.first]
                     part: Any = _Columns(self._nested(leaf, images), None, None)
-                    nobody: Any = None  # a picture asks only for its values
-                    block = Block(nobody, part, [], rows, times)
+                    block = Block(_NOTHING, part, [], rows, times)
                     panel.send(self._place, block, self._times(rows, times))
 
     def send_frames(self, follower: Follower) -> None:
         """Sends the newest frames."""
-        import rerun as rr
-
-        stream = self._place.stream
         for panel in self._cameras:
-            for row, frame in follower.frames(self._env, self._images):
-                stream.reset_time()
-                stream.set_time("step", sequence=row + self._shift)
-                stream.set_time("time", timestamp=np.datetime64(frame.time_ns, "ns"))
-                if self._seconds is not None:
-                    stream.set_time("episode_time", duration=(row + self._shift) * self._seconds)
-                image = rr.EncodedImage(contents=frame.data, media_type=f"image/{frame.form}")
-                stream.log(self._place.root + panel.entity, image)
+            found = follower.frames(self._env, self._images)
+            if found:
+                rows = np.array([row for row, _ in found]) + self._shift
+                frames = [frame for _, frame in found]
+                times = self._times(rows, np.array([frame.time_ns for frame in frames]))
+                panel.send_frames(self._place, frames, times)
 
     def _nested(self, leaf: Leaf, values: Array) -> Any:
         """A state of this leaf only."""
@@ -239,15 +225,14 @@ def columns_of(layout: StepLayout, decoder: MessageDecoder | None, steps: NewSte
     return _Columns(layout.nest_state(states), layout.nest_action(actions), layout.nest_reward(rewards))
 
 
-def _block(steps: NewSteps, columns: _Columns, bounds: list[int], ends: Sequence[int | None]) -> Block:
+def _block(steps: NewSteps, columns: Any, bounds: list[int], ends: Sequence[int | None]) -> Block:
     """The steps, and between each two of the bounds an episode, or what there is of it."""
     pieces = [
-        Piece(begin, end, i, int(steps.facts.step[begin]), how is not None)
-        for i, ((begin, end), how) in enumerate(zip(itertools.pairwise(bounds), ends, strict=True))
+        Piece(begin, end, i, int(steps.facts.step[begin]), how_ended)
+        for i, ((begin, end), how_ended) in enumerate(zip(itertools.pairwise(bounds), ends, strict=True))
     ]
-    asked: Any = _Ends({"end": np.array([_INTERRUPTED if how is None else how for how in ends])})
-    told: Any = columns
-    return Block(asked, told, pieces, np.arange(steps.first, steps.first + len(steps)), steps.facts.time)
+    number = np.arange(steps.first, steps.first + len(steps))
+    return Block(_NOTHING, columns, pieces, number, steps.facts.time)
 
 
 def _ends_of(steps: NewSteps, bounds: list[int]) -> list[int | None]:
@@ -256,9 +241,9 @@ def _ends_of(steps: NewSteps, bounds: list[int]) -> list[int | None]:
     found: list[int | None] = []
     for end in bounds[1:]:
         if terminal[end - 1] or timeout[end - 1]:
-            found.append(_TERMINAL if terminal[end - 1] else _TIMEOUT)
+            found.append(TERMINAL if terminal[end - 1] else TIMEOUT)
         else:
-            found.append(_INTERRUPTED if end < bounds[-1] else None)
+            found.append(INTERRUPTED if end < bounds[-1] else None)
     return found
 
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from tupli_mcap.viewer.panels import Panel, Series
-from tupli_mcap.viewer.pictures import Camera, Grid, HeatMap, Picture
+from tupli_mcap.viewer.panels import Camera, Grid, HeatMap, Infos, Lanes, Panel, Picture, Series, Words
 from tupli_mcap.viewer.scene import Scene
-from tupli_mcap.viewer.words import Infos, Lanes, Words
 
 __all__ = ["blueprint_of"]
 

@@ -13,7 +13,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
-from tupli_mcap.viewer.panels import PALETTE, Place, named, plot
+from tupli_mcap.viewer.panels.panel import PALETTE, Place, named, plot
 from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
 
 __all__ = ["Infos", "Lanes", "LiveInfos", "Words", "infos_of", "numbers_in"]

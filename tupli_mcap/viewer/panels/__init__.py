@@ -1,0 +1,15 @@
+"""Panels: a leaf, or what follows from the steps, as entities of a Rerun recording and a view on them.
+
+`panel` says what each of them can do; the kinds are in `numbers` (lines, reward and return), `images` (images, grids,
+heat maps, camera frames) and `texts` (texts, lanes of states, infos). `viewer.scene` chooses among them.
+"""
+
+from tupli_mcap.viewer.panels.images import Camera, Grid, HeatMap, Picture
+from tupli_mcap.viewer.panels.numbers import Rewards, Series
+from tupli_mcap.viewer.panels.panel import PALETTE, Panel, Place
+from tupli_mcap.viewer.panels.texts import Infos, Lanes, LiveInfos, Words, infos_of, numbers_in
+
+__all__ = [
+    "PALETTE", "Camera", "Grid", "HeatMap", "Infos", "Lanes", "LiveInfos", "Panel", "Picture", "Place", "Rewards",
+    "Series", "Words", "infos_of", "numbers_in",
+]  # fmt: skip

@@ -1,0 +1,122 @@
+"""Panels of numbers over time: lines for a leaf's dimensions, reward and return."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.viewer.blocks import Block
+from tupli_mcap.viewer.panels.panel import Place, flat_values, plot
+from tupli_mcap.viewer.sending import Times, send_scalars
+
+__all__ = ["Rewards", "Series"]
+
+_ENDS: Mapping[str, int] = {"terminal": 0xE4572EFF, "timeout": 0xF3A712FF, "interrupted": 0x9A9A9AFF}
+"""How an episode may end, by code, and the colour of its marker (RGBA)."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """Dimensions `dims` of a leaf as one entity of scalars, a line each.
+
+    column: the field of the steps that the leaf is in. stepped: the value is held, as an action is, rather than moved.
+    """
+
+    leaf: Leaf
+    column: str
+    entity: str
+    title: str
+    dims: Sequence[int]
+    names: Sequence[str]
+    stepped: bool = False
+
+    def declare(self, place: Place) -> None:
+        names = [place.told(name, alone=len(self.names) == 1) for name in self.names]
+        place.declare_series(self.entity, names, place.colors(len(names)), stepped=self.stepped)
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        values = flat_values(self.leaf, self.column, block)
+        if len(self.dims) < values.shape[1]:
+            values = values[:, list(self.dims)]
+        send_scalars(place.stream, place.root + self.entity, times, values)
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        told = len(roots) == 1 and len(self.names) > 1  # compared episodes are told beside the returns, once
+        return plot(self.title, [root + self.entity for root in roots], axis, legend=told)
+
+
+@dataclass
+class Rewards:
+    """The reward, the running return, and a marker at the end of each episode, by how it ended."""
+
+    leaves: Sequence[Leaf]
+    title: str = "reward and return"
+    column: str = "rewards"
+    _running: float = 0.0  # the return of an episode that goes on in the next block
+
+    def declare(self, place: Place) -> None:
+        import rerun as rr
+        from rerun.components import MarkerShape
+
+        for name, color in (("reward", 6), ("return", 2)):
+            place.declare_series(f"/{name}", [place.told(name, alone=True)], place.colors(1, color))
+        shapes = (MarkerShape.Cross, MarkerShape.Diamond, MarkerShape.Square)
+        for (name, color), shape in zip(_ENDS.items(), shapes, strict=True):
+            points = rr.SeriesPoints(
+                names=[name], colors=np.array([color], np.uint32), markers=[shape], marker_sizes=[5.0]
+            )
+            place.stream.log(f"{place.root}/end/{name}", points, static=True)
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        rewards = self._totals(block)
+        returns = self._returns(rewards, block)
+        send_scalars(place.stream, f"{place.root}/reward", times, rewards[:, None])
+        send_scalars(place.stream, f"{place.root}/return", times, returns[:, None])
+        heights = np.where(np.isfinite(returns), returns, 0.0)  # a marker has to be somewhere
+        for code, name in enumerate(_ENDS):
+            at = np.array([piece.end - 1 for piece in block.pieces if piece.how_ended == code], np.int64)
+            if len(at):
+                send_scalars(place.stream, f"{place.root}/end/{name}", times.at(at), heights[at][:, None])
+
+    def miss(self) -> None:
+        """Says that steps are left out before the next block: the return is unknown until the running episode ends."""
+        self._running = np.nan
+
+    def _totals(self, block: Block) -> Array:
+        total = np.zeros(len(block))
+        for leaf in self.leaves:
+            if leaf.dtype is not None and leaf.size:
+                total += flat_values(leaf, "rewards", block).sum(axis=1, dtype=np.float64)
+        return total
+
+    def _returns(self, rewards: Array, block: Block) -> Array:
+        """The return so far, after each step."""
+        returns = np.empty(len(rewards))
+        if np.isfinite(rewards).all():
+            sums = np.cumsum(rewards)
+            first = np.array([piece.begin for piece in block.pieces])
+            lengths = np.array([piece.end - piece.begin for piece in block.pieces])
+            returns = sums - np.repeat(sums[first] - rewards[first], lengths)
+        else:  # NaN and infinities must not spill into the next episode
+            for piece in block.pieces:
+                np.cumsum(rewards[piece.begin : piece.end], out=returns[piece.begin : piece.end])
+        head, tail = block.pieces[0], block.pieces[-1]
+        if head.step:  # its episode began in an earlier block
+            returns[head.begin : head.end] += self._running
+        self._running = 0.0 if tail.how_ended is not None else float(returns[-1])
+        return returns
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        import rerun.blueprint as rrb
+
+        ends = [f"{root}/end/{name}" for root in roots for name in _ENDS]
+        return rrb.Vertical(
+            plot("return", [*(f"{root}/return" for root in roots), *ends], axis),
+            plot("reward", [f"{root}/reward" for root in roots], axis, legend=False),
+            name=self.title,
+        )

@@ -1,0 +1,114 @@
+"""What every panel has, and where its entities go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.viewer.blocks import Block
+from tupli_mcap.viewer.sending import Times
+
+__all__ = ["PALETTE", "Panel", "Place", "flat_values", "named", "plot"]
+
+PALETTE: Final = (
+    0x4C9BE8FF, 0xF28E2BFF, 0x59C36AFF, 0xE15759FF, 0xB07AD9FF, 0xEDC948FF,
+    0x3FBFB5FF, 0xFF9DA7FF, 0xB58A6BFF, 0x8FA6C8FF, 0xA8C64DFF, 0xD264B6FF,
+)  # fmt: skip
+"""Colours that are told apart next to each other, on a light and on a dark ground (RGBA)."""
+
+
+class Place(NamedTuple):
+    """Where a panel's entities go: below `root` in a stream. `title` and `color` tell several episodes in one view
+    apart; they are empty where there is only one. `single`: one step is all that comes, which makes no line."""
+
+    stream: Any
+    root: str = ""
+    title: str = ""
+    color: int | None = None
+    single: bool = False
+
+    def told(self, name: str, *, alone: bool) -> str:
+        """The name of a series: of the episode where the view shows only this one of each."""
+        if not self.title:
+            return name
+        return self.title if alone else f"{name} · {self.title}"
+
+    def colors(self, count: int, first: int = 0) -> Array:
+        """Colours for so many series: that of the episode, or those of the palette from `first` on."""
+        if self.color is not None:
+            return np.full(count, self.color, np.uint32)
+        return np.resize(np.roll(np.array(PALETTE, np.uint32), -first), count)
+
+    def declare_series(
+        self, entity: str, names: Sequence[str], colors: Array, *, stepped: bool = False
+    ) -> None:
+        """How the scalars of an entity are drawn: as lines, or a single row as points."""
+        import rerun as rr
+        from rerun.components import AggregationPolicy, InterpolationMode, MarkerShape
+
+        style: Any
+        if self.single:
+            shapes = [MarkerShape.Circle] * len(names)
+            style = rr.SeriesPoints(
+                names=names, colors=colors, markers=shapes, marker_sizes=[4.0] * len(names)
+            )
+        else:
+            style = rr.SeriesLines(
+                names=names,
+                colors=colors,
+                interpolation_mode=InterpolationMode.StepAfter if stepped else None,
+                aggregation_policy=AggregationPolicy.MinMax,
+            )
+        self.stream.log(self.root + entity, style, static=True)
+
+
+class Panel(Protocol):
+    """Something that is shown."""
+
+    @property
+    def title(self) -> str: ...
+
+    @property
+    def column(self) -> str:
+        """The field that it shows. Only those of "states" have a value after the last step of an episode."""
+        ...
+
+    def declare(self, place: Place) -> None:
+        """Sends what does not change."""
+        ...
+
+    def send(self, place: Place, block: Block, times: Times) -> None:
+        """Sends a block of steps; of "states", a block `with_finals`."""
+        ...
+
+    def view(self, roots: Sequence[str], axis: Any) -> Any:
+        """The view on the entities below each root; `axis` is the time axis of plots."""
+        ...
+
+
+def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
+    """A leaf's values in a block: rows x dimensions."""
+    values: Array = leaf.get(getattr(block.columns, column))
+    return values.reshape(len(block), -1)
+
+
+def named(title: str, root: str) -> str:
+    """A view's title: of several episodes, which one it is comes first."""
+    return f"{root.rpartition('/')[2]}: {title}" if root else title
+
+
+def plot(title: str, entities: Sequence[str], axis: Any, *, legend: bool = True) -> Any:
+    """A view of series over time. A legend of what the title says would only hide it."""
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(
+        name=title,
+        origin="/",
+        contents=list(entities),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+        axis_x=axis,
+    )
