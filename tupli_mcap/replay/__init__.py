@@ -1,4 +1,9 @@
-"""Recordings replayed: the environment rebuilt, every episode taken again, and compared bit for bit."""
+"""Replays recordings: rebuilds the environment, takes every episode again, and compares it bit for bit.
+
+`certify` does so for a whole recording and gives a `Certificate`; `render` also keeps what the environment renders.
+`starts` decides how each episode is started again, `reapply` resets and steps the environment, `compare` compares with
+`recorded_values`, `attempt` is the three together for one episode, `movie` keeps rendered frames and writes films.
+"""
 
 from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, Skipped
 from tupli_mcap.replay.certify import certify

@@ -1,4 +1,4 @@
-"""One episode replayed and compared, and what can be said of why it differs."""
+"""Replays one episode and compares it; tells whether its environment repeats itself."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.replay.compare import Checker, Tally
-from tupli_mcap.replay.plan import EpisodePlan
 from tupli_mcap.replay.reapply import EnvironmentFailedError, Moment, Replayer, recorded_actions
-from tupli_mcap.replay.values import Block, RecordedValues
+from tupli_mcap.replay.recorded_values import Block, RecordedValues
+from tupli_mcap.replay.starts import EpisodePlan
 
 __all__ = ["Attempt", "Watch", "attempt", "repeats_itself"]
 
 Watch = Callable[[int], None]
-"""Called when the environment is in the state of a step, and that agrees; the last one is the final state."""
+"""Called with the number of each step whose state agrees, while the environment is in it; last for the final state."""
 
-_SAMPLE = 2000  # steps that are taken twice to see whether an environment repeats itself
+_SAMPLE = 2000  # steps that are compared to see whether an environment repeats itself
 
 
 class Attempt(NamedTuple):
@@ -36,7 +36,7 @@ class Attempt(NamedTuple):
 
 
 class _Actions:
-    """The actions of the block that is at work."""
+    """The actions of the block that is being replayed."""
 
     def __init__(self, recording: Recording, *, plain: bool) -> None:
         self._recording = recording
@@ -63,8 +63,8 @@ def attempt(
     checker: Checker,
     watch: Watch | None = None,
 ) -> Attempt:
-    """Takes an episode again and compares it, up to its end or the environment's; with `watch`, up to the first
-    difference."""
+    """Takes an episode again and compares it, up to its recorded end or the environment's end; with `watch`, up to the
+    first difference."""
     tally = Tally()
     actions = _Actions(recording, plain=replayer.plain)
     moments = replayer.moments(plan, actions)
@@ -81,7 +81,7 @@ def attempt(
                     watch(step)
                 moment = next(moments)
                 if not checker.result(step, moment, tally) and step + 1 < values.length:
-                    tally.ended = step  # stepping on would tell nothing
+                    tally.ended = step  # the environment is over: no later step can be compared
                     return Attempt(tally)
         final = values.final_state
         if final is not None:

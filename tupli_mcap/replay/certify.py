@@ -1,4 +1,4 @@
-"""`certify`: a whole recording replayed and compared."""
+"""`certify`: replays a whole recording and compares it."""
 
 from __future__ import annotations
 
@@ -14,23 +14,25 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.sign.carried_code import foreign_options, options_are_trusted
 from tupli_mcap.replay.attempt import Attempt, Watch, attempt, repeats_itself
-from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, SkipKind, Skipped
+from tupli_mcap.replay.certificate import (
+    REASONS,
+    Certificate,
+    Counts,
+    Divergence,
+    SkipKind,
+    Skipped,
+    content_digest,
+    platform_facts,
+    versions_of,
+)
 from tupli_mcap.replay.compare import Checker, Difference
-from tupli_mcap.replay.facts import content_digest, platform_facts, versions_of
-from tupli_mcap.replay.plan import EpisodePlan, plan_episodes
 from tupli_mcap.replay.reapply import Replayer, brief
-from tupli_mcap.replay.values import RecordedValues, recorded_values
+from tupli_mcap.replay.recorded_values import RecordedValues, recorded_values
+from tupli_mcap.replay.starts import EpisodePlan, needed_for, plan_episodes, up_to_last
 
 __all__ = ["Certifier", "certify"]
 
 _MAX_DIVERGENCES = 100
-_REASONS: dict[SkipKind, str] = {
-    "unseeded": "reset without a seed, from a random state that the recording does not hold",
-    "after_divergence": "reset without a seed, after an episode that diverged",
-    "no_predecessor": "reset without a seed, after steps or episodes that are not in the recording any more",
-    "untrusted": "reset with options that need trust, such as names of files, or after such a reset; "
-    "`tupli-mcap trust FILE` or --trust (trust=True) lets the environment have them",
-}
 
 
 def certify(
@@ -69,7 +71,7 @@ def certify(
 class Certifier:
     """Replays the chosen episodes, and what they depend on; `run` does it once.
 
-    What is to be done beside comparing is for a subclass: `_build`, `_watch` and `_stops` are its to replace.
+    A subclass that does more than compare overrides `_build`, `_watch` and `_stops`.
     """
 
     def __init__(
@@ -89,17 +91,17 @@ class Certifier:
         self._versions: dict[str, str] | None = None
         self._outcomes: dict[int, Divergence | SkipKind | None] = {}  # by position
         self._done = 0
-        self._plain = False  # Python's numbers in actions
-        self._settled = False  # which of the two it is
+        self._plain = False  # whether actions are given with Python's numbers
+        self._settled = False  # whether that is known
         self._deterministic: bool | None = None
         self._stopped = False
-        self._any_options: bool | None = None  # whether resets may be given options that are more than data
+        self._any_options: bool | None = None  # whether resets may be given options that could run code
 
     def run(self) -> Certificate:
         """Replays and compares; the result."""
         captured = self._record is not None and self._record.pickle is not None
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what the environment has to say, it said when it was recorded
+            warnings.simplefilter("ignore")  # the environment warned when it was recorded
             if self._chosen:
                 self._checker = Checker(self._recording.layout, casts=self._recording.is_vector)
                 for plans in plan_episodes(self._recording, captured=captured):
@@ -118,7 +120,7 @@ class Certifier:
         return self._recording.benchmark.make_env(trust=self._trust)
 
     def _watch(self, plan: EpisodePlan, replayer: Replayer) -> Watch | None:
-        """Who watches the next attempt at an episode; it may not be the last one."""
+        """What watches the next attempt at an episode, which may not be the last one."""
         return None
 
     def _stops(self, plan: EpisodePlan, outcome: Divergence | SkipKind | None) -> bool:
@@ -129,10 +131,10 @@ class Certifier:
         return Replayer(self._make, owned=self._given is None, plain=plain)
 
     def _sub_environment(self, plans: list[EpisodePlan]) -> None:
-        """The chosen episodes of one sub-environment, and what they go on from; everything before them too if a wrapper
-        seems to carry state beyond a seed."""
-        everything = _up_to_last(plans, self._chosen)
-        needed = _needed(everything, self._chosen)
+        """Replays the chosen episodes of one sub-environment and those they go on from. If one differs, replays all
+        before them too: a wrapper may carry state beyond a seed."""
+        everything = up_to_last(plans, self._chosen)
+        needed = needed_for(everything, self._chosen)
         self._replay(needed)
         if len(needed) < len(everything) and self._given is None:
             outcomes = [self._outcomes.get(plan.position) for plan in needed if plan.number in self._chosen]
@@ -141,7 +143,7 @@ class Certifier:
                 self._replay(everything)
 
     def _replay(self, plans: list[EpisodePlan]) -> None:
-        """Episodes in order, on one environment."""
+        """Replays episodes in order, on one environment."""
         replayer = self._replayer(plain=self._plain)
         doubt: SkipKind | None = "unseeded"
         try:
@@ -169,7 +171,7 @@ class Certifier:
             replayer.close()
 
     def _withheld(self, plan: EpisodePlan) -> bool:
-        """Whether an episode is not reset: a stranger's options for code of this machine are more than data."""
+        """Whether an episode is not reset, since its options could run code and are not trusted."""
         if not any(foreign_options(reset.options) for reset in plan.resets):
             return False
         if self._any_options is None:
@@ -187,8 +189,8 @@ class Certifier:
     def _attempt(
         self, plan: EpisodePlan, values: RecordedValues, replayer: Replayer
     ) -> tuple[Attempt, Replayer]:
-        """The episode on the environment that took those before it, or else on a new one: a recording may have
-        been continued in another process, and its policy may have given Python's numbers."""
+        """Tries the episode on the environment that took those before it, then on new ones: the recording may have been
+        continued in another process, and its policy may have given Python's numbers."""
         used = replayer.used
         found = self._attempted(plan, values, replayer)
         if found.agrees:
@@ -211,7 +213,7 @@ class Certifier:
         watch = self._watch(plan, replayer)
         return attempt(self._recording, replayer, plan, values, self._checker, watch)
 
-    # ---- what is said of a difference
+    # ---- the first difference of an episode
 
     def _divergence(self, plan: EpisodePlan, values: RecordedValues, found: Attempt) -> Divergence:
         tally, first, error = found.tally, found.tally.first, found.error
@@ -304,7 +306,7 @@ class Certifier:
 
     def _skipped(self, outcomes: dict[int, Divergence | SkipKind | None]) -> list[Skipped]:
         skipped = []
-        for kind, reason in _REASONS.items():
+        for kind, reason in REASONS.items():
             positions = [p for p, o in outcomes.items() if o == kind]
             if positions:
                 counts = self._counts(positions)
@@ -329,23 +331,6 @@ def _chosen(recording: Recording, episodes: Sequence[int] | None) -> frozenset[i
             "`tupli-mcap episodes` lists them"
         )
     return chosen
-
-
-def _up_to_last(plans: list[EpisodePlan], chosen: frozenset[int]) -> list[EpisodePlan]:
-    last = max((i for i, plan in enumerate(plans) if plan.number in chosen), default=-1)
-    return plans[: last + 1]
-
-
-def _needed(plans: list[EpisodePlan], chosen: frozenset[int]) -> list[EpisodePlan]:
-    """The chosen episodes and those before them that they go on from."""
-    needed = []
-    wanted = False
-    for plan in reversed(plans):
-        wanted = wanted or plan.number in chosen
-        if wanted:
-            needed.append(plan)
-            wanted = not plan.starts_chain
-    return needed[::-1]
 
 
 def _check_spaces(recording: Recording, env: gym.Env[Any, Any]) -> None:

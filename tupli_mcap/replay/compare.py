@@ -1,4 +1,4 @@
-"""Bit for bit: what an environment returned against what a recording holds.
+"""Compares what an environment returns with what a recording holds, bit for bit.
 
 A value agrees if recording it again would store the same bytes: in the recorded dtype, with the same sign of zero and
 payload of NaN.
@@ -54,7 +54,7 @@ class Tally:
     _last: int = field(default=-1, repr=False)
 
     def note(self, difference: Difference) -> None:
-        """Takes a difference in; they come in the order of the steps."""
+        """Adds a difference; they come in the order of the steps."""
         if self.first is None:
             self.first = difference
         if difference.step != self._last:
@@ -177,7 +177,7 @@ class Checker:
         return same
 
     def _stored(self, leaf: Leaf, dtype: DType, value: Any) -> np.ndarray[Any, Any]:
-        """What a recorder makes of a value.
+        """The value as a recorder stores it.
 
         Raises:
             StepError: it cannot be recorded.

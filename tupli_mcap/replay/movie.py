@@ -1,25 +1,94 @@
-"""Pictures as a film that everybody can play: MP4 by PyAV (extra `video`), GIF by Pillow (extra `frames`)."""
+"""Rendered frames: kept in a temporary file, for an episode may have thousands, and written as MP4 (by PyAV, extra
+`video`) or GIF (by Pillow, extra `frames`)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tupli_mcap.errors import RecordingError, missing_extra
-from tupli_mcap.messages.images.pictures import Picture, resized
+from tupli_mcap.messages.frames import EncodedFrame
+from tupli_mcap.messages.images.pictures import FrameFormat, Picture, decode_picture, encode_picture, resized
 
-__all__ = ["Indexed", "check_movie", "write_movie"]
+__all__ = ["Indexed", "RenderedFrames", "check_movie", "write_movie"]
 
-_GIF_FPS = 50  # browsers show faster ones at 10 frames a second
+_GIF_FPS = 50  # browsers slow faster ones down to 10 frames a second
 _GIF_COLOURS = 256
 _GIF_SAMPLE = 15_000  # pixels that the colours of a picture with more than that are chosen from
 _CODECS = ("libx264", "h264", "mpeg4")
+
+
+class _Take(NamedTuple):
+    """A frame in the temporary file."""
+
+    step: int
+    offset: int
+    size: int
+
+
+class RenderedFrames:
+    """Frames by episode, as `NewFrames` has them, in a temporary file; a context manager that removes it.
+
+    `times` of an episode says when it was in the state of each step (ns).
+    """
+
+    def __init__(self, camera: str, form: FrameFormat) -> None:
+        self.camera = camera
+        self._form: FrameFormat = form
+        self._takes: dict[int, list[_Take]] = {}
+        self._times: dict[int, Sequence[int]] = {}
+        self._file = tempfile.TemporaryFile(prefix="tupli-mcap-")  # noqa: SIM115 - closed by close()
+        self._end = 0
+
+    def begin(self, episode: int, times: Sequence[int]) -> None:
+        """Starts an episode, over again if there are frames of it."""
+        self._takes[episode], self._times[episode] = [], times
+
+    def add(self, episode: int, step: int, picture: Picture) -> None:
+        """Appends the frame of a step."""
+        data = encode_picture(picture, self._form)
+        self._file.seek(self._end)
+        self._file.write(data)
+        self._takes[episode].append(_Take(step, self._end, len(data)))
+        self._end += len(data)
+
+    @property
+    def counts(self) -> dict[int, int]:
+        """Frames by episode, those with none left out."""
+        return {episode: len(takes) for episode, takes in self._takes.items() if takes}
+
+    def of(self, episode: int) -> Iterator[tuple[int, EncodedFrame]] | None:
+        """(step, frame) of an episode; None if it has none."""
+        return self._read(episode) if self._takes.get(episode) else None
+
+    def _read(self, episode: int) -> Iterator[tuple[int, EncodedFrame]]:
+        times = self._times[episode]
+        for take in self._takes[episode]:
+            self._file.seek(take.offset)
+            yield take.step, EncodedFrame(times[take.step], self._form, self._file.read(take.size))
+
+    def pictures(self, episodes: Sequence[int]) -> Iterator[Picture]:
+        """The frames of episodes, one after another."""
+        for episode in episodes:
+            for step, frame in self._read(episode):
+                yield decode_picture(frame.data, f"frame of step {step}")
+
+    def close(self) -> None:
+        """Throws the frames away."""
+        self._file.close()
+
+    def __enter__(self) -> RenderedFrames:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def check_movie(suffix: str) -> None:
@@ -71,7 +140,8 @@ def _write_mp4(path: Path, first: Picture, rest: Iterator[Picture], fps: float) 
 
 
 def _even(picture: Picture) -> Picture:
-    """The picture with its last row and column once more where they are odd in number: colours are stored by 2 x 2."""
+    """The picture with an even height and width, since colours are stored for 2 x 2 pixels: repeats the last row or
+    column."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
@@ -118,7 +188,7 @@ class Indexed:
         return image.quantize(palette=palette, dither=Image.Dither.NONE)
 
     def _exact(self, picture: Picture, colours: Picture) -> Any:
-        """Pillow, which chooses colours even where there are few, takes ten times as long."""
+        """An image of at most 256 colours, each kept as it is. (Pillow would choose colours again.)"""
         from PIL import Image
 
         if self._places is None:

@@ -1,6 +1,6 @@
-"""An episode taken again: the environment is reset with the recorded seed and options, and stepped with its actions.
+"""Takes an episode again: resets the environment with the recorded seed and options, steps it with the actions.
 
-Only what the environment returns is given; comparing, rendering and showing it are for others.
+Yields what the environment returns; comparing and rendering are done elsewhere.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.episode import item_getter
-from tupli_mcap.replay.plan import EpisodePlan, ResetCall
+from tupli_mcap.replay.starts import EpisodePlan, ResetCall
 
 __all__ = ["EnvironmentFailedError", "Moment", "Replayer", "recorded_actions"]
 
@@ -47,7 +47,7 @@ class Moment(NamedTuple):
 class Replayer:
     """Takes the episodes of one sub-environment again, in the order in which it is asked to.
 
-    make: builds the environment; owned: it is closed when it is not needed any more, otherwise it is the caller's.
+    make: builds the environment. owned: close it when it is not needed any more; otherwise it is the caller's.
     plain: numbers in actions are Python's, not NumPy's; a recording does not tell which ones the policy gave.
 
     One environment serves all episodes, since wrappers may carry state from one to the next, until an episode says
@@ -87,7 +87,7 @@ class Replayer:
             EnvironmentFailedError: the environment raised.
         """
         if plan.how == "drawn" and self.used:
-            self.close()  # an environment draws its own seed in its first reset only: it was another one
+            self.close()  # an environment draws its own seed only in its first reset, so a new one began here
         moment = self._start(plan)
         yield moment
         step = self.env.step
@@ -105,7 +105,7 @@ class Replayer:
         env = self.env
         if plan.auto and self._resets_itself and self._last is not None:
             try:
-                state, *_ = env.step(self._last_action)  # the action is not looked at
+                state, *_ = env.step(self._last_action)  # Autoreset ignores the action after an end
             except (Exception, SystemExit) as err:
                 raise EnvironmentFailedError(-1, err) from err
             self._last = Moment(state)
@@ -114,7 +114,7 @@ class Replayer:
         for seed, text in plan.resets or (ResetCall(None, ""),):
             options = jsonvalue.loads(text) if text else None
             if isinstance(options, dict):
-                options.pop("reset_mask", None)  # meant for the vector environment, which takes it out too
+                options.pop("reset_mask", None)  # for the vector environment, which removes it too
             self._used = True
             try:
                 state, info = env.reset(seed=seed, options=options)
@@ -129,7 +129,7 @@ class Replayer:
         env, self._env = self._env, None
         self._last = None
         if env is not None and self._owned:
-            with contextlib.suppress(Exception):  # nothing depends on it any more
+            with contextlib.suppress(Exception):  # the environment is not used again
                 env.close()
 
 

@@ -1,4 +1,4 @@
-"""`render`: frames of a recording that has none, from its environment, replayed and compared step by step."""
+"""`render`: makes frames for a recording that has none, by replaying its environment and comparing each step."""
 
 from __future__ import annotations
 
@@ -21,10 +21,9 @@ from tupli_mcap.recording.write.options import CAMERA, RENDER_MODE
 from tupli_mcap.replay.attempt import Watch
 from tupli_mcap.replay.certificate import Divergence, SkipKind, Skipped
 from tupli_mcap.replay.certify import Certifier
-from tupli_mcap.replay.film import Film
-from tupli_mcap.replay.movie import check_movie, write_movie
-from tupli_mcap.replay.plan import EpisodePlan
+from tupli_mcap.replay.movie import RenderedFrames, check_movie, write_movie
 from tupli_mcap.replay.reapply import Replayer, brief
+from tupli_mcap.replay.starts import EpisodePlan
 from tupli_mcap.storage.sidecar import Notes
 
 __all__ = ["RenderReport", "RenderedEpisode", "render"]
@@ -124,33 +123,14 @@ def render(
     kind = _check_target(recording, goal, overwrite=overwrite)
     if every < 1 or (width is not None and not 1 <= width <= 1 << 14):
         raise RecordingError(f"expected every >= 1 and a width of 1 to 16384, found {every} and {width}")
-    form = check_format(frame_format if kind == ".mcap" else "png")
-    check_movie(kind)
     chosen = _numbers(recording, episodes)
-    with Film(CAMERA, form) as film:
-        renderer = _Renderer(recording, trust, chosen, env, progress, film, every, width)
-        certificate = renderer.run()
-        counts = film.counts
-        if counts:
-            _write(recording, goal, kind, film, [n for n in chosen if n in counts], renderer.fps)
-    lengths = dict(zip(recording.index["episode"].tolist(), recording.index["length"].tolist(), strict=True))
-    done = tuple(
-        RenderedEpisode(n, lengths[n], counts.get(n, 0), n in renderer.agreed)
-        for n in chosen
-        if n in counts or n in renderer.agreed
-    )
-    height, wide = renderer.size
-    return RenderReport(
-        path=goal if counts else None,
-        episodes=done,
-        divergence=renderer.divergence,
-        skipped=tuple(certificate.skipped),
-        fps=renderer.fps,
-        width=wide,
-        height=height,
-        signature_left_out=kind == ".mcap" and bool(counts) and SIGNATURE_NAME in recording.attachments,
-        seconds=time.perf_counter() - began,
-    )
+    with RenderedFrames(CAMERA, check_format(frame_format if kind == ".mcap" else "png")) as frames:
+        renderer = _Renderer(recording, trust, chosen, env, progress, frames, every, width)
+        skipped = renderer.run().skipped
+        order = [number for number in chosen if number in frames.counts]
+        if order:
+            _write(recording, goal, kind, frames, order, renderer.fps)
+        return renderer.report(goal if order else None, chosen, skipped, time.perf_counter() - began)
 
 
 def _check_target(recording: Recording, goal: Path, *, overwrite: bool) -> str:
@@ -165,6 +145,7 @@ def _check_target(recording: Recording, goal: Path, *, overwrite: bool) -> str:
         )
     if not goal.absolute().parent.is_dir():
         raise RecordingError(f"{goal}: there is no directory {goal.parent}; make it")
+    check_movie(kind)
     return kind
 
 
@@ -188,19 +169,21 @@ def _deleted(recording: Recording) -> set[int]:
     return set() if recording.path is None else Notes.read(recording.path).about(recording.metadata).deleted
 
 
-def _write(recording: Recording, goal: Path, kind: str, film: Film, order: list[int], fps: float) -> None:
+def _write(
+    recording: Recording, goal: Path, kind: str, frames: RenderedFrames, order: list[int], fps: float
+) -> None:
     if kind == ".mcap":
         deleted = _deleted(recording)
         kept = [n for n in recording.index["episode"].tolist() if n not in deleted] if deleted else None
-        rewrite_recording(recording, goal, episodes=kept, frames=film)
+        rewrite_recording(recording, goal, episodes=kept, frames=frames)
         return
     with replacing(goal) as (_, temporary):
-        count = sum(film.counts[number] for number in order)
-        write_movie(temporary, kind, film.pictures(order), count, fps)
+        count = sum(frames.counts[number] for number in order)
+        write_movie(temporary, kind, frames.pictures(order), count, fps)
 
 
 class _Renderer(Certifier):
-    """A replay that renders the chosen episodes, and ends at the first difference."""
+    """Renders the chosen episodes while they are replayed, up to the first difference."""
 
     def __init__(
         self,
@@ -209,12 +192,12 @@ class _Renderer(Certifier):
         chosen: list[int],
         env: gym.Env[Any, Any] | None,
         progress: Callable[[int], None] | None,
-        film: Film,
+        frames: RenderedFrames,
         every: int,
         width: int | None,
     ) -> None:
         super().__init__(recording, trust, frozenset(chosen), env, progress)
-        self._film = film
+        self._frames = frames
         self._every = every
         self._width = width
         self._fps: float | None = None
@@ -234,6 +217,32 @@ class _Renderer(Certifier):
         found = {int(numbers[p]) for p, outcome in self._outcomes.items() if outcome is None}
         return found & self._chosen
 
+    def report(
+        self, path: Path | None, chosen: list[int], skipped: Sequence[Skipped], seconds: float
+    ) -> RenderReport:
+        """What was rendered, into the file at `path`."""
+        index, counts, agreed = self._recording.index, self._frames.counts, self.agreed
+        lengths = dict(zip(index["episode"].tolist(), index["length"].tolist(), strict=True))
+        episodes = tuple(
+            RenderedEpisode(number, lengths[number], counts.get(number, 0), number in agreed)
+            for number in chosen
+            if number in counts or number in agreed
+        )
+        height, width = self.size
+        return RenderReport(
+            path=path,
+            episodes=episodes,
+            divergence=self.divergence,
+            skipped=tuple(skipped),
+            fps=self.fps,
+            width=width,
+            height=height,
+            signature_left_out=path is not None
+            and path.suffix.lower() == ".mcap"
+            and SIGNATURE_NAME in self._recording.attachments,
+            seconds=seconds,
+        )
+
     def _make(self) -> gym.Env[Any, Any]:
         env = super()._make()
         if env.render_mode != RENDER_MODE:
@@ -252,7 +261,7 @@ class _Renderer(Certifier):
             try:
                 benchmark.make_env(trust=self._trust).close()
             except TupliError:
-                raise err from None  # it cannot be built at all, and says why
+                raise err from None  # it cannot be built without rendering either: the first error says why
             raise self._cannot_render(brief(err.__cause__ or err)) from err
 
     def _cannot_render(self, why: str) -> RecordingError:
@@ -274,11 +283,11 @@ class _Renderer(Certifier):
             return lambda step: None
         number, length = plan.number, int(self._recording.index["length"][plan.position])
         times = self._recording.read([plan.position], fields=["times"]).times.tolist()
-        self._film.begin(number, [int(self._recording.index["start_time"][plan.position]), *times])
+        self._frames.begin(number, [int(self._recording.index["start_time"][plan.position]), *times])
 
         def watch(step: int) -> None:
             if step % self._every == 0 or step == length:
-                self._film.add(number, step, self._picture(replayer.env, number, step))
+                self._frames.add(number, step, self._picture(replayer.env, number, step))
 
         return watch
 

@@ -1,4 +1,4 @@
-"""The recorded values of episodes in memory: many short episodes at once, a long one in parts."""
+"""Reads the values of episodes for comparing: many short episodes at once, a long one in parts."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _cut(layout: StepLayout, columns: Columns, start: int, stop: int) -> Columns
 
 
 def _row_size(recording: Recording) -> int:
-    """Bytes of a step in memory, about."""
+    """About how many bytes a step takes in memory."""
     layout = recording.layout
     sizes = [
         leaf.size * layout.dtypes[leaf.name].itemsize for leaf in layout.leaves if leaf.dtype is not None

@@ -1,4 +1,4 @@
-"""How each episode of a recording is started again, decided from what the recording says, before anything runs.
+"""Decides how each episode of a recording is started again, from the recording alone.
 
 A reset with a seed starts a chain. A reset without one goes on with the random stream of the episode before it, so
 it can be repeated only by repeating all episodes from the chain's start, in their order, on one environment.
@@ -6,12 +6,13 @@ it can be repeated only by repeating all episodes from the chain's start, in the
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Literal, NamedTuple
 
 from tupli_mcap.messages.episodes import INTERRUPTED
 from tupli_mcap.recording import Recording
 
-__all__ = ["EpisodePlan", "How", "plan_episodes"]
+__all__ = ["EpisodePlan", "How", "needed_for", "plan_episodes", "up_to_last"]
 
 How = Literal["seeded", "drawn", "captured", "follows", "continues", "unknown"]
 
@@ -74,10 +75,10 @@ def _plan(recording: Recording, position: int, before: int | None, captured: boo
     row = recording.index[position]
     start = recording.episode_start(position)
     number = int(row["episode"])
-    # Numbers count over all sub-environments: whose episode is missing cannot be said.
+    # Episodes are numbered across sub-environments, so a missing number may be of any of them.
     gap = number != position if before is None else number - position != _shift(recording, before)
     after_end = before is not None and recording.index[before]["end"] != INTERRUPTED
-    # an episode that was cut out of damage, or made by hand, does not tell where it left the environment
+    # without a final state (cut out of damage, or made by hand), it is not known where it left the environment
     gap = gap or (before is not None and recording.index[before]["final_row"] < 0)
     earlier = recording.resets_before(position)
     lost = [i for i, reset in enumerate(earlier) if reset.continued]
@@ -106,3 +107,21 @@ def _plan(recording: Recording, position: int, before: int | None, captured: boo
 
 def _shift(recording: Recording, position: int) -> int:
     return int(recording.index[position]["episode"]) - position
+
+
+def up_to_last(plans: list[EpisodePlan], chosen: Collection[int]) -> list[EpisodePlan]:
+    """The plans up to the last chosen episode."""
+    last = max((i for i, plan in enumerate(plans) if plan.number in chosen), default=-1)
+    return plans[: last + 1]
+
+
+def needed_for(plans: list[EpisodePlan], chosen: Collection[int]) -> list[EpisodePlan]:
+    """The chosen episodes and those before them that they go on from."""
+    needed = []
+    wanted = False
+    for plan in reversed(plans):
+        wanted = wanted or plan.number in chosen
+        if wanted:
+            needed.append(plan)
+            wanted = not plan.starts_chain
+    return needed[::-1]
