@@ -26,8 +26,8 @@ from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
-from tupli_mcap.viewer.companions import companion_topics, write_companions
-from tupli_mcap.viewer.foxglove_layout import foxglove_layout
+from tupli_mcap.viewer.companion_channels import companion_topics, write_companions
+from tupli_mcap.viewer.to_mcap import foxglove_layout
 
 SPACE = spaces.Dict(
     {

@@ -36,7 +36,8 @@ from tupli_mcap.errors import MissingExtraError, RecordingError
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
-from tupli_mcap.viewer.live.follow import Follower, NewSteps, follow
+from tupli_mcap.viewer.live.follow import Follower, follow
+from tupli_mcap.viewer.live.new_rows import NewSteps
 from tupli_mcap.viewer.live.rerun_panels import LivePanels
 from tupli_mcap.viewer.live.target import parse_target
 

@@ -33,7 +33,7 @@ from tupli_mcap import (
     write_recording,
 )
 from tupli_mcap.cli import app
-from tupli_mcap.cli.sparklines import PLAIN, sparkline
+from tupli_mcap.cli.info import PLAIN, sparkline
 from tupli_mcap.errors import install_line
 from tupli_mcap.plots import Measured, Report, report
 from tupli_mcap.plots.draw_trace import by_scale

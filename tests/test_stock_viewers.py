@@ -26,7 +26,7 @@ from test_golden import NAMES, finished
 
 from tupli_mcap.recording import Recording
 from tupli_mcap.spaces.leaves import Leaf
-from tupli_mcap.viewer.companions import write_companions
+from tupli_mcap.viewer.companion_channels import write_companions
 
 DECODERS = Path(__file__).parent / "foxglove"
 

@@ -34,8 +34,8 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli import app
 from tupli_mcap.cli import terminal as terminal_module
+from tupli_mcap.cli.info import print_episodes
 from tupli_mcap.cli.output import print_json
-from tupli_mcap.cli.recordings import print_episodes
 from tupli_mcap.cli.terminal import one_line, say_json, visible
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.schema import ArtifactMetadata, EpisodeHeader, EpisodeMetadataCallback, RLTuple
@@ -336,7 +336,7 @@ def test_errors_of_other_peoples_code(tmp_path: Path) -> None:
         "record", "CartPole-v1", "-o", "a.mcap", "--policy", "warning:act", "--steps", 3
     )
     script = (
-        "import sys, tupli_mcap.cli.recordings as commands\n"
+        "import sys, tupli_mcap.cli.info as commands\n"
         f"def broken(facts): raise ZeroDivisionError({HOSTILE!r})\n"
         "commands.print_facts = broken\n"
         "sys.argv[1:] = ['info', 'a.mcap']\n"

@@ -48,7 +48,7 @@ from tupli_mcap.recording.description import describe
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.sign.carried_code import carried_code
 from tupli_mcap.replay import certify, render
-from tupli_mcap.viewer.companions import write_companions
+from tupli_mcap.viewer.companion_channels import write_companions
 
 # Starting programs, networks, native code, other processes: never, whatever the arguments are.
 FORBIDDEN = (

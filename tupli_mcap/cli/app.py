@@ -10,24 +10,13 @@ import contextlib
 import errno
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from tupli_mcap.cli import (
-    curating,
-    doctor,
-    plotting,
-    recordings,
-    rendering,
-    repair,
-    sharing,
-    storages,
-    trusting,
-    viewing,
-)
+from tupli_mcap.cli import bundle, doctor, edit, info, record, render, replay, storage, trust, verify
 from tupli_mcap.cli.terminal import (
     fail,
     flush,
@@ -162,16 +151,33 @@ def _root(
         say(*context.get_help().split("\n"))
 
 
-recordings.register(app)
-doctor.register(app)
-plotting.register(app)
-storages.register(app)
-sharing.register(app)
-trusting.register(app)
-repair.register(app)
-curating.register(app)
-viewing.register(app)
-rendering.register(app)
+_COMMANDS: dict[str, Callable[..., None]] = {
+    "record": record.record,
+    "ls": info.ls,
+    "info": info.info,
+    "episodes": info.episodes,
+    "doctor": doctor.doctor,
+    "plot": render.plot,
+    "list-benchmarks": storage.list_benchmarks,
+    "list-artifacts": storage.list_artifacts,
+    "list-episodes": storage.list_episodes,
+    "compact": storage.compact,
+    "reindex": storage.reindex,
+    "bundle": bundle.bundle,
+    "import": bundle.import_,
+    "export": bundle.export,
+    "trust": trust.trust,
+    "untrust": trust.untrust,
+    "verify": verify.verify,
+    "recover": edit.recover,
+    "merge": edit.merge,
+    "split": edit.split,
+    "filter": edit.filter_,
+    "replay": replay.replay,
+    "render": render.render,
+}
+for _name, _command in _COMMANDS.items():
+    app.command(_name)(_command)
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from tupli_mcap.cli.terminal import say, say_styled, status
 if TYPE_CHECKING:
     from tupli_mcap.doctor import Diagnosis, Finding, Severity
 
-__all__ = ["register"]
+__all__ = ["doctor"]
 
 _INDENT = 9  # columns: the longest severity and a gap
 _OTHERS = 3  # recordings with the same finding that are named
@@ -34,12 +34,7 @@ class _FailOn(StrEnum):
     never = "never"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("doctor")(_doctor)
-
-
-def _doctor(
+def doctor(
     paths: Annotated[
         list[str] | None,
         typer.Argument(metavar="PATH", help="Recordings, directories, storages, URLs; here by default."),

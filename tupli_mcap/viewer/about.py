@@ -1,4 +1,4 @@
-"""What there is to say about a recording as a whole: a card of its metadata, and all its episodes."""
+"""Panels about recordings as a whole: a card of their metadata, returns and lengths of all their episodes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import numpy as np
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.description import describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
-from tupli_mcap.viewer.names import title_of
+from tupli_mcap.viewer.names import plain, title_of
+from tupli_mcap.viewer.sending import column_of, pooled, tensor_array
 
-__all__ = ["card", "plain", "send_about"]
+__all__ = ["card", "send_about"]
 
 _MOST_BARS = 1000
 _MOST_LEAVES = 16
@@ -25,8 +26,6 @@ _MOST_CARDS, _MOST_UNSEEN = 5, 20
 def send_about(stream: Any, recordings: Sequence[Recording], shown: str, unseen: Sequence[str]) -> None:
     """Sends `/card`, and `/overview/return` and `/overview/length` of all episodes, on the timeline `episode`."""
     import rerun as rr
-
-    from tupli_mcap.viewer.sending import column_of
 
     texts = [card(recording) for recording in recordings[:_MOST_CARDS]]
     if len(recordings) > _MOST_CARDS:
@@ -49,19 +48,15 @@ def send_about(stream: Any, recordings: Sequence[Recording], shown: str, unseen:
 
 
 def _bars(values: Any) -> Any:
-    """At most a thousand bars: means of neighbours where there are more; what is not finite is 0."""
+    """At most a thousand bars, means of neighbours if there are more values; NaN and infinities count as 0."""
     import rerun as rr
-
-    from tupli_mcap.viewer.sending import tensor_array
 
     finite = np.where(np.isfinite(values), values, 0.0)
     if len(finite) <= _MOST_BARS:
         return rr.BarChart(tensor_array([finite], ["episode"]))
-    edges = np.linspace(0, len(finite), _MOST_BARS + 1).astype(int)
-    counts = np.diff(edges)  # a bar is as wide as the episodes it stands for
-    means = np.add.reduceat(finite, edges[:-1]) / counts
-    bars, places = (tensor_array([found], ["episode"]) for found in (means, edges[:-1]))
-    return rr.BarChart(bars, abscissa=places, widths=counts)
+    means, bounds = pooled(finite, _MOST_BARS)
+    bars, places = (tensor_array([column], ["episode"]) for column in (means, bounds[:-1]))
+    return rr.BarChart(bars, abscissa=places, widths=np.diff(bounds))  # as wide as the episodes it stands for
 
 
 def card(recording: Recording) -> str:
@@ -96,7 +91,7 @@ def _when(time_ns: int) -> str:
 
 
 def _leaf_rows(recording: Recording) -> list[tuple[str, str]]:
-    """A row for every leaf of state and action: its space is one line long, however large the whole is."""
+    """A row for each of the first leaves of state and action."""
     if not recording.index.size:
         return []
     leaves = [*recording.layout.state, *recording.layout.action]
@@ -113,9 +108,3 @@ def _short(leaf: Leaf) -> str:
     if leaf.dtype is None:
         return kind
     return f"{kind}, {' × '.join(map(str, leaf.shape)) or 'one'} {leaf.dtype}"
-
-
-def plain(text: str) -> str:
-    """Text from a file as Markdown that means nothing but itself."""
-    kept = "".join(c if c.isprintable() else " " for c in text[:400])
-    return "".join(f"\\{c}" if c in r"\`*_{}[]<>()#+!|~" else c for c in kept)

@@ -1,4 +1,4 @@
-"""The blueprint: where the panels of a scene are in the window."""
+"""Makes the blueprint of a scene: where its panels are in the window."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def blueprint_of(scene: Scene, roots: Sequence[str] = ("",), *, listed: bool = F
     """The blueprint of a scene whose panels are below each of `roots`; `listed` shows the list of recordings, too."""
     import rerun.blueprint as rrb
 
-    # where there is nothing to plot, what is looked at has the room
+    # without plots of states, images and texts take their place
     main, beside = (scene.states, scene.beside) if scene.states else (scene.beside, [])
     axis = _newest() if scene.grows else _time_axis(scene.rows)
     groups = ((main, "state"), (scene.actions, "action"))
@@ -63,7 +63,7 @@ def blueprint_of(scene: Scene, roots: Sequence[str] = ("",), *, listed: bool = F
 
 
 def _stack(panels: Sequence[Panel], roots: Sequence[str], axis: Any, name: str) -> Any:
-    """Views below each other; many of them side by side, and on several pages. What a heat map shows comes last."""
+    """Views below each other; many of them side by side, and on several pages. Heat maps and their lines come last."""
     import rerun.blueprint as rrb
 
     maps = [panel for panel in panels if isinstance(panel, HeatMap)]

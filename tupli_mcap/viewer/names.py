@@ -1,4 +1,4 @@
-"""What leaves, their dimensions and the entities they are sent to are called."""
+"""Names of leaves, dimensions and entities, and texts from files made safe for entity paths and Markdown."""
 
 from __future__ import annotations
 
@@ -6,17 +6,15 @@ import itertools
 import zlib
 from collections.abc import Sequence
 
-import numpy as np
-
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["dimension_names", "entity_of", "escaped", "title_of"]
+__all__ = ["dimension_names", "entity_of", "escaped", "plain", "title_of"]
 
 _LONGEST = 80  # characters of a part of an entity path
 
 
 def escaped(text: str) -> str:
-    """Any text as one part of an entity path; texts that cannot be shown as they are get a number, to stay apart."""
+    """Any text as one part of an entity path. One that must be cut or changed gets a checksum, to stay unique."""
     import rerun
 
     shown = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text[:_LONGEST])
@@ -32,13 +30,13 @@ def entity_of(leaf: Leaf) -> str:
 
 
 def title_of(leaf: Leaf) -> str:
-    """A leaf's name as people say it: `state · arm · position`."""
+    """A leaf's name for people: `state · arm · position`."""
     root = leaf.path.partition("[")[0]
     return " · ".join([root, *(str(key)[:_LONGEST] for key in leaf.keys)])
 
 
 def dimension_names(leaf: Leaf, known: Sequence[str] | None) -> list[str]:
-    """A name for each dimension of the flattened leaf: the known ones, else its place such as `[0, 2]`."""
+    """A name for each dimension of the flattened leaf: the known names, else indexes such as `[0, 2]`."""
     if known is not None:
         return list(known)
     if leaf.shape == ():
@@ -46,25 +44,7 @@ def dimension_names(leaf: Leaf, known: Sequence[str] | None) -> list[str]:
     return [f"[{', '.join(map(str, at))}]" for at in itertools.product(*map(range, leaf.shape))]
 
 
-def magnitudes(values: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> list[float]:
-    """How large each column of `values` typically gets: the 95th percentile of its finite absolute values."""
-    found = []
-    for column in values.T:
-        finite = np.abs(column[np.isfinite(column)])
-        found.append(float(np.percentile(finite, 95)) if len(finite) else 0.0)
-    return found
-
-
-def by_scale(sizes: Sequence[float], ratio: float, most: int) -> list[list[int]]:
-    """Groups of dimensions that may share an axis: within `ratio` of the largest, at most `most` together.
-
-    Dimensions that are always zero go with the smallest others. Groups and dimensions keep their order.
-    """
-    groups: list[list[int]] = []
-    for i in sorted(range(len(sizes)), key=lambda i: -sizes[i]):
-        largest = sizes[groups[-1][0]] if groups else 0.0
-        if groups and len(groups[-1]) < most and (sizes[i] == 0 or sizes[i] * ratio >= largest):
-            groups[-1].append(i)
-        else:
-            groups.append([i])
-    return sorted(sorted(group) for group in groups)
+def plain(text: str) -> str:
+    """Text from a file, escaped so that Markdown shows it as it is."""
+    kept = "".join(c if c.isprintable() else " " for c in text[:400])
+    return "".join(f"\\{c}" if c in r"\`*_{}[]<>()#+!|~" else c for c in kept)

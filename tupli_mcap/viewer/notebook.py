@@ -1,4 +1,4 @@
-"""Replays in a notebook: the viewer itself where `rerun-notebook` is installed, else what is known of the episodes."""
+"""Replays in a notebook: the viewer if `rerun-notebook` is installed, else facts about the episodes as text."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _widget_installed() -> bool:
 
 
 class Display:
-    """Episodes that show themselves as the result of a cell.
+    """Episodes as the result of a cell.
 
     Args:
         width, height: of the viewer (pixels); by default as wide as the cell.
@@ -47,7 +47,7 @@ class Display:
             self._facts.append((plan.name, plan.shown))
             if installed:
                 stream = plan.new_stream()
-                plan.send(stream)  # kept until there is a viewer to take it
+                plan.send(stream)  # the stream keeps it until a viewer takes it
                 self._streams.append((stream, plan.blueprint))
 
     def viewer(self) -> Any:
@@ -71,7 +71,7 @@ class Display:
             viewer.display()
 
     def _repr_html_(self) -> str:
-        """What there is to say without a viewer."""
+        """The facts about the episodes, and how to install the viewer."""
         told = "".join(
             f"<p><b>{html.escape(name)}</b></p><pre>{html.escape(shown)}</pre>" for name, shown in self._facts
         )

@@ -1,4 +1,4 @@
-"""What becomes of chosen episodes: one Rerun recording on a long timeline, one each, or all of them overlaid."""
+"""Plans the Rerun recordings of chosen episodes: one on a long timeline, one each, or all of them overlaid."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from tupli_mcap.dataset.which import Chosen
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
-from tupli_mcap.viewer.about import plain, send_about
+from tupli_mcap.viewer.about import send_about
 from tupli_mcap.viewer.blocks import Block, blocks_of, row_counts
 from tupli_mcap.viewer.blueprints import blueprint_of
+from tupli_mcap.viewer.names import plain
 from tupli_mcap.viewer.panels import PALETTE, Place
 from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk
@@ -57,7 +58,7 @@ class Plan(NamedTuple):
     identity: str
     parts: Sequence[Part]
     shown: str
-    listed: bool = False  # it is one of several, which the viewer is to list
+    listed: bool = False  # it is one of several, so the viewer lists them
 
     @property
     def blueprint(self) -> Any:
@@ -67,18 +68,20 @@ class Plan(NamedTuple):
 
     @property
     def application(self) -> str:
-        """The Rerun application: what looks alike has one, since a viewer keeps a blueprint for each."""
+        """The Rerun application. Plans that look alike share one, since a viewer keeps a blueprint for each."""
         first = self.parts[0]
         recording = first.chosen.recording
         looks = _spaces_of(recording) + repr([part.root for part in self.parts] if first.root else "")
         looks += first.scene.looks + "listed" * self.listed
-        name = re.sub(r"[^\w-]+", "-", name_of(recording))  # the viewer warns of others
+        name = re.sub(r"[^\w-]+", "-", name_of(recording))  # the viewer warns of other characters
         return f"{name} {hashlib.sha256(looks.encode()).hexdigest()[:6]}"
 
     def new_stream(self) -> Any:
         """A Rerun recording stream without a sink."""
         rr = rerun_sdk()
-        fresh = f"{self.identity}-{uuid.uuid4().hex[:8]}"  # sent twice into one viewer, it is there twice
+        fresh = (
+            f"{self.identity}-{uuid.uuid4().hex[:8]}"  # so that a viewer that is sent it twice shows it twice
+        )
         return rr.RecordingStream(self.application, recording_id=fresh, send_properties=True)
 
     def send(self, stream: Any) -> None:
@@ -143,7 +146,7 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
         alike: dict[str, list[Chosen]] = {}
         for item in chosen:
             alike.setdefault(_spaces_of(item.recording), []).append(item)
-        for group in alike.values():  # what has other spaces has other plots
+        for group in alike.values():  # other spaces need other plots
             yield _joined(group)._replace(listed=len(alike) > 1)
 
 
@@ -154,7 +157,7 @@ def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
         scene.rows = int(row_counts(*item).max())
         for position in item.positions:
             number = item.recording.episodes[position].number
-            name = f"episode {number} · {Path(item.recording.name).stem}"  # a list has room for its beginning
+            name = f"episode {number} · {Path(item.recording.name).stem}"  # the viewer's list shows only the beginning
             part = Part(Chosen(item.recording, [position]), scene)
             told = _episode_told(item.recording, position)
             yield Plan(name, f"{item.recording.uuid}-{number}", [part], told, listed=several)

@@ -35,11 +35,11 @@ __all__ = [
 ]
 
 LOCAL = "127.0.0.1"
-_PATIENCE = 30.0  # seconds until a viewer that does not answer is given up
+_PATIENCE = 30.0  # seconds for a viewer to answer
 
 
 def viewer_program() -> Path:
-    """The program `rerun`: the one of the installed rerun-sdk, else one on the PATH of the same version.
+    """The program `rerun`: that of the installed rerun-sdk, else one of the same version on the PATH.
 
     Raises:
         ViewerError: there is none, or it is of another version than the data would be.
@@ -104,7 +104,7 @@ def answers(host: str, port: int, seconds: float = 0.25) -> bool:
 
 
 def start(program: Path, *arguments: str, log: IO[bytes] | int) -> subprocess.Popen[bytes]:
-    """Starts the viewer in a session of its own, so that a Ctrl-C reaches this process only.
+    """Starts the viewer in a session of its own, so that Ctrl-C reaches this process only.
 
     Raises:
         ViewerError: it cannot be run.
@@ -147,7 +147,7 @@ def wait_for_ports(process: subprocess.Popen[bytes], ports: list[int], log: Path
 
 @contextlib.contextmanager
 def scratch() -> Iterator[Path]:
-    """A directory for what the viewer reads and says."""
+    """A temporary directory for the viewer's file and log."""
     with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
         yield Path(folder)
 

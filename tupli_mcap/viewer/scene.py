@@ -1,4 +1,4 @@
-"""The scene of a recording: which panels its spaces ask for."""
+"""Chooses the panels for the spaces of a recording: its scene."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tupli_mcap.messages.step import StepLayout, can_stack
 from tupli_mcap.recording import Recording
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
-from tupli_mcap.viewer.names import by_scale, dimension_names, entity_of, escaped, magnitudes, title_of
+from tupli_mcap.viewer.names import dimension_names, entity_of, escaped, title_of
 from tupli_mcap.viewer.panels import (
     Camera,
     Grid,
@@ -27,17 +27,18 @@ from tupli_mcap.viewer.panels import (
     Series,
     Words,
     infos_of,
+    value_range,
 )
 
 __all__ = ["Scene", "live_scene", "scene_of"]
 
 MOST_LINES: Final = 12  # in one plot; more cannot be told apart
-_MOST_SMALL: Final = 48  # dimensions that get small plots beside their heat map
+_MOST_SMALL: Final = 48  # dimensions that get small plots besides their heat map
 _LINES_SMALL: Final = 6
 _MOST_LANES: Final = 12  # values of a Discrete leaf that get a colour each
 _MOST_LANE_ROWS: Final = 20_000  # the state timeline draws every change, however narrow
 _MOST_INFOS: Final = 12
-_MOST_FRAMES: Final = 16  # of a stack that nothing says to be one
+_MOST_FRAMES: Final = 16  # of a stack that is not declared as one
 _LEAST_FRAME: Final = 16  # pixels of each of its sides
 _RATIO: Final = 30.0  # magnitudes further apart than this do not share an axis
 _SAMPLE_EPISODES, _SAMPLE_STEPS, _SAMPLE_VALUES = 8, 512, 1 << 20
@@ -45,15 +46,15 @@ _SAMPLE_EPISODES, _SAMPLE_STEPS, _SAMPLE_VALUES = 8, 512, 1 << 20
 
 @dataclass
 class Scene:
-    """Panels by their place in the window, and what is not shown."""
+    """Panels by their place in the window, and notes on what is not shown."""
 
     states: list[Panel] = field(default_factory=list)
     actions: list[Panel] = field(default_factory=list)
     rewards: list[Rewards] = field(default_factory=list)
-    beside: list[Panel] = field(default_factory=list)  # what is looked at next to the plots
+    beside: list[Panel] = field(default_factory=list)  # images, texts and infos, next to the plots
     unseen: list[str] = field(default_factory=list)
     rows: int = 0
-    grows: bool = False  # rows are added while it is looked at
+    grows: bool = False  # rows are added while it is shown
 
     @property
     def panels(self) -> list[Panel]:
@@ -61,7 +62,7 @@ class Scene:
 
     @property
     def looks(self) -> str:
-        """Which panels there are, and what they show: one blueprint fits scenes where this is the same."""
+        """The panels and what they show, as text: scenes with the same text can share a blueprint."""
         facts = ("title", "entity", "numbers", "texts")
         return repr(
             [(type(panel).__name__, *(getattr(panel, fact, None) for fact in facts)) for panel in self.panels]
@@ -69,7 +70,7 @@ class Scene:
 
 
 class _Material(NamedTuple):
-    """What panels are decided on: labels, some columns, how many rows will come, and whether lines stay apart."""
+    """What panels are chosen by: labels, a sample of columns, how many rows there are, and whether lines stay apart."""
 
     labels: Labels
     sample: Sequence[Any]
@@ -154,7 +155,7 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
 
 
 def _are_frames(leaf: Leaf, column: str, material: _Material) -> bool:
-    """Whether an array that nothing says to be a stack of frames looks like one."""
+    """Whether an array that is not declared as a stack of frames looks like one."""
     if not can_stack(leaf) or leaf.shape[0] > _MOST_FRAMES or min(leaf.shape[1:3]) < _LEAST_FRAME:
         return False
     return all(leaf.get(getattr(part, column)).dtype == np.uint8 for part in material.sample)
@@ -171,13 +172,13 @@ def _discrete(leaf: Leaf, column: str, material: _Material) -> Panel:
 
 
 def _distinct(labels: Sequence[str]) -> list[str]:
-    """Labels that differ: a viewer takes equal ones for one state."""
+    """Makes labels differ, since the viewer takes equal ones for one state."""
     return [label if labels.index(label) == i else f"{label} ({i})" for i, label in enumerate(labels)]
 
 
 def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Panel]:
     names = dimension_names(leaf, material.labels.dimensions.get(leaf.path))
-    groups = by_scale(magnitudes(material.values(leaf, column)), _RATIO, most)
+    groups = _by_scale(_magnitudes(material.values(leaf, column)), _RATIO, most)
     stepped = column == "actions" or (leaf.dtype is not None and leaf.dtype.kind in "iub")
     found: list[Panel] = []
     for dims in groups:
@@ -190,18 +191,39 @@ def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Pan
     return found
 
 
+def _magnitudes(values: Array) -> list[float]:
+    """How large each column of `values` typically gets: the 95th percentile of its finite absolute values."""
+    found = []
+    for column in values.T:
+        finite = np.abs(column[np.isfinite(column)])
+        found.append(float(np.percentile(finite, 95)) if len(finite) else 0.0)
+    return found
+
+
+def _by_scale(sizes: Sequence[float], ratio: float, most: int) -> list[list[int]]:
+    """Groups of dimensions that may share an axis: within `ratio` of the largest, at most `most` together.
+
+    Dimensions that are always zero go with the smallest others. Groups and dimensions keep their order.
+    """
+    groups: list[list[int]] = []
+    for i in sorted(range(len(sizes)), key=lambda i: -sizes[i]):
+        largest = sizes[groups[-1][0]] if groups else 0.0
+        if groups and len(groups[-1]) < most and (sizes[i] == 0 or sizes[i] * ratio >= largest):
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    return sorted(sorted(group) for group in groups)
+
+
 def _some(names: Sequence[str], most: int = 4) -> str:
     """The first names, as a title has room for."""
     return ", ".join(names[:most]) + ("" if len(names) <= most else ", …")
 
 
 def _many(scene: Scene, leaf: Leaf, column: str, material: _Material) -> list[Panel]:
-    """A heat map, and where they can still be told apart, small plots."""
+    """A heat map, and small plots if there are few enough dimensions to tell apart."""
     values = material.values(leaf, column)
-    finite = np.isfinite(values)
-    low = np.where(finite, values, np.inf).min(axis=0, initial=np.inf)
-    high = np.where(finite, values, -np.inf).max(axis=0, initial=-np.inf)
-    low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
+    low, high = (np.where(np.isfinite(ends), ends, 0.0) for ends in value_range(values))
     title = f"{title_of(leaf)}: {leaf.size:,} dimensions, each from its lowest to its highest"
     panels: list[Panel] = [HeatMap(leaf, column, f"{entity_of(leaf)}/heat_map", title, low, high)]
     if leaf.size > _MOST_SMALL or material.apart:
@@ -213,13 +235,13 @@ def _many(scene: Scene, leaf: Leaf, column: str, material: _Material) -> list[Pa
 
 
 def _spread(positions: Sequence[int]) -> list[int]:
-    """A few of the episodes, from all over them."""
+    """A few of the episodes, evenly spaced."""
     chosen = np.unique(np.linspace(0, len(positions) - 1, _SAMPLE_EPISODES).astype(int))
     return [int(positions[i]) for i in chosen]
 
 
 def _sample(recording: Recording, positions: Sequence[int]) -> list[Any]:
-    """A few steps from all over the episodes: for how large the values get."""
+    """A few steps from the middle of a few episodes: they tell how large the values get."""
     row = sum(leaf.size for leaf in recording.layout.leaves if leaf.dtype is not None)
     most = max(1, min(_SAMPLE_STEPS, _SAMPLE_VALUES // (_SAMPLE_EPISODES * max(row, 1))))
     found = []

@@ -40,7 +40,7 @@ def rerun_sdk() -> Any:
 
 
 class _NoPandas:
-    """Finds no pandas, for whoever imports it first."""
+    """A finder that hides pandas."""
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: ModuleType | None = None) -> None:
@@ -49,24 +49,24 @@ class _NoPandas:
 
 
 def import_quickly() -> None:
-    """Imports rerun-sdk without pandas, which pyarrow imports with its first array where it is installed.
+    """Imports rerun-sdk without pandas and without garbage collection, so that a small replay starts sooner.
 
-    That, and looking for garbage meanwhile, is a third of the time that a small recording takes to be shown. Only for
-    a process that gives pyarrow nothing of pandas, as the command line is one. Whoever imports pandas later gets it,
-    and so does pyarrow where it is asked to make something for pandas. Nothing happens if it is there already.
+    pyarrow looks for pandas at its first array; here it finds none. Only for a process that gives pyarrow no pandas
+    objects, such as the command line. pandas can still be imported later, also by pyarrow. Does nothing if pandas is
+    imported already.
     """
     if "pandas" in sys.modules:
         return
     finder: Any = _NoPandas
     sys.meta_path.insert(0, finder)
     collecting = gc.isenabled()
-    gc.disable()  # what is imported is no garbage
+    gc.disable()  # modules are no garbage
     try:
-        with contextlib.suppress(ImportError):  # there is an error for it, if it is needed
+        with contextlib.suppress(ImportError):  # `rerun_sdk` raises the error, if it is needed
             import pyarrow
-            import rerun  # noqa: F401 - here, where nothing is collected
+            import rerun  # noqa: F401 - while nothing is collected
 
-            pyarrow.array([])  # it looks once
+            pyarrow.array([])  # pyarrow looks for pandas only once
     finally:
         sys.meta_path.remove(finder)
         if collecting:

@@ -1,4 +1,4 @@
-"""Columns on their way to Rerun: timelines, and values in rows."""
+"""Sends columns to Rerun: timelines, and one row of values for each of their times."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 from tupli_mcap.arrays import Array
 
 __all__ = [
-    "Times", "blob_array", "column_of", "send_blobs", "send_scalars", "send_tensors", "send_texts", "tensor_array"
+    "Times", "blob_array", "column_of", "pooled", "send_blobs", "send_scalars", "send_tensors", "send_texts",
+    "tensor_array",
 ]  # fmt: skip
 
 
@@ -44,22 +45,34 @@ class Times:
         return columns
 
     def at(self, rows: Array) -> Times:
-        """Of some of the rows."""
+        """The times of some of the rows."""
         return Times(self._step[rows], self._wall[rows], self._step_seconds)
 
     def moved(self, steps: int) -> Times:
-        """So many steps later, at the same wall clock."""
+        """The same rows so many steps later, at the same wall clock."""
         return Times(self._step + steps, self._wall, self._step_seconds)
 
     def inserted(self, before: Array, step: Array, wall: Array) -> Times:
-        """With other rows, each before one of these."""
+        """With rows added, each before one of these."""
         return Times(
             np.insert(self._step, before, step), np.insert(self._wall, before, wall), self._step_seconds
         )
 
 
+def pooled(values: Array, most: int, axis: int = 0) -> tuple[Array, Array]:
+    """Means of neighbours along an axis, at most `most` of them, and the bounds of what each is the mean of."""
+    length = values.shape[axis]
+    bounds = np.linspace(0, length, min(length, most) + 1).astype(int)
+    if length <= most:
+        return values, bounds
+    sums = np.add.reduceat(values, bounds[:-1], axis=axis)
+    shape = [1] * values.ndim
+    shape[axis] = most
+    return sums / np.diff(bounds).reshape(shape), bounds
+
+
 class _Batch:
-    """An Arrow array as it is, for a `ComponentColumn`; the SDK's own batches copy what they are given."""
+    """An Arrow array for a `ComponentColumn`. (The SDK's own batches copy their values.)"""
 
     def __init__(self, array: Any) -> None:
         self._array = array
@@ -77,19 +90,18 @@ def column_of(descriptor: Any, array: Any, width: int = 1) -> Any:
 
 
 def send_scalars(stream: Any, entity: str, times: Times, values: Array) -> None:
-    """Send `values` (rows x width), one batch a row."""
+    """Sends `values` (rows x width), one batch a row."""
     import pyarrow as pa
     import rerun as rr
 
-    flat = np.require(values, np.float64, ("C", "ALIGNED")).reshape(
-        -1
-    )  # the SDK aborts the process at others
+    # the SDK aborts the process if an array is of another order or not aligned
+    flat = np.require(values, np.float64, ("C", "ALIGNED")).reshape(-1)
     column = column_of(rr.Scalars.descriptor_scalars(), pa.array(flat), values.shape[1])
     stream.send_columns(entity, times.columns, [column])
 
 
 def send_texts(stream: Any, entity: str, times: Times, descriptor: Any, texts: Sequence[str | None]) -> None:
-    """Send one text a row; None is an empty one."""
+    """Sends one text a row; None is an empty one."""
     import pyarrow as pa
 
     array = pa.array(texts, pa.utf8())
@@ -97,14 +109,14 @@ def send_texts(stream: Any, entity: str, times: Times, descriptor: Any, texts: S
 
 
 def send_blobs(stream: Any, entity: str, times: Times, descriptor: Any, values: Array) -> None:
-    """Send `values` (rows x bytes), one blob a row."""
+    """Sends `values` (rows x bytes), one blob a row."""
     rows, width = values.shape
     blobs = blob_array(values.reshape(-1), np.arange(0, rows * width + 1, width))
     stream.send_columns(entity, times.columns, [column_of(descriptor, blobs)])
 
 
 def blob_array(data: Array, ends: Array) -> Any:
-    """Bytes cut into blobs; they have to be declared as never null, or the viewer does not see them."""
+    """Bytes cut into blobs. They must be declared as never null, or the viewer does not show them."""
     import pyarrow as pa
 
     blob = pa.list_(pa.field("item", pa.uint8(), nullable=False))
@@ -114,7 +126,7 @@ def blob_array(data: Array, ends: Array) -> Any:
 def send_tensors(
     stream: Any, entity: str, times: Times, values: Sequence[Array], names: Sequence[str]
 ) -> None:
-    """Send one tensor a row; for `values` and `names`, see `tensor_array`."""
+    """Sends one tensor a row; for `values` and `names`, see `tensor_array`."""
     import rerun as rr
 
     column = column_of(rr.Tensor.descriptor_data(), tensor_array(values, names))
@@ -124,7 +136,7 @@ def send_tensors(
 def tensor_array(values: Sequence[Array], names: Sequence[str]) -> Any:
     """Tensors: arrays of one dtype (float32, float64, int64 or uint8), and of as many dimensions as there are names.
 
-    Made without a cast: the first one of a process takes pyarrow a tenth of a second.
+    Made without a cast, since the first cast of a process makes pyarrow load its compute functions.
     """
     import pyarrow as pa
 

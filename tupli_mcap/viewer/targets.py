@@ -1,4 +1,4 @@
-"""Where a replay goes: a file, the native viewer, a browser."""
+"""Sends a replay to a file, the native viewer, or a browser."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tupli_mcap.viewer.process import (
 )
 from tupli_mcap.viewer.sdk import ViewerError
 
-__all__ = ["to_browser", "to_file", "to_viewer", "to_window"]
+__all__ = ["check_new", "to_browser", "to_file", "to_viewer", "to_window"]
 
 _ANSWER_SECONDS = 3.0
 _FLUSH_SECONDS = 600.0  # a viewer takes some millions of steps a second
@@ -43,7 +43,7 @@ def to_file(
     force: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Path:
-    """Writes a `.rrd` with its blueprint; it is there as a whole or not at all. `tell` is given what opens it.
+    """Writes a `.rrd` with its blueprint, in one rename. `tell` is given the command that opens it.
 
     Raises:
         RecordingError: its name does not end in .rrd, it exists and `force` is False, or the system refuses.
@@ -53,12 +53,7 @@ def to_file(
         raise RecordingError(
             f"expected a name that ends in .rrd, by which the viewer knows such files, found {str(goal)!r}"
         )
-    if goal.exists() and not force:
-        raise RecordingError(f"{goal} exists already; choose another name, or replace it with --force")
-    if not goal.parent.is_dir():
-        raise RecordingError(
-            f"{goal} cannot be written: there is no directory {str(goal.parent)!r}; make it first"
-        )
+    check_new(goal, force=force)
     with replacing(goal) as (_, temporary):
         several = list(plans)
         if len(several) == 1:
@@ -66,9 +61,23 @@ def to_file(
         else:
             _write_all(several, temporary)
     if tell is not None:
-        # of a file on disk the viewer opens one recording only, whichever is registered first
+        # given a path, the viewer opens only one recording of the file
         tell(f"rerun {'- < ' if len(several) > 1 else ''}{shlex.quote(str(goal))}")
     return goal
+
+
+def check_new(goal: Path, *, force: bool) -> None:
+    """Checks that a file can be made.
+
+    Raises:
+        RecordingError: it exists and `force` is False, or there is no directory for it.
+    """
+    if goal.exists() and not force:
+        raise RecordingError(f"{goal} exists already; choose another name, or replace it with --force")
+    if not goal.parent.is_dir():
+        raise RecordingError(
+            f"{goal} cannot be written: there is no directory {str(goal.parent)!r}; make it first"
+        )
 
 
 def _write_all(plans: Sequence[Plan], path: Path) -> None:
@@ -94,10 +103,10 @@ def _write(plan: Plan, path: Path, blueprint: Any) -> None:
 
 
 def to_viewer(plans: Iterable[Plan], url: str) -> None:
-    """Sends to a viewer that runs, such as `rerun+http://127.0.0.1:9876/proxy`.
+    """Sends to a running viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
 
     Raises:
-        ViewerError: the URL is none, or nobody there took the data.
+        ViewerError: the URL is not valid, or no viewer took the data.
     """
     _await_viewer(url)
     for plan in plans:
@@ -113,11 +122,11 @@ def to_viewer(plans: Iterable[Plan], url: str) -> None:
 
 
 def _await_viewer(url: str) -> None:
-    """Returns once somebody listens there, who may just have been started; the SDK would try for much longer."""
+    """Waits a little for a viewer that may just have been started. (The SDK would wait much longer.)"""
     parts = urlsplit(url)
     try:
         address = parts.hostname, parts.port
-    except ValueError:  # the port is none: the SDK says what is wrong
+    except ValueError:  # not a port: the SDK says what is wrong
         return
     if None in address or not parts.scheme.startswith("rerun"):
         return
@@ -164,7 +173,7 @@ def to_window(plans: Iterable[Plan]) -> int:
         except BaseException:
             end(process)
             raise
-    process.returncode = 0  # it is left to itself: nobody is to be told that it still runs
+    process.returncode = 0  # it stays open; Popen is not to warn of it
     return process.pid
 
 

@@ -1,50 +1,37 @@
-"""Starts and ends of episodes as they come: those that the recorder has written, and those that it leaves to rows.
+"""Starts and ends of episodes while they are recorded: written ones, and ones that are still to be derived from rows.
 
-The latter are written with many others when their rows go to the file. Here they are made before: a start once the hole
-is there that its reset has left, an end once the hole behind it is there, or at the second look at it. At the first one
-the recorder may be about to write it. An end that is made has the time of the episode's last step, also where the
-recorder will take the time at which it writes it.
+The recorder derives most starts and ends only at a flush. Here they are made earlier:
+
+1. A start is made once its reset has left a hole.
+2. An end is made once there is a hole behind its last step; else at the second look, since at the first one the
+   recorder may be about to write it.
+3. An end made here has the time of the episode's last step, even where the recorder will give it the time of writing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.mcap.records import BODY, CDR_HEADER, RECORD_HEADER
+from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recover.evidence import Evidence
 from tupli_mcap.recording.recover.step_runs import StepRun, runs_in
+from tupli_mcap.viewer.live.new_rows import NewSteps, messages_of
 
-if TYPE_CHECKING:
-    from tupli_mcap.viewer.live.follow import NewSteps
-
-__all__ = ["EpisodeNews", "messages_of"]
+__all__ = ["EpisodeNews"]
 
 _STARTS = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8")])
 _ENDS = np.dtype([*_STARTS.descr, ("length", "<u8"), ("return", "<f8")])
 _NUMBER = len(CDR_HEADER)  # where messages have the number of their episode
 
 
-def messages_of(store: ChunkStore, channel: int, rows: range) -> list[tuple[int, bytes]]:
-    """(log_time, CDR message with its header) of rows."""
-    found = []
-    for span in store.spans(channel, rows.start, len(rows)):
-        data, places = store.records(span.chunk)
-        view = memoryview(data)
-        for start, end in places[span.begin : span.end].tolist():
-            time_ns = RECORD_HEADER.unpack_from(view, start)[4]
-            found.append((time_ns, bytes(view[start + RECORD_HEADER.size : end])))
-    return found
-
-
 class _Shown:
-    """Numbers of the episodes whose start, or end, was written lately, or is shown `ahead` of that."""
+    """Numbers of the episodes whose start (or end) was written lately, or was shown `ahead` of being written."""
 
     def __init__(self) -> None:
         self.ahead: set[int] = set()
@@ -52,7 +39,7 @@ class _Shown:
         self._now: set[int] = set()
 
     def note(self, numbers: Array) -> set[int]:
-        """Those that were written since the last look; returns which of them are shown already."""
+        """Notes what was written since the last look; returns the numbers that have been shown already."""
         self._before, self._now = self._now, set(numbers.tolist())
         known = self.ahead & self._now
         self.ahead -= known
@@ -63,11 +50,12 @@ class _Shown:
 
 
 class EpisodeNews:
-    """What is new of episodes since the last look.
+    """The starts and ends of episodes since the last look.
 
     Args:
         topics: the channels.
-        new_rows: the rows of a channel that were not looked at; `seen` has how many were.
+        new_rows: returns the rows of a channel that were not looked at.
+        seen: how many rows of each channel were looked at.
     """
 
     def __init__(
@@ -78,7 +66,7 @@ class EpisodeNews:
         self._earlier = seen.get(self._end, 0)
         self._starts, self._ends = _Shown(), _Shown()
         self._last: dict[int, StepRun] = {}  # by sub-environment
-        self._waiting: dict[int, StepRun] = {}  # episodes that have ended
+        self._waiting: dict[int, StepRun] = {}  # by number, ended episodes that wait for the second look
         self.count = 0  # ended episodes
 
     def look(
@@ -94,7 +82,7 @@ class EpisodeNews:
         self._store = store
         self._rows = {channel: self._new_rows(channel) for channel in (self._final, self._end, self._start)}
         starts = self._fields(self._start, _STARTS)
-        if len(starts) and not is_over and _is_empty(starts[-1], counts):  # it may be taken back
+        if len(starts) and not is_over and _is_empty(starts[-1], counts):  # the recorder may take it back
             starts, rows = starts[:-1], self._rows[self._start]
             self._rows[self._start], self._seen[self._start] = rows[:-1], rows.stop - 1
         ends = self._fields(self._end, _ENDS)
@@ -118,7 +106,7 @@ class EpisodeNews:
         return np.concatenate([fresh, np.array([end for end in made if end is not None], _ENDS)])
 
     def _fields(self, channel: int, dtype: np.dtype[np.void]) -> Array:
-        """What the new messages of a channel begin with."""
+        """The first fields of the new messages of a channel."""
         parts: list[Array] = [np.empty(0, dtype)]
         rows = self._rows[channel]
         for span in self._store.spans(channel, rows.start, len(rows)):
@@ -128,7 +116,7 @@ class EpisodeNews:
         return np.concatenate(parts)
 
     def _whole_runs(self, new: NewSteps) -> Iterator[StepRun]:
-        """The rows of each episode so far, where all of them were looked at."""
+        """The rows so far of each episode whose rows were all looked at."""
         for run in runs_in(new.facts, new.env, new.first, self._last.get(new.env)):
             self._last[new.env] = run
             if run.step == 0:
@@ -144,8 +132,10 @@ class EpisodeNews:
     def _make_end(
         self, evidence: Evidence, run: StepRun, counts: Sequence[int] | None
     ) -> tuple[int, int, int, int, float] | None:
-        """The end of an episode, and its final state. None if there is none to be made, or not yet; `counts` at the
-        second look."""
+        """Makes the end of an episode and its final state; None if it is written, or cannot be made yet.
+
+        counts: rows by sub-environment, given at the second look only.
+        """
         number, env = run.episode, run.env
         if number in self._ends:
             return None
@@ -167,17 +157,17 @@ class EpisodeNews:
         return facts
 
     def messages(self, most: int) -> list[tuple[int, int, bytes]]:
-        """(channel, log_time, CDR message) of the newest of new starts, final states and ends."""
+        """(channel, log_time, CDR message) of the newest new starts, final states and ends."""
         found = list(self._made)
         for channel, rows in self._rows.items():
             for time_ns, message in messages_of(self._store, channel, rows[-most:]):
                 if int.from_bytes(message[_NUMBER : _NUMBER + 4], "little") not in self._known[channel]:
                     found.append((channel, time_ns, message))
         order = list(self._rows)
-        return sorted(found, key=lambda one: (one[1], order.index(one[0])))[-most:]
+        return sorted(found, key=lambda message: (message[1], order.index(message[0])))[-most:]
 
 
 def _is_empty(start: Array, counts: Sequence[int]) -> bool:
-    """Whether an episode has no step."""
+    """Whether the episode has no step yet."""
     env = int(start["env"])
     return env < len(counts) and int(start["first_row"]) >= counts[env]

@@ -1,17 +1,16 @@
-"""A recording read while it is written: what its file and its journal have that the last look did not find.
+"""Reads a recording while it is written: each look finds the rows that have been committed since the last one.
 
-As for every reader, the rows of a channel are those in chunks, then the rows of the journal that follow them, up to the
-first that is missing. The journal is read before the file: the recorder moves rows from there to here. The recorder
-does nothing for it and waits for nobody.
+The rule is that of every reader: the rows of a channel are those in chunks, then the journal's rows that follow them,
+up to the first that is missing. The journal is read before the file, since the recorder moves rows from the journal to
+the file. The recorder does nothing for this and does not wait.
 """
 
 from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -47,67 +46,24 @@ from tupli_mcap.recording.recover.find_journal import belongs
 from tupli_mcap.recording.recover.prefix import prefix
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
-from tupli_mcap.viewer.live.episodes import EpisodeNews, messages_of
+from tupli_mcap.viewer.live.episodes import EpisodeNews
+from tupli_mcap.viewer.live.new_rows import NewInfo, NewSteps, messages_of
 
-__all__ = ["Follower", "NewInfo", "NewSteps", "follow"]
+__all__ = ["Follower", "follow"]
 
-_ENVS = 8  # sub-environments that are looked at
+_ENVS = 8  # sub-environments whose steps are read
 _STEPS = 5000  # of a sub-environment at a time, the newest
 _DECODED = 200  # the same where each message is decoded on its own
-_EPISODES = 1000  # whose begin is known
-_CHUNKS = 8  # of each channel, at hand
+_EPISODES = 1000  # of a sub-environment, whose first row is remembered
+_CHUNKS = 8  # of each channel, the newest, that can be read
 _HEADER = RECORD_HEADER.size
 _PAIR = struct.Struct("<II")  # episode and step, with which the messages of infos and frames begin
 
 
-class NewSteps(NamedTuple):
-    """Consecutive steps of a sub-environment: rows `first`, `first + 1`, … of its channel.
-
-    `rows` are whole records of a constant layout, `messages` the (log_time, CDR message) of another one.
-    """
-
-    env: int
-    first: int
-    rows: Array | None
-    messages: list[tuple[int, bytes]]
-    facts: StepFacts
-
-    def __len__(self) -> int:
-        return len(self.facts.time)
-
-    def newest(self, count: int) -> NewSteps:
-        """The last `count` of them."""
-        skip = max(0, len(self) - count)
-        rows = None if self.rows is None else self.rows[skip:]
-        facts = StepFacts._make([*(column[skip:] for column in self.facts[:-1]), self.facts.bad])
-        return NewSteps(self.env, self.first + skip, rows, self.messages[skip:], facts)
-
-    def moved(self, rows: int) -> NewSteps:
-        """The same, so many rows later."""
-        return NewSteps(self.env, self.first + rows, self.rows, self.messages, self.facts)
-
-    def cdr(self) -> Iterator[tuple[int, bytes]]:
-        """(log_time, CDR message with its header) of each step."""
-        if self.rows is None:
-            yield from self.messages
-            return
-        data, size = self.rows.tobytes(), self.rows.dtype.itemsize
-        for i, time_ns in enumerate(self.facts.time.tolist()):
-            yield time_ns, data[i * size + _HEADER : (i + 1) * size]
-
-
-class NewInfo(NamedTuple):
-    """The recorded infos of the step in row `row` of a sub-environment's channel; `time_ns` is wall clock."""
-
-    row: int
-    time_ns: int
-    values: Mapping[str, Any]
-
-
 class _GrowingFile:
-    """The newest chunks of a file that grows, as their heads and message indexes say.
+    """The newest chunks of a growing file, from their heads and message indexes.
 
-    `earlier` has the rows of each channel before offset `begin`; `position` is where the records that are known begin.
+    `position` is the end of the records that are known, `earlier` how many rows each channel has before offset `begin`.
     """
 
     def __init__(self, source: Source, position: int, begin: int) -> None:
@@ -118,10 +74,10 @@ class _GrowingFile:
         self.earlier = {channel: pieces[-1].stop for channel, pieces in self._pieces.items()}
 
     def read_on(self, end: int | None = None) -> None:
-        """Takes note of the chunks that have come."""
+        """Notes the chunks that were added since the last call."""
         self._source.refresh()
         chunk = 0
-        with contextlib.suppress(FormatError):  # it was cut meanwhile
+        with contextlib.suppress(FormatError):  # the recorder cut the file meanwhile
             for opcode, at, length in Walk(self._source, end=end).places(self._position):
                 if opcode == Opcode.DATA_END or self._is_index(opcode, at):
                     break
@@ -133,7 +89,7 @@ class _GrowingFile:
                 self._position = at + length
 
     def _is_index(self, opcode: int, at: int) -> bool:
-        """Whether the record is the index of the episodes: it will be cut off."""
+        """Whether the record is the episode index, which an appending recorder cuts off."""
         name = INDEX_NAME.encode()
         return opcode == Opcode.ATTACHMENT and self._source.read(at + ATTACHMENT_HEAD.size, len(name)) == name
 
@@ -149,11 +105,11 @@ class _GrowingFile:
         method = COMPRESSIONS.index(name)
         entry = chunk, length + RECORD.size, size, first, rows, skip, crc, channel, method, 0
         pieces.append(Piece(first, rows, entry))
-        if len(pieces) > _CHUNKS:  # the oldest ones become one that nobody reads
+        if len(pieces) > _CHUNKS:  # the two oldest become one piece that is not read
             pieces[:2] = [_unread(channel, 0, pieces[1].stop)]
 
     def evidence(self, seen: Mapping[int, int]) -> Evidence:
-        """As if the rows that were looked at were in the file: they are not taken out of the journal once more."""
+        """The file as if it held all rows that were looked at, so that they are not read from the journal again."""
         evidence = Evidence(self._source, Tail(), strict=True, good_end=self._source.size)
         evidence.pieces = {channel: list(pieces) for channel, pieces in self._pieces.items()}
         for channel, count in seen.items():
@@ -168,16 +124,16 @@ class _GrowingFile:
 
 
 def _unread(channel: int, first: int, stop: int) -> Piece:
-    """Rows in a chunk that is nowhere."""
+    """A piece for rows that are not read."""
     return Piece(first, stop - first, (0, 0, 0, first, stop - first, 0, 0, channel, 0, 0))
 
 
 class Follower:
-    """Reads what a recorder has committed since the last look. Rows before offset `begin` of the file are not shown.
+    """Reads what a recorder has committed since the last look. Rows before offset `begin` of the file are left out.
 
     Attributes:
-        is_over: nobody records any more: what is there now is the rest.
-        steps: the step channels of the sub-environments that are looked at.
+        is_over: nobody records any more, so the next look finds the rest.
+        steps: the step channels of the sub-environments whose steps are read.
     """
 
     def __init__(self, source: PathSource, metadata: Mapping[str, str], found: Evidence, begin: int) -> None:
@@ -198,7 +154,7 @@ class Follower:
         self._source, self._metadata = source, metadata
         self._known = Channels.of(found, layout)._replace(steps=self.steps)
         self._file = _GrowingFile(source, found.good_end, begin)
-        self._seen = dict(self._file.earlier)  # rows of each channel
+        self._seen = dict(self._file.earlier)  # how many rows of each channel were looked at
         envs = range(len(self.steps))
         self._areas = {"steps", "events", "info"}
         self._areas |= {f"{top}{i}" for top in ("steps/", FRAMES_AREA) for i in envs}
@@ -211,8 +167,9 @@ class Follower:
             *self._others,
             *(self.topics[topic] for topic in (EPISODE_START, EPISODE_END, FINAL_STATE)),
         ]
-        self._begins: list[dict[int, int]] = [{} for _ in envs]  # where the last episodes began
-        self._infos: list[tuple[int, bytes]] = []  # of steps that have not been looked at
+        # by sub-environment: the first row of each of its last episodes
+        self._begins: list[dict[int, int]] = [{} for _ in envs]
+        self._infos: list[tuple[int, bytes]] = []  # whose steps have not been looked at
         self._news = EpisodeNews(self.topics, self._new_rows, self._seen)
 
     @property
@@ -234,7 +191,7 @@ class Follower:
         return steps, self._news.look(self._store, evidence, steps, counts, is_over=self.is_over)
 
     def _new_rows(self, channel: int, most: int | None = None) -> range:
-        """The rows of a channel, or the newest of them, that were not looked at; now they are."""
+        """The rows of a channel that were not looked at, or the newest of them; marks them as looked at."""
         count = self._store.count(channel)
         first = max(
             self._seen.get(channel, 0), self._file.at_hand(channel), 0 if most is None else count - most
@@ -255,20 +212,17 @@ class Follower:
         )
         self._begins[env] = dict([*self._begins[env].items(), *begins][-_EPISODES:])
         if not layout.constant:
-            return NewSteps(env, new.start, None, self._messages(channel, new), facts)
+            return NewSteps(env, new.start, None, messages_of(store, channel, new), facts)
         dtype, spans = layout.step_message.dtype, store.spans(channel, new.start, len(new))
         data = [store.rows(span.chunk, dtype)[span.begin : span.end].tobytes() for span in spans]
         return NewSteps(env, new.start, np.frombuffer(b"".join(data), dtype), [], facts)
-
-    def _messages(self, channel: int, rows: range) -> list[tuple[int, bytes]]:
-        return messages_of(self._store, channel, rows)
 
     def image_channel(self, leaf: int, env: int) -> int:
         """The channel of the images of a leaf and a sub-environment."""
         return self.topics[self._of_env[env].image(self.layout.images[leaf].name)]
 
     def images(self, leaf: int, env: int, rows: range) -> dict[int, Array]:
-        """Whole records of those of the image rows that are at hand."""
+        """The image rows that can still be read, as whole records."""
         channel = self.image_channel(leaf, env)
         dtype = self.layout.image_messages[self.layout.images[leaf].name].dtype
         first = max(rows.start, self._file.at_hand(channel))
@@ -279,11 +233,11 @@ class Follower:
         return dict(enumerate(found, first))
 
     def events(self, most: int) -> list[tuple[int, int, bytes]]:
-        """(channel, log_time, CDR message) of the newest of new infos and frames, then of new starts, ends and final
-        states."""
+        """(channel, log_time, CDR message) of the newest new infos and frames, then starts, ends and final states."""
         found = []
         for channel in self._others:
-            found += [(channel, *one) for one in self._messages(channel, self._new_rows(channel, most))]
+            rows = self._new_rows(channel, most)
+            found += [(channel, *message) for message in messages_of(self._store, channel, rows)]
         return found + self._news.messages(most)
 
     def frames(self, env: int, most: int) -> list[tuple[int, EncodedFrame]]:
@@ -295,10 +249,10 @@ class Follower:
         count, begins = min(map(self._store.count, ids)), self._begins[env]
         first = max(self._seen.get(ids[0], 0), count - most, *map(self._file.at_hand, ids))
         newest, found = max(begins, default=-1), []
-        pairs, pictures = (self._messages(channel, range(first, count)) for channel in ids)
+        pairs, pictures = (messages_of(self._store, channel, range(first, count)) for channel in ids)
         for row, (_, pair), (_, picture) in zip(range(first, count), pairs, pictures, strict=True):
             episode, step = _PAIR.unpack_from(pair, BODY - _HEADER)
-            if episode > newest:  # its steps have not been looked at
+            if episode > newest:  # its steps have not been looked at: it is for the next look
                 break
             self._seen |= dict.fromkeys(ids, row + 1)
             if episode in begins:
@@ -312,7 +266,7 @@ class Follower:
             return []
         decoder, begins, found = InfoCodec.from_metadata(self.channels[channel].metadata), self._begins[0], []
         most *= self.num_envs
-        new = [*self._infos, *self._messages(channel, self._new_rows(channel, most))][-most:]
+        new = [*self._infos, *messages_of(self._store, channel, self._new_rows(channel, most))][-most:]
         self._infos = []
         for time_ns, message in new:
             body = memoryview(message)[BODY - _HEADER :]
@@ -339,7 +293,8 @@ def follow(path: Path, uuid: str, begin: int) -> Follower | None:
     if told.get("uuid") == uuid:
         metadata = check_metadata(source, told)
         journal = _journal_of(source, metadata, ())
-        if journal is not None:  # that of every recorder at work defines the channels, later the summary does
+        # while somebody records, the journal defines the channels, later the summary does
+        if journal is not None:
             define(found, journal)
         elif has_summary(source) and not is_locked(path):
             summary = read_summary(source)

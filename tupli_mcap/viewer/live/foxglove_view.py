@@ -12,7 +12,8 @@ import numpy as np
 from tupli_mcap.mcap.records import RECORD_HEADER
 from tupli_mcap.messages.images.codecs import CODEC
 from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
-from tupli_mcap.viewer.live.follow import Follower, NewSteps
+from tupli_mcap.viewer.live.follow import Follower
+from tupli_mcap.viewer.live.new_rows import NewSteps
 from tupli_mcap.viewer.live.target import Target
 
 __all__ = ["FoxgloveView"]
@@ -20,11 +21,11 @@ __all__ = ["FoxgloveView"]
 _STEPS = 250  # of a sub-environment at a time
 _IMAGES = 2
 _EVENTS = 250
-_FAREWELL = 0.2  # seconds for clients to take what was published last: a server that stops drops it
+_FAREWELL = 0.2  # seconds for clients to take the last messages, which a stopping server drops
 
 
 class FoxgloveView:
-    """Publishes what is recorded; a channel that nobody listens to costs next to nothing.
+    """Publishes what is recorded, on the channels that a client has subscribed to.
 
     Raises:
         RuntimeError: the port is taken.
@@ -52,11 +53,11 @@ class FoxgloveView:
         return True
 
     def _announce(self, follower: Follower) -> None:
-        """The channels that the file has, in its own order."""
+        """Offers the channels of the file, in its order."""
         for channel in follower.channels.values():
             schema = follower.schemas[channel.schema_id]
             name, text = schema.name, schema.data
-            if CODEC in channel.metadata:  # they are shown as pixels
+            if CODEC in channel.metadata:  # stored encoded, published as pixels
                 name, text = IMAGE_NAME, IMAGE_SCHEMA.encode()
             self._channels[channel.id] = foxglove.Channel(
                 channel.topic,

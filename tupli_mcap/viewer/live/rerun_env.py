@@ -1,4 +1,4 @@
-"""One sub-environment of a rollout that goes on, in the panels of a replay."""
+"""Sends one sub-environment of a rollout that goes on to the panels of a replay."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block, Piece
-from tupli_mcap.viewer.live.follow import Follower, NewInfo, NewSteps
-from tupli_mcap.viewer.panels import Camera, HeatMap, LiveInfos, Panel, Place, Rewards, Series
+from tupli_mcap.viewer.live.follow import Follower
+from tupli_mcap.viewer.live.new_rows import NewInfo, NewSteps
+from tupli_mcap.viewer.panels import Camera, HeatMap, LiveInfos, Panel, Place, Rewards, Series, value_range
 from tupli_mcap.viewer.scene import Scene
 from tupli_mcap.viewer.sending import Times, send_scalars
 
 __all__ = ["MOST_INFOS", "LiveEnv", "columns_of"]
 
-_STEPS = 1000  # of the newest, at a time, of all sub-environments together
-_DECODED = 200  # where each message is decoded on its own
+_STEPS = 1000  # at a time, the newest, of all sub-environments together
+_DECODED = 200  # the same where each message is decoded on its own
 MOST_INFOS = 300
 _IMAGES = 3
 _MAP_STEPS = 400
@@ -39,7 +40,7 @@ class _Columns(NamedTuple):
 
 
 class _NewestMap:
-    """The heat map of the newest steps, whatever their episodes: those of a replay are of whole episodes."""
+    """A heat map of the newest steps, across episodes. (In a replay, each heat map is of one episode.)"""
 
     def __init__(self, panel: HeatMap) -> None:
         self._panel = panel
@@ -49,11 +50,8 @@ class _NewestMap:
         values = self._panel.leaf.get(getattr(columns, self._panel.column))
         new = values.reshape(len(values), -1)[-_MAP_STEPS:].astype(np.float32)
         self._values = np.concatenate([self._values, new])[-_MAP_STEPS:]
-        finite = np.isfinite(new)
-        panel = self._panel
-        low = np.minimum(panel.low, np.where(finite, new, np.inf).min(axis=0, initial=np.inf))
-        high = np.maximum(panel.high, np.where(finite, new, -np.inf).max(axis=0, initial=-np.inf))
-        self._panel = replace(panel, low=low, high=high)
+        panel, (low, high) = self._panel, value_range(new)
+        self._panel = replace(panel, low=np.minimum(panel.low, low), high=np.maximum(panel.high, high))
 
     def send(self, place: Place, times: Times) -> None:
         self._panel.send_map(place, self._values, times)
@@ -64,8 +62,8 @@ class LiveEnv:
 
     Args:
         scene: the panels that all sub-environments have.
-        place: below which root they are; without a stream still.
-        share: one of so many that are shown.
+        place: the root that they are below; `on` gives it a stream.
+        share: how many sub-environments are shown, which share what is sent at a time.
     """
 
     def __init__(
@@ -78,13 +76,13 @@ class LiveEnv:
         self._seconds = seconds
         self._most = max(1, (_STEPS if layout.constant else _DECODED) // share)
         self._images = max(1, _IMAGES // share)
-        self._rows = 0  # looked at
-        self._shift = 0  # of its rows on the timeline
+        self._rows = 0  # known of
+        self._shift = 0  # from the number of a row to its place on the timeline
         self._next = 0  # the number after the last one sent
         self._missed = False  # whether steps were left out since the last infos
-        self._rewards = Rewards(layout.reward)  # it remembers
+        self._rewards = Rewards(layout.reward)  # one for each sub-environment: it keeps the running return
         shown = [*scene.states, *scene.actions, *scene.beside]
-        # cameras, infos and maps come by themselves
+        # cameras, infos and heat maps are not sent with blocks of steps
         self._panels = [
             self._rewards,
             *(panel for panel in shown if not isinstance(panel, HeatMap | Camera | LiveInfos)),
@@ -95,7 +93,7 @@ class LiveEnv:
 
     @property
     def _alone(self) -> Place:
-        """Where there is what only this sub-environment has."""
+        """The place of entities that only the first sub-environment has: below no root."""
         return Place(self._place.stream)
 
     @property
@@ -104,13 +102,13 @@ class LiveEnv:
         return self._rows + self._shift
 
     def expect(self, new: NewSteps) -> None:
-        """These steps are sent next."""
+        """Says which steps are sent next."""
         self._rows = new.first + len(new)
 
     def catch_up(self, end: int) -> None:
         """Numbers rows from here on so that the last one known of is before `end`.
 
-        There are fewer rows where episodes are shorter: a reset is none.
+        A sub-environment with shorter episodes has fewer rows, since a reset makes none.
         """
         self._shift = max(self._shift, end - self._rows)
 
@@ -151,7 +149,7 @@ class LiveEnv:
         self._missed = False
 
     def _leave_out(self, after: NewSteps) -> None:
-        """Breaks the lines where steps are missing before those that follow."""
+        """Breaks the lines before `after`: steps ahead of it are not sent."""
         self._rewards.miss()
         self._missed = True
         times = self._times(np.array([after.first - 1]), after.facts.time[:1])

@@ -12,10 +12,11 @@ import numpy as np
 
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.recording.description import nan_text, spread_of
-from tupli_mcap.viewer.about import plain
 from tupli_mcap.viewer.blueprints import blueprint_of
-from tupli_mcap.viewer.live.follow import Follower, NewInfo, NewSteps
+from tupli_mcap.viewer.live.follow import Follower
+from tupli_mcap.viewer.live.new_rows import NewInfo, NewSteps
 from tupli_mcap.viewer.live.rerun_env import MOST_INFOS, LiveEnv, columns_of
+from tupli_mcap.viewer.names import plain
 from tupli_mcap.viewer.panels import PALETTE, Place, numbers_in
 from tupli_mcap.viewer.scene import live_scene
 from tupli_mcap.viewer.sending import tensor_array

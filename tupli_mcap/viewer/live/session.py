@@ -1,7 +1,7 @@
-"""Starting the process that shows a rollout, and telling it of the files.
+"""Starts the process that shows a rollout, and names the files to it.
 
-It is started as a program, not forked (this process may have threads) and not by `multiprocessing` (which would run the
-caller's script again). What becomes of it is no matter to the recording.
+The process is started as a program: a fork would copy the locks of this process's threads, and `multiprocessing` would
+run the caller's script again. Whatever happens to it, the recording goes on.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ class LiveSession:
         self.go_on(writer)
 
     def go_on(self, writer: RecordingWriter) -> None:
-        """After the rest of the files before, what `writer` records is shown."""
+        """Shows what `writer` records, once the files before it are shown to their ends."""
         file = os.path.realpath(writer.path), writer.uuid, writer.container.position
-        with contextlib.suppress(OSError):  # it has ended
+        with contextlib.suppress(OSError):  # the process has ended
             if self.process.stdin is not None:
                 self.process.stdin.write(json.dumps(file).encode() + b"\n")
                 self.process.stdin.flush()
 
     def close(self) -> None:
-        """The rest is shown, and the process ends; it goes on alone if that takes longer than some seconds."""
+        """Waits some seconds for the process to show the rest and end; a slower one is left to go on alone."""
         with contextlib.suppress(OSError):
             if self.process.stdin is not None:
                 self.process.stdin.close()
         try:
             self.process.wait(_FAREWELL)
         except subprocess.TimeoutExpired:
-            self.process.returncode = 0  # which is no leak to warn of
+            self.process.returncode = 0  # it goes on; Popen is not to warn of it
 
 
 def open_session(writer: RecordingWriter, live: str, title: str) -> LiveSession | None:
-    """Begins to show what `writer` records; None, and a warning, where no process can be had.
+    """Begins to show what `writer` records. Warns and returns None if no process can be started.
 
     Args:
         live: "rerun", "foxglove", or where a viewer listens.
@@ -70,7 +70,7 @@ def open_session(writer: RecordingWriter, live: str, title: str) -> LiveSession 
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             env=environment,
-            start_new_session=True,  # a Ctrl-C is for the recorder
+            start_new_session=True,  # Ctrl-C reaches the recorder only
         )
     except OSError as err:
         warnings.warn(

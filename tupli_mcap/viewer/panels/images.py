@@ -1,4 +1,4 @@
-"""Panels of what is looked at rather than read off: images, grids, heat maps, camera frames."""
+"""Panels of images, grids, heat maps and camera frames."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.panels.panel import Place, flat_values, named
-from tupli_mcap.viewer.sending import Times, blob_array, column_of, send_blobs, send_tensors
+from tupli_mcap.viewer.sending import Times, blob_array, column_of, pooled, send_blobs, send_tensors
 
-__all__ = ["Camera", "Grid", "HeatMap", "Picture"]
+__all__ = ["Camera", "Grid", "HeatMap", "Picture", "value_range"]
 
 _MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
 # By dimensions of a leaf. The viewer knows height and width by these names, and would lay other ones on their side.
@@ -26,7 +26,7 @@ _FRAMES_A_LINE = 4  # of a stack
 
 @dataclass(frozen=True)
 class Picture:
-    """An image leaf: a picture a step, as it is; of a stack its frames, the oldest first, in lines as one reads."""
+    """An image leaf: one picture a step. A stack shows all its frames side by side, the oldest first."""
 
     leaf: Leaf
     column: str
@@ -51,7 +51,7 @@ class Picture:
         send_blobs(place.stream, place.root + self.entity, times, rr.Image.descriptor_buffer(), values)
 
     def _tiled(self, values: Array) -> Array:
-        """Pictures (rows x height x width x channels) of a column; black where the last line is not full."""
+        """Pictures (rows x height x width x channels) of a column; black where the last line of a stack is not full."""
         leaf = self.leaf
         if leaf.kind == "image":
             return values
@@ -80,7 +80,7 @@ class Grid:
     title: str
 
     def declare(self, place: Place) -> None:
-        """Nothing: tensors say all themselves."""
+        """Nothing: all is sent with the values."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         values = self.leaf.get(getattr(block.columns, self.column))
@@ -99,7 +99,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class HeatMap:
-    """Many dimensions of a leaf over the steps of an episode: one picture an episode, at its first step.
+    """Many dimensions of a leaf over the steps of an episode: one picture for each episode, at its first step.
 
     low, high: the range of each dimension, which its colours span.
     """
@@ -112,7 +112,7 @@ class HeatMap:
     high: Array
 
     def declare(self, place: Place) -> None:
-        """Nothing: tensors say all themselves."""
+        """Nothing: all is sent with the values."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         scaled = self._scaled(flat_values(self.leaf, self.column, block))
@@ -138,20 +138,24 @@ class HeatMap:
         return _tensors(self.title, roots, self.entity)
 
 
+def value_range(values: Array) -> tuple[Array, Array]:
+    """The lowest and highest finite value of each dimension (steps x dimensions); inf and -inf if it has none."""
+    finite = np.isfinite(values)
+    low: Array = np.where(finite, values, np.inf).min(axis=0, initial=np.inf)
+    high: Array = np.where(finite, values, -np.inf).max(axis=0, initial=-np.inf)
+    return low, high
+
+
 def _pooled(values: Array) -> Array:
     """Means of neighbours, so that no side is longer than a heat map can be."""
     for axis, most in enumerate((_MOST_ROWS, _MOST_COLUMNS)):
-        length = values.shape[axis]
-        if length > most:
-            edges = np.linspace(0, length, most + 1).astype(int)
-            sums = np.add.reduceat(values, edges[:-1], axis=axis)
-            values = sums / np.expand_dims(np.diff(edges), 1 - axis)
+        values, _ = pooled(values, most, axis)
     return np.ascontiguousarray(values, np.float32)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """The frames of a camera, as they were encoded; they show states."""
+    """The frames of a camera, as they were encoded. They show states."""
 
     name: str
     entity: str
@@ -159,7 +163,7 @@ class Camera:
     column: str = "states"
 
     def declare(self, place: Place) -> None:
-        """Nothing: frames say all themselves."""
+        """Nothing: all is sent with the frames."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         if self.name not in block.recording.cameras:  # another recording beside it may have one

@@ -36,7 +36,7 @@ class Series:
     stepped: bool = False
 
     def declare(self, place: Place) -> None:
-        names = [place.told(name, alone=len(self.names) == 1) for name in self.names]
+        names = [place.series_name(name, alone=len(self.names) == 1) for name in self.names]
         place.declare_series(self.entity, names, place.colors(len(names)), stepped=self.stepped)
 
     def send(self, place: Place, block: Block, times: Times) -> None:
@@ -46,8 +46,10 @@ class Series:
         send_scalars(place.stream, place.root + self.entity, times, values)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        told = len(roots) == 1 and len(self.names) > 1  # compared episodes are told beside the returns, once
-        return plot(self.title, [root + self.entity for root in roots], axis, legend=told)
+        legend = (
+            len(roots) == 1 and len(self.names) > 1
+        )  # compared episodes are named once, beside the returns
+        return plot(self.title, [root + self.entity for root in roots], axis, legend=legend)
 
 
 @dataclass
@@ -64,7 +66,7 @@ class Rewards:
         from rerun.components import MarkerShape
 
         for name, color in (("reward", 6), ("return", 2)):
-            place.declare_series(f"/{name}", [place.told(name, alone=True)], place.colors(1, color))
+            place.declare_series(f"/{name}", [place.series_name(name, alone=True)], place.colors(1, color))
         shapes = (MarkerShape.Cross, MarkerShape.Diamond, MarkerShape.Square)
         for (name, color), shape in zip(_ENDS.items(), shapes, strict=True):
             points = rr.SeriesPoints(

@@ -18,12 +18,15 @@ PALETTE: Final = (
     0x4C9BE8FF, 0xF28E2BFF, 0x59C36AFF, 0xE15759FF, 0xB07AD9FF, 0xEDC948FF,
     0x3FBFB5FF, 0xFF9DA7FF, 0xB58A6BFF, 0x8FA6C8FF, 0xA8C64DFF, 0xD264B6FF,
 )  # fmt: skip
-"""Colours that are told apart next to each other, on a light and on a dark ground (RGBA)."""
+"""Colours that can be told apart next to each other, on a light and on a dark ground (RGBA)."""
 
 
 class Place(NamedTuple):
-    """Where a panel's entities go: below `root` in a stream. `title` and `color` tell several episodes in one view
-    apart; they are empty where there is only one. `single`: one step is all that comes, which makes no line."""
+    """Where a panel's entities go: below `root` in a stream.
+
+    title, color: tell several episodes in one view apart; empty if there is only one.
+    single: there is only one step, which is drawn as points, since it makes no line.
+    """
 
     stream: Any
     root: str = ""
@@ -31,8 +34,8 @@ class Place(NamedTuple):
     color: int | None = None
     single: bool = False
 
-    def told(self, name: str, *, alone: bool) -> str:
-        """The name of a series: of the episode where the view shows only this one of each."""
+    def series_name(self, name: str, *, alone: bool) -> str:
+        """The name of a series. `alone`: the view shows only this series of each episode, so the episode names it."""
         if not self.title:
             return name
         return self.title if alone else f"{name} · {self.title}"
@@ -67,14 +70,14 @@ class Place(NamedTuple):
 
 
 class Panel(Protocol):
-    """Something that is shown."""
+    """A view, and the entities that it shows."""
 
     @property
     def title(self) -> str: ...
 
     @property
     def column(self) -> str:
-        """The field that it shows. Only those of "states" have a value after the last step of an episode."""
+        """The field that it shows. Only "states" have a value after the last step of an episode."""
         ...
 
     def declare(self, place: Place) -> None:
@@ -97,12 +100,12 @@ def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
 
 
 def named(title: str, root: str) -> str:
-    """A view's title: of several episodes, which one it is comes first."""
+    """A view's title, after the name of the episode if there are several."""
     return f"{root.rpartition('/')[2]}: {title}" if root else title
 
 
 def plot(title: str, entities: Sequence[str], axis: Any, *, legend: bool = True) -> Any:
-    """A view of series over time. A legend of what the title says would only hide it."""
+    """A view of series over time. No legend is needed where it would only repeat the title."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(

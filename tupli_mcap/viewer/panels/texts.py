@@ -1,4 +1,4 @@
-"""Panels of what is read: texts, values of variable size, states of few values, and infos."""
+"""Panels of texts, values of variable size, infos, and lanes of states."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Lanes:
         known = (which >= 0) & (which < len(self.labels))
         which = np.where(known, which, len(self.labels))
         at = times.at(rows)
-        if block.finals is not None:  # which have no value here: the lane ends
+        if block.finals is not None:  # a lane ends where its episode does
             before = np.searchsorted(rows, block.finals.before)
             which = np.insert(which, before, len(self.labels) + 1)
             at = at.inserted(before, block.finals.number, block.finals.times)
@@ -80,7 +80,7 @@ class Words:
     title: str
 
     def declare(self, place: Place) -> None:
-        """Nothing: texts say all themselves."""
+        """Nothing: all is sent with the texts."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         import rerun as rr
@@ -121,7 +121,7 @@ class Infos:
 
     def declare(self, place: Place) -> None:
         for i, (key, entity) in enumerate(self.numbers.items()):
-            place.declare_series(entity, [place.told(key, alone=False)], place.colors(1, i))
+            place.declare_series(entity, [place.series_name(key, alone=False)], place.colors(1, i))
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         import rerun as rr
@@ -138,7 +138,7 @@ class Infos:
                 continue
             at = times.at(np.array([row for row, _ in pairs]))
             if key in self.numbers:
-                values = np.array([float(np.asarray(value).reshape(())) for _, value in pairs])
+                values = np.array([_number(value) for _, value in pairs])
                 send_scalars(place.stream, place.root + self.numbers[key], at, values[:, None])
             else:
                 texts = [_shown(value) for _, value in pairs]
@@ -161,17 +161,18 @@ class Infos:
 
 
 class LiveInfos(Infos):
-    """Numbers among the infos of the first sub-environment of a rollout that goes on: they are below no root."""
+    """Numbers among the infos of the first sub-environment of a rollout that goes on; below no root."""
 
     def send_numbers(
         self, place: Place, infos: Sequence[Mapping[str, Any]], times: Times, *, missed: bool
     ) -> None:
-        """Sends the numbers of `infos`, one a row of `times`; `missed` ones before them break the lines."""
+        """Sends the numbers of `infos`, one for each row of `times`. `missed`: infos before them were not sent, so the
+        lines break."""
         for key, entity in self.numbers.items():
             rows = [row for row, info in enumerate(infos) if _is_number(info.get(key))]
             if not rows:
                 continue
-            values = np.array([float(np.asarray(infos[row][key]).reshape(())) for row in rows])
+            values = np.array([_number(infos[row][key]) for row in rows])
             if missed:
                 before = times.at(np.array(rows[:1])).moved(-1)
                 send_scalars(place.stream, place.root + entity, before, np.full((1, 1), np.nan))
@@ -182,7 +183,7 @@ class LiveInfos(Infos):
 
 
 def infos_of(recording: Recording, positions: Sequence[int], most: int) -> tuple[Infos | None, list[str]]:
-    """The panel of the infos that the given episodes have, and what of them is not shown."""
+    """The panel of the infos of the given episodes, and notes on infos that are not shown."""
     kinds: dict[str, str] = {}
     for position in positions:
         for info in recording.infos(position) or ():
@@ -212,3 +213,7 @@ def _is_number(value: Any) -> bool:
     if isinstance(value, bool | int | float | np.bool_ | np.number):
         return not isinstance(value, int) or abs(value) < 2**1000
     return isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "biuf"
+
+
+def _number(value: Any) -> float:
+    return float(np.asarray(value).reshape(()))

@@ -23,20 +23,13 @@ from tupli_mcap.cli.terminal import ask_secret, say
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
 
-__all__ = ["register"]
+__all__ = ["bundle", "export", "import_"]
 
 Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write (.mcap).")]
 Source = Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.command("bundle")(_bundle)
-    app.command("import")(_import)
-    app.command("export")(_export)
-
-
-def _bundle(
+def bundle(
     source: Annotated[
         str, typer.Argument(metavar="BENCHMARK_ID|FILE", help="A benchmark (4 digits may do) or a recording.")
     ],
@@ -78,7 +71,7 @@ def _bundle(
     _print_written(output, as_json)
 
 
-def _export(
+def export(
     output: Output,
     storage_path: StoragePath = DEFAULT_STORAGE,
     filter_text: FilterText = None,
@@ -94,7 +87,7 @@ def _export(
     _print_written(output, as_json)
 
 
-def _import(
+def import_(
     file: Source,
     storage_path: StoragePath = DEFAULT_STORAGE,
     trust: Annotated[bool, typer.Option("--trust", help="Also trust its environment's code.")] = False,

@@ -1,4 +1,4 @@
-"""A copy of a recording for viewers without a blueprint: beside each number and text a channel of a type they know.
+"""Companion channels: in a copy of a recording, each number and text once more, in a type that stock viewers plot.
 
 Rerun plots `std_msgs/msg/Float64MultiArray` and shows `std_msgs/msg/String` as they are; Foxglove gets a layout file.
 The copy is a recording like any other: companion channels say what they follow, and readers of recordings ignore them.
@@ -31,6 +31,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.rewrite import Follower, rewrite_recording
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names
+from tupli_mcap.viewer.targets import check_new
 
 __all__ = ["ARRAY_SCHEMA", "STRING_SCHEMA", "WIDEST", "companion_topics", "write_companions"]
 
@@ -63,8 +64,7 @@ def write_companions(
         FormatError: the source is damaged.
     """
     target = Path(target)
-    if target.exists() and not force:
-        raise RecordingError(f"{target} exists already; choose another name, or replace it with --force")
+    check_new(target, force=force)
     if not source.num_steps:
         raise RecordingError(f"{source.name} has no step, so there is nothing to plot")
     rewrite_recording(source, target, episodes=episodes, followers=_followers(source))
@@ -130,7 +130,7 @@ def _columns(layout: StepLayout, rows: Rows) -> _Columns:
 
 
 def _values_of(layout: StepLayout, leaf: Leaf) -> Callable[[Rows], Array]:
-    """A function from steps to the leaf's elements as float64 (rows x elements)."""
+    """Makes a function from steps to the leaf's elements as float64 (rows x elements)."""
 
     def values(rows: Rows) -> Array:
         found = np.asarray(_columns(layout, rows).leaves(leaf.name))
@@ -140,7 +140,7 @@ def _values_of(layout: StepLayout, leaf: Leaf) -> Callable[[Rows], Array]:
 
 
 class _RunningReturn:
-    """From steps to the sum of the rewards of their episode so far; goes on from one chunk of a channel to the next."""
+    """From steps to the sum of their episode's rewards so far; keeps the sum from one chunk to the next."""
 
     def __init__(self, layout: StepLayout) -> None:
         self._layout = layout

@@ -1,11 +1,8 @@
-"""Commands on recordings: record, ls, info, episodes."""
+"""Commands that look into recordings: ls, info, episodes."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import sys
-from enum import StrEnum
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,222 +12,37 @@ from tupli_mcap.cli.options import FilterText, Json, Limit, filter_of, open_stor
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
-    counted,
     number,
     numbers,
     print_facts,
     print_json,
     print_table,
+    print_wrapped,
     short_ids,
     time_of,
     when,
 )
-from tupli_mcap.cli.sparklines import print_sketch
-from tupli_mcap.cli.terminal import fail, say, step_progress, terminal_width
-from tupli_mcap.errors import TupliError
+from tupli_mcap.cli.terminal import can_print, fail, say, terminal_width
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
+    from tupli_mcap.recording import Recording
     from tupli_mcap.recording.description import RecordingDescription, Spread
-    from tupli_mcap.recording.write.options import CaptureEnv
+    from tupli_mcap.recording.series import Series
     from tupli_mcap.schema import EpisodeHeader
-    from tupli_mcap.wrappers.rollout import RolloutSummary
 
-__all__ = ["print_episodes", "register"]
+__all__ = ["episodes", "info", "ls", "print_episodes", "sparkline"]
 
 _ROOMY = 100  # columns of a terminal on which metadata and times fit side by side
+BLOCKS = "▁▂▃▄▅▆▇█"
+PLAIN = ".:-=+*#@"  # where blocks cannot be printed
+_WIDEST, _NARROWEST = 40, 8
+_OTHERS = 44  # columns of a line beside its blocks
+_LONGEST_NAME = 24
 
 
-class _Mode(StrEnum):
-    x = "x"
-    w = "w"
-    a = "a"
-
-
-class _Durability(StrEnum):
-    os = "os"
-    chunk = "chunk"
-    step = "step"
-
-
-class _Compression(StrEnum):
-    zstd = "zstd"
-    lz4 = "lz4"
-    none = "none"
-
-
-class _CaptureEnv(StrEnum):
-    spec = "spec"
-    pickle = "pickle"
-    none = "none"
-
-    @property
-    def argument(self) -> CaptureEnv:
-        """The same for `record_rollouts`."""
-        return None if self is _CaptureEnv.none else "pickle" if self is _CaptureEnv.pickle else "spec"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.command("record")(_record)
-    app.command("ls")(_ls)
-    app.command("info")(_info)
-    app.command("episodes")(_episodes)
-
-
-def _check_policy(value: str | None) -> str | None:
-    if value is not None and not all(value.partition(":")[::2]):
-        raise typer.BadParameter(f"expected module:function, found {value!r}")
-    return value
-
-
-_EnvId = Annotated[str, typer.Argument(metavar="ENV_ID", help="As gymnasium.make takes it.")]
-_Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording (.mcap).")]
-_Steps = Annotated[int, typer.Option(min=1, help="Steps to record, in total.")]
-_Seed = Annotated[int | None, typer.Option(min=0, help="Of the first reset and of random actions.")]
-_NumEnvs = Annotated[int, typer.Option(min=1, help="Sub-environments side by side.")]
-_Policy = Annotated[
-    str | None,
-    typer.Option(
-        metavar="MODULE:FUNCTION",
-        callback=_check_policy,
-        help="Called with an observation, returns an action; random without it.",
-    ),
-]
-_ModeOption = Annotated[
-    _Mode,
-    typer.Option(help="If the file exists: x refuses, w replaces, a appends (and makes a missing one)."),
-]
-_CompressionOption = Annotated[_Compression, typer.Option(help="Of the chunks.")]
-_RecordInfo = Annotated[bool, typer.Option("--record-info", help="Record the infos of steps too.")]
-_DurabilityOption = Annotated[
-    _Durability, typer.Option(help="What a power loss leaves: step and chunk wait for the disk.")
-]
-_Live = Annotated[
-    str | None,
-    typer.Option(metavar="VIEWER", help="Show it meanwhile: rerun, foxglove, or the URL of a viewer."),
-]
-_Frames = Annotated[
-    bool, typer.Option("--frames", help="Record what the environment renders (rgb_array) too.")
-]
-_Every = Annotated[int, typer.Option(min=1, help="With --frames: of every so many steps.")]
-_CaptureEnvOption = Annotated[_CaptureEnv, typer.Option(help="What the file carries of the environment.")]
-_MaxBytes = Annotated[
-    int | None, typer.Option(min=1, help="Go on in FILE_0001.mcap, … once so much is in a file.")
-]
-_MaxSeconds = Annotated[
-    float | None,
-    typer.Option(min=0.001, help="The same after so many seconds; a running episode stays whole."),
-]
-
-
-def _record(
-    env_id: _EnvId,
-    output: _Output,
-    steps: _Steps = 1000,
-    seed: _Seed = None,
-    num_envs: _NumEnvs = 1,
-    policy: _Policy = None,
-    mode: _ModeOption = _Mode.x,
-    compression: _CompressionOption = _Compression.zstd,
-    record_info: _RecordInfo = False,
-    durability: _DurabilityOption = _Durability.os,
-    live: _Live = None,
-    frames: _Frames = False,
-    every: _Every = 1,
-    capture_env: _CaptureEnvOption = _CaptureEnv.spec,
-    max_bytes: _MaxBytes = None,
-    max_seconds: _MaxSeconds = None,
-    as_json: Json = False,
-) -> None:
-    """Record rollouts of an environment.
-
-    Modules (of a policy, or an ENV_ID such as my_envs:Maze-v0) are looked for in the current directory too,
-    after the installed ones.
-    Ctrl-C ends the recording early; what was recorded stays, and how much that is is said.
-    """
-    if every > 1 and not frames:
-        raise typer.BadParameter("--every says of how many steps frames are recorded; give --frames too")
-    if frames:  # no window is opened: pygame need not look for a screen
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
-
-    if policy is not None or ":" in env_id:
-        sys.path.append("")  # last: a file that happens to lie here replaces no installed module
-    function = None if policy is None else load_policy(policy)
-    with (
-        _saying_what_is_safe(output, max_bytes or max_seconds, replaces=mode is _Mode.w),
-        step_progress(steps) as progress,
-    ):
-        summary = record_rollouts(
-            env_id, output, steps=steps, seed=seed, num_envs=num_envs, policy=function, mode=mode.value,
-            compression=compression.value, record_info=record_info, durability=durability.value, live=live,
-            frames=every if frames else False, capture_env=capture_env.argument, max_bytes=max_bytes,
-            max_seconds=max_seconds, progress=progress,
-        )  # fmt: skip
-    _print_rollout(summary, as_json=as_json)
-
-
-def _print_rollout(summary: RolloutSummary, *, as_json: bool) -> None:
-    if as_json:
-        paths = [str(path) for path in summary.paths]
-        print_json({**summary._asdict(), "path": str(summary.path), "paths": paths})
-        return
-    last = "" if len(summary.paths) == 1 else f" to {summary.path.name}"
-    facts = [
-        counted(summary.episodes, "episode"),
-        counted(summary.steps, "step"),
-        *_mean_text(summary),
-        f"{bytes_of(summary.size)} in {summary.seconds:.1f} s",
-    ]
-    say(f"{summary.paths[0]}{last}: {', '.join(facts)}")
-
-
-@contextlib.contextmanager
-def _saying_what_is_safe(output: Path, limit: float | None, *, replaces: bool) -> Iterator[None]:
-    """Adds to Ctrl-C what the recording holds by now; with a limit, the files it went on in count too."""
-    before = output.stat().st_ino if replaces and output.exists() else None
-    try:
-        yield
-    except KeyboardInterrupt as err:
-        held = _held(output, limit)
-        if before is not None and output.exists() and output.stat().st_ino == before:
-            held = f"{held}; this is the file that was there before"
-        raise KeyboardInterrupt(held) from err
-
-
-def _held(output: Path, limit: float | None) -> str:
-    from tupli_mcap.recording import Recording
-    from tupli_mcap.recording.file_series import series
-
-    first, others = (output, {}) if limit is None else series(output)
-    paths = [path for path in (first, *others.values()) if path.exists()]
-    episodes = steps = 0
-    try:
-        for path in paths:
-            with Recording(path) as recording:
-                episodes += len(recording)
-                steps += recording.num_steps
-    except TupliError as err:
-        return str(err)
-    if not paths:
-        return "nothing was recorded"
-    files = f"{paths[0]} holds" if len(paths) == 1 else f"{paths[0]} to {paths[-1].name} hold"
-    return f"{files} {counted(episodes, 'episode')}, {counted(steps, 'step')}"
-
-
-def _mean_text(summary: RolloutSummary) -> list[str]:
-    """The mean return, and what it leaves out; nothing where no episode was recorded."""
-    from tupli_mcap.recording.description import nan_text
-
-    odd = nan_text(summary.return_nan, summary.episodes)
-    if summary.return_nan < summary.episodes:
-        return [f"mean return {number(summary.return_mean)}{f' ({odd})' if odd else ''}"]
-    return [f"return {odd}"] if odd else []
-
-
-def _ls(
+def ls(
     paths: Annotated[
         list[Path] | None,
         typer.Argument(metavar="PATH", help="Files, directories, storages; here by default.", readable=False),
@@ -272,7 +84,7 @@ def _ls(
         raise typer.Exit(1)
 
 
-def _info(
+def info(
     file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or a URL.")],
     as_json: Json = False,
 ) -> None:
@@ -290,7 +102,7 @@ def _info(
         description = describe(recording)
         if not as_json:
             print_facts(_facts(description))
-            print_sketch(recording)
+            _print_series(recording)
     if as_json:
         channels = [channel._asdict() for channel in description.channels]
         print_json({**asdict(description), "channels": channels, **_spreads(description)})
@@ -307,7 +119,7 @@ def _info(
         )
 
 
-def _episodes(
+def episodes(
     path: Annotated[
         Path,
         typer.Argument(metavar="FILE|STORAGE", help="A recording, or a storage's directory.", readable=False),
@@ -433,4 +245,66 @@ def _print_channels(d: RecordingDescription) -> None:
         *(Column(title, "right") for title in ("MESSAGES", "SIZE", "STORED")),
     )
     rows = [(c.topic, c.schema, number(c.messages), bytes_of(c.size), bytes_of(c.stored)) for c in d.channels]
+    print_table(columns, rows, empty="")
+
+
+# --- series of numbers as lines of blocks ---
+
+
+def sparkline(values: Sequence[float], *, zero_based: bool = False, blocks: str = BLOCKS) -> str:
+    """One character a number: a higher one for a larger number, a space for NaN.
+
+    zero_based: the lowest level is that of 0, which is a space; else that of the smallest number.
+    """
+    finite = [value for value in values if math.isfinite(value)]
+    if not finite:
+        return ""
+    low, high = (0.0 if zero_based else min(finite)), max(finite)
+    line = ""
+    for value in values:
+        if not math.isfinite(value) or (zero_based and value <= 0):
+            line += " "
+        elif high > low:
+            part = (value / 2 - low / 2) / (high / 2 - low / 2)  # a difference of huge numbers may overflow
+            line += blocks[min(int(part * len(blocks)), len(blocks) - 1)]
+        else:
+            line += blocks[len(blocks) // 2]
+    return line
+
+
+def _print_series(recording: Recording) -> None:
+    """Returns and lengths over episodes, and how rewards, actions and states are distributed."""
+    from tupli_mcap.recording.series import sketch
+
+    room = (terminal_width() or _WIDEST + _OTHERS) - _OTHERS
+    found = sketch(recording, max(_NARROWEST, min(_WIDEST, room)))
+    if not found.courses:
+        return
+    say("")
+    _print_sparklines("EPISODES", "FIRST TO LAST", found.courses, zero_based=False)
+    if found.distributions:
+        say("")
+        _print_sparklines("STEPS", "LEAST TO MOST", found.distributions, zero_based=True)
+        told = "" if found.sampled == recording.num_steps else f"{number(found.sampled)} steps sampled"
+        hidden = f"{number(found.hidden)} more dimensions" if found.hidden else ""
+        if told or hidden:
+            say(", ".join(filter(None, (hidden, told))))
+        odd = [f"{number(one.odd)} of {one.name}" for one in found.distributions if one.odd]
+        if odd:
+            print_wrapped(f"not finite, left out: {', '.join(odd)}", "", "")
+    if found.error:
+        say(f"no step is shown: {found.error}")
+
+
+def _print_sparklines(title: str, spark: str, series: Sequence[Series], *, zero_based: bool) -> None:
+    blocks = BLOCKS if can_print(BLOCKS) else PLAIN
+    columns = (Column(title, shrink="end"), Column(spark), Column("LEAST", "right"), Column("MOST", "right"))
+    rows = [
+        (
+            one.name if len(one.name) <= _LONGEST_NAME else f"{one.name[:8]}...{one.name[-13:]}",
+            sparkline(one.values, zero_based=zero_based, blocks=blocks),
+            *("" if math.isnan(end) else number(end, 3) for end in (one.least, one.most)),
+        )
+        for one in series
+    ]
     print_table(columns, rows, empty="")

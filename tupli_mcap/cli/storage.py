@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from tupli_mcap.cli.info import print_episodes
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
     FilterText,
@@ -25,24 +26,14 @@ from tupli_mcap.cli.output import (
     short_ids,
     when,
 )
-from tupli_mcap.cli.recordings import print_episodes
 from tupli_mcap.cli.terminal import say, terminal_width
 
-__all__ = ["register"]
+__all__ = ["compact", "list_artifacts", "list_benchmarks", "list_episodes", "reindex"]
 
 _ROOMY = 100  # columns of a terminal on which benchmarks and their environments fit side by side
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.command("list-benchmarks")(_list_benchmarks)
-    app.command("list-artifacts")(_list_artifacts)
-    app.command("list-episodes")(_list_episodes)
-    app.command("compact")(_compact)
-    app.command("reindex")(_reindex)
-
-
-def _list_benchmarks(
+def list_benchmarks(
     storage_path: StoragePath = DEFAULT_STORAGE, filter_text: FilterText = None, as_json: Json = False
 ) -> None:
     """List the benchmarks of a storage.
@@ -77,7 +68,7 @@ def _list_benchmarks(
     print_table(columns, rows, empty="no benchmarks")
 
 
-def _list_artifacts(
+def list_artifacts(
     storage_path: StoragePath = DEFAULT_STORAGE, filter_text: FilterText = None, as_json: Json = False
 ) -> None:
     """List the artifacts of a storage.
@@ -99,7 +90,7 @@ def _list_artifacts(
     print_table(columns, rows, empty="no artifacts")
 
 
-def _list_episodes(
+def list_episodes(
     storage_path: StoragePath = DEFAULT_STORAGE,
     filter_text: FilterText = None,
     limit: Limit = None,
@@ -116,7 +107,7 @@ def _list_episodes(
     print_episodes(headers, as_json=as_json)
 
 
-def _compact(
+def compact(
     storage_path: StoragePath = DEFAULT_STORAGE,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be rewritten.")] = False,
     as_json: Json = False,
@@ -153,7 +144,7 @@ def _compact(
     )
 
 
-def _reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) -> None:
+def reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) -> None:
     """Make the catalog of a storage anew.
 
     The catalog is an index of the recordings, which are the only truth.

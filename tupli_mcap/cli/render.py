@@ -1,4 +1,4 @@
-"""The command that makes pictures of a recording that has none."""
+"""Commands that make pictures: render (of what an environment looked like), plot (of numbers)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tupli_mcap.replay import RenderReport
     from tupli_mcap.schema import BaseFilter
 
-__all__ = ["register"]
+__all__ = ["plot", "render"]
 
 _MOST_NAMES = 5
 
@@ -32,34 +32,35 @@ class _Format(StrEnum):
     jpeg = "jpeg"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("render")(_render)
+_Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="FILE|STORAGE", help="A recording: a path or a URL; or a directory with the recording."
+    ),
+]
+_Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
+_Episodes = Annotated[
+    str, typer.Option(metavar="WHICH", help="Numbers such as 3,7, or best, worst, first, last, all.")
+]
+_Every = Annotated[int, typer.Option(min=1, help="A frame of every so many steps, and the last.")]
+_Width = Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Of the frames (pixels).")]
+_FrameFormat = Annotated[_Format, typer.Option("--format", help="Of the frames in a .mcap: png is exact.")]
+_Trust = Annotated[
+    bool, typer.Option("--trust", help="Rebuild the environment even if that runs code from the file.")
+]
+_Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
 
 
-def _render(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="FILE|STORAGE", help="A recording: a path or a URL; or a directory with the recording."
-        ),
-    ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")
-    ],
-    episodes: Annotated[
-        str, typer.Option(metavar="WHICH", help="Numbers such as 3,7, or best, worst, first, last, all.")
-    ] = "best",
+def render(
+    source: _Source,
+    output: _Output,
+    episodes: _Episodes = "best",
     filter_text: FilterText = None,
-    every: Annotated[int, typer.Option(min=1, help="A frame of every so many steps, and the last.")] = 1,
-    width: Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Of the frames (pixels).")] = None,
-    frame_format: Annotated[
-        _Format, typer.Option("--format", help="Of the frames in a .mcap: png is exact.")
-    ] = _Format.png,
-    trust: Annotated[
-        bool, typer.Option("--trust", help="Rebuild the environment even if that runs code from the file.")
-    ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
+    every: _Every = 1,
+    width: _Width = None,
+    frame_format: _FrameFormat = _Format.png,
+    trust: _Trust = False,
+    force: _Force = False,
     as_json: Json = False,
 ) -> None:
     """Render episodes that were recorded without pictures.
@@ -76,7 +77,7 @@ def _render(
 
     os.environ.setdefault(
         "SDL_VIDEODRIVER", "dummy"
-    )  # no window is opened, and pygame need not look for a screen
+    )  # no window is opened: pygame need not look for a screen
     with (
         _chosen(source, episodes, filter_of(filter_text)) as (recording, chosen),
         step_progress(sum(map(len, chosen)), "rendering") as progress,
@@ -162,3 +163,49 @@ def _print(report: RenderReport) -> None:
         )
         hint = f". {report.divergence.hint}" if report.divergence.hint else ""
         fail(f"{report.divergence}; no frames from there on, {kept}{hint}")
+
+
+def plot(
+    paths: Annotated[
+        list[str], typer.Argument(metavar="FILE|STORAGE", help="Recordings, directories, storages, URLs.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="A .png, .svg or .html; by default FILE's name with .png."
+        ),
+    ] = None,
+    episode: Annotated[
+        str,
+        typer.Option(
+            metavar="N|best|worst|...", help="Whose steps to show: a number, best, worst, first, last."
+        ),
+    ] = "best",
+    filter_text: FilterText = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the output if it is there.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Draw a report of recordings as a picture or a page.
+
+    Returns, lengths, states, actions, rewards, and one episode step by step. Several recordings are compared.
+    The extension of the output says what it is; an .html needs no network. Needs the extra plot (matplotlib).
+    Nothing in a file is executed.
+    """
+    from tupli_mcap.plots import check_goal, report
+
+    goal = output or Path(f"{Path(paths[0]).resolve().stem if len(paths) == 1 else 'report'}.png")
+    try:
+        check_goal(goal, overwrite=force)
+    except RecordingError as err:
+        raise type(err)(str(err).replace("overwrite it", "replace it with --force")) from err
+    made = report(paths, episode=episode, episode_filter=filter_of(filter_text))
+    made.save(goal, overwrite=force)
+    size = goal.stat().st_size
+    episodes, steps = (
+        sum(counts) for counts in zip(*((len(m.rows), m.steps) for m in made.measured), strict=True)
+    )
+    if as_json:
+        told = {"path": str(goal), "size": size, "recordings": len(made.measured), "episodes": episodes}
+        print_json({**told, "steps": steps, "notes": made.notes})
+    else:
+        say(f"{goal}: {counted(episodes, 'episode')}, {counted(steps, 'step')}, {bytes_of(size)}")

@@ -12,74 +12,68 @@ from tupli_mcap.cli.options import FilterText, filter_of
 from tupli_mcap.cli.output import bytes_of
 from tupli_mcap.cli.terminal import flush, say
 
-__all__ = ["register"]
+__all__ = ["replay"]
+
+_Sources = Annotated[
+    list[str], typer.Argument(metavar="PATH", help="Recordings, URLs, directories of a storage.")
+]
+_Episode = Annotated[
+    str | None,
+    typer.Option("--episode", "-e", metavar="WHICH", help="Such as 3,7,9, best, worst, first, last, all."),
+]
+_Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
+_Split = Annotated[
+    bool,
+    typer.Option("--split/--joined", help="Each episode as a recording of its own, or all on one timeline."),
+]
+_Save = Annotated[
+    Path | None, typer.Option("--save", metavar="FILE.rrd", help="Write a file for the viewer instead.")
+]
+_Web = Annotated[
+    bool, typer.Option("--web", help="Serve a viewer for the browser, on 127.0.0.1, until Ctrl-C.")
+]
+_Connect = Annotated[
+    str | None,
+    typer.Option(
+        "--connect", metavar="URL", help="Send to a viewer that runs: rerun+http://HOST:PORT/proxy."
+    ),
+]
+_Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
+_ToMcap = Annotated[
+    Path | None,
+    typer.Option(
+        "--to-mcap", metavar="FILE.mcap", help="Write a copy that Rerun and Foxglove plot as it is instead."
+    ),
+]
+_Layout = Annotated[
+    Path | None,
+    typer.Option(
+        "--layout", metavar="FILE.json", help="Where --to-mcap puts the layout for Foxglove; beside the copy."
+    ),
+]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command("replay")(_replay)
-
-
-def _replay(
-    sources: Annotated[
-        list[str], typer.Argument(metavar="PATH", help="Recordings, URLs, directories of a storage.")
-    ],
-    episode: Annotated[
-        str | None,
-        typer.Option(
-            "--episode", "-e", metavar="WHICH", help="Such as 3,7,9, best, worst, first, last, all."
-        ),
-    ] = None,
+def replay(
+    sources: _Sources,
+    episode: _Episode = None,
     filter_text: FilterText = None,
-    compare: Annotated[
-        bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")
-    ] = False,
-    split: Annotated[
-        bool,
-        typer.Option(
-            "--split/--joined", help="Each episode as a recording of its own, or all on one timeline."
-        ),
-    ] = False,
-    save: Annotated[
-        Path | None, typer.Option("--save", metavar="FILE.rrd", help="Write a file for the viewer instead.")
-    ] = None,
-    web: Annotated[
-        bool, typer.Option("--web", help="Serve a viewer for the browser, on 127.0.0.1, until Ctrl-C.")
-    ] = False,
-    connect: Annotated[
-        str | None,
-        typer.Option(
-            "--connect", metavar="URL", help="Send to a viewer that runs: rerun+http://HOST:PORT/proxy."
-        ),
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
-    to_mcap: Annotated[
-        Path | None,
-        typer.Option(
-            "--to-mcap",
-            metavar="FILE.mcap",
-            help="Write a copy that Rerun and Foxglove plot as it is instead.",
-        ),
-    ] = None,
-    layout: Annotated[
-        Path | None,
-        typer.Option(
-            "--layout",
-            metavar="FILE.json",
-            help="Where --to-mcap puts the layout for Foxglove; beside the copy.",
-        ),
-    ] = None,
+    compare: _Compare = False,
+    split: _Split = False,
+    save: _Save = None,
+    web: _Web = False,
+    connect: _Connect = None,
+    force: _Force = False,
+    to_mcap: _ToMcap = None,
+    layout: _Layout = None,
 ) -> None:
     """Look at recordings in the Rerun viewer.
 
     States, actions, rewards, infos and images over time, all episodes in an overview. Needs the extra `rerun`.
     Timelines: step, episode_time (where the recording knows how long a step takes), and wall clock.
     """
-    from tupli_mcap import viewer
-    from tupli_mcap.viewer.sdk import import_quickly
-
+    goals = sum([web, save is not None, connect is not None])
     if to_mcap is not None:
-        if compare or split or web or save is not None or connect is not None:
+        if compare or split or goals:
             raise typer.BadParameter(
                 "--to-mcap writes a recording, and goes with --episode, --filter and --layout"
             )
@@ -89,13 +83,16 @@ def _replay(
         raise typer.BadParameter("--layout goes with --to-mcap")
     if compare and split:
         raise typer.BadParameter("--compare overlays episodes, --split shows them apart; give one of them")
-    form: viewer.Form = "compare" if compare else "split" if split else "joined"
-    if sum([web, save is not None, connect is not None]) > 1:
+    if goals > 1:
         raise typer.BadParameter(
             "--save, --web and --connect are three places to show episodes; give one of them"
         )
     if force and save is None:
         raise typer.BadParameter("--force replaces the file of --save; give that too")
+    from tupli_mcap import viewer
+    from tupli_mcap.viewer.sdk import import_quickly
+
+    form: viewer.Form = "compare" if compare else "split" if split else "joined"
     wanted = filter_of(filter_text)
     import_quickly()
     if save is not None:
@@ -118,7 +115,7 @@ def _tell(url: str) -> None:
 def _copy(
     sources: list[str], target: Path, episode: str | None, wanted: Any, layout: Path | None, *, force: bool
 ) -> None:
-    from tupli_mcap.viewer.copies import to_mcap
+    from tupli_mcap.viewer.to_mcap import to_mcap
 
     made = to_mcap(sources, target, episode, filter=wanted, layout=layout, force=force)
     size = bytes_of(made.recording.stat().st_size)

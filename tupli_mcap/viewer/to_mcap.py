@@ -1,4 +1,4 @@
-"""A layout for Foxglove: plots, images and state transitions on the topics of a recording."""
+"""`replay --to-mcap`: a copy of a recording that stock viewers plot as it is, and a layout for Foxglove."""
 
 from __future__ import annotations
 
@@ -6,20 +6,23 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.dataset.which import Source, chosen_from
+from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.topics import EPISODE_END, Topics
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
-from tupli_mcap.viewer.companions import WIDEST, companion_topics
+from tupli_mcap.viewer.companion_channels import WIDEST, companion_topics, write_companions
 from tupli_mcap.viewer.names import dimension_names
+from tupli_mcap.viewer.targets import check_new
 
-__all__ = ["foxglove_layout", "write_layout"]
+__all__ = ["Copies", "foxglove_layout", "to_mcap", "write_layout"]
 
 _MOST_LINES = 12  # in a plot
 _PLOT = {
@@ -32,6 +35,59 @@ _PLOT = {
     "sidebarDimension": 240,
     "xAxisVal": "timestamp",
 }
+
+
+class Copies(NamedTuple):
+    """The files that were written."""
+
+    recording: Path
+    layout: Path
+
+
+def to_mcap(
+    sources: Source | Sequence[Source],
+    target: str | os.PathLike[str],
+    episodes: str | Sequence[int] | None = None,
+    *,
+    filter: Any = None,
+    layout: str | os.PathLike[str] | None = None,
+    force: bool = False,
+) -> Copies:
+    """Writes a copy with companion channels, and beside it (or at `layout`) a layout to import into Foxglove.
+
+    Args:
+        sources, episodes, filter: as `tupli_mcap.viewer.save` has them, of one recording.
+        force: replace files that exist.
+
+    Raises:
+        RecordingError: more than one recording, no such episode, or a file that exists, is the recording itself, has
+            another ending than `.mcap`, or cannot be written.
+        FormatError: the recording is damaged.
+    """
+    target = Path(target)
+    place = target.with_suffix(".foxglove-layout.json") if layout is None else Path(layout)
+    if target.suffix != ".mcap":
+        raise RecordingError(
+            f"expected a name that ends in .mcap, by which viewers know such files, found {str(target)!r}"
+        )
+    for goal in (target, place):  # neither is written if the other cannot be
+        check_new(goal, force=force)
+    with chosen_from(sources, episodes, filter) as chosen:
+        if len(chosen) != 1:
+            raise RecordingError(f"expected one recording to copy, found {len(chosen)}; copy them one by one")
+        ((recording, positions),) = chosen
+        if recording.path is not None and any(_is_same(goal, recording.path) for goal in (target, place)):
+            raise RecordingError(
+                f"{recording.path} is the recording, which is never written over; give another name"
+            )
+        everything = len(positions) == len(recording)
+        numbers = None if everything else recording.index["episode"][list(positions)].tolist()
+        write_companions(recording, target, episodes=numbers, force=force)
+        return Copies(target, write_layout(recording, place))
+
+
+def _is_same(goal: Path, source: Path) -> bool:
+    return goal.exists() and goal.samefile(source)
 
 
 def write_layout(recording: Recording, target: str | os.PathLike[str]) -> Path:

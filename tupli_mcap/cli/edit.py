@@ -1,124 +1,119 @@
-"""Commands on files that may be damaged: verify, recover."""
+"""Commands that make new recordings of others: merge, split, filter, recover."""
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import Column, bytes_of, counted, number, print_json, print_table, print_wrapped
-from tupli_mcap.cli.replaying import Replays, episode_numbers
-from tupli_mcap.cli.terminal import fail, say
+from tupli_mcap.cli.terminal import say
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.check.report import VerifyReport
     from tupli_mcap.recording.edit.repair import RecoveryReport
 
-__all__ = ["register"]
+__all__ = ["filter_", "merge", "recover", "split"]
 
-_STATES = {"unfinished": "not finished", "recording": "being recorded"}
+_Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The new recording (.mcap).")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
+_DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be written.")]
+
+
 _NO_JOURNAL = {
     "missing": "which is not beside the file; if the file was cut off, all that followed too",
     "stale": "which is not the one beside the file",
     "damaged": "as far as that cannot be read",
 }
-_NOTHING = "nothing to be done"
 _SHOWN = 20  # damaged places, lost episodes: what is beyond is in --json
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.command("verify")(_verify)
-    app.command("recover")(_recover)
-
-
-def _verify(
-    paths: Annotated[
-        list[Path],
-        typer.Argument(metavar="PATH", help="Recordings, directories, storages.", readable=False),
+def merge(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE", help="Recordings of the same spaces.", readable=False)
     ],
-    replay: Annotated[
-        bool, typer.Option("--replay", help="Also replay recordings and compare, bit for bit.")
-    ] = False,
-    trust: Annotated[
-        bool,
-        typer.Option("--trust", help="With --replay: run the code that the files carry, with all options."),
-    ] = False,
-    episodes: Annotated[
-        str | None, typer.Option(metavar="NUMBERS", help="With --replay: only these, such as 0,4,10-19.")
-    ] = None,
+    output: _Output,
+    force: _Force = False,
+    dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Check files for damage.
+    """Write the episodes of several recordings into one.
 
-    Structure, CRCs, indexes, layouts, alignment and digests are checked. Every episode has to start, go on and
-    end, without a gap or a step twice. Of a storage, artifacts, benchmarks and the catalog are checked too.
-    Nothing is executed, nothing is written. Exit code 1 if something is damaged.
-
-    --replay rebuilds the environment of each recording, takes every episode again with its seed, options and
-    actions, and says where something differs. Exit code 1 if something does, or nothing could be checked.
+    They come in the order of their times, and are numbered anew. Of recordings made at the same time, those of the
+    later one follow the others, and rows that may not go back in time get a later one; a warning says how many.
+    The new recording has ids of its own, the environment of the first one, and no signature.
     """
-    replays = Replays(trust, episode_numbers(episodes)) if replay else None
-    if replays is None and (trust or episodes is not None):
-        raise typer.BadParameter("--trust and --episodes go with --replay")
-    from tupli_mcap.storage.verify import StorageReport, verify_paths
+    from tupli_mcap.recording.edit.merge import merge_recordings
 
-    found = StorageReport()
-    for report in verify_paths(paths):
-        found.files.append(report)
-        if not as_json:
-            _print_verified(report)
-        if replays is not None and report.kind == "recording" and report.ok:
-            replays.add(Path(report.path), quiet=as_json)
+    report = merge_recordings(files, output, overwrite=force, dry_run=dry_run)
     if as_json:
-        print_json({**found.to_json(), **({} if replays is None else {"replays": replays.to_json()})})
-    elif not found.files:
-        fail("there is nothing to verify; give recordings (.mcap) or directories of them")
-        raise typer.Exit(1)
-    elif len(found.files) > 1:
-        say(f"{number(len(found.files))} verified, {number(len(found.damaged))} damaged")
-    if replays is not None and not replays.tried and not as_json:
-        fail("nothing was replayed: there is no undamaged recording; recover one first")
-    if not found.ok or (replays is not None and not replays.ok):
-        raise typer.Exit(1)
+        print_json({"dry_run": dry_run, **_plain(report)})
+        return
+    _print_made(report, dry_run)
 
 
-def _print_verified(report: VerifyReport) -> None:
-    """A line on a file, one on each problem that does not follow from another, and what to do about them."""
-    from tupli_mcap.recording.check.report import RECOVER
+def split(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="The first one; FILE_0001.mcap, … follow.")
+    ],
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes in each file.")] = None,
+    max_bytes: Annotated[int | None, typer.Option(min=1, help="Bytes of each file, roughly.")] = None,
+    dry_run: _DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Write the episodes of a recording into several.
 
-    unread = report.kind == "recording" and not (report.ok or report.episodes)
-    facts = (
-        "its episodes cannot be read as it is"
-        if unread
-        else {
-            "recording": f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}",
-            "storage": f"{counted(report.attachments, 'artifact')}",
-        }[report.kind]
-    )
-    roots = [problem for problem in report.problems if not problem.follows]
-    count = sum(problem.severity == "error" for problem in roots) + report.more
-    damage = counted(count, "problem")
-    state = "" if report.state == "complete" else f", {_STATES[report.state]}"
-    say(f"{report.path}: {'ok' if report.ok else damage} ({facts}{state})")
-    for problem in roots[:_SHOWN]:
-        place = f"{problem.place}: " if problem.place else ""
-        print_wrapped(f"{problem.severity}: {place}{problem.message}", "  ", "    ")
-    if len(roots) > _SHOWN or report.more:
-        say(f"  ... and {number(len(roots) - min(_SHOWN, len(roots)) + report.more)} more; see --json")
-    followers = len(report.problems) - len(roots)
-    if followers:
-        follow = f"{'follows' if followers == 1 else 'follow'} from {'that' if len(roots) == 1 else 'these'}"
-        say(f"  ({number(followers)} more {follow}; see --json)")
-    for advice in dict.fromkeys(problem.advice for problem in roots if problem.advice != _NOTHING):
-        file = f" {shlex.quote(report.path)}" if advice == RECOVER else ""
-        print_wrapped(f"→ {advice}{file}", "  ", "    ")
+    Episodes stay whole and keep their numbers; the new recordings have ids of their own, and no signature.
+    """
+    if (episodes is None) == (max_bytes is None):
+        raise typer.BadParameter("expected either --episodes or --max-bytes")
+    from tupli_mcap.recording.edit.merge import split_recording
+
+    parts = split_recording(file, output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
+    if as_json:
+        print_json({"dry_run": dry_run, "recordings": [_plain(part) for part in parts]})
+        return
+    columns = (Column("RECORDING", shrink="start"), Column("EPISODES", "right"), Column("STEPS", "right"))
+    rows = [(str(part.path), number(part.episodes), number(part.steps)) for part in parts]
+    print_table(columns, rows, empty="nothing to split")
 
 
-def _recover(
+def filter_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
+    filter_text: Annotated[
+        str, typer.Argument(metavar="FILTER", help="Such as 'metadata.score > -200 and env = 0'.")
+    ],
+    output: _Output,
+    force: _Force = False,
+    dry_run: _DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Write the episodes that a filter is true of into a file.
+
+    They keep their ids. A signature is left out.
+    """
+    from tupli_mcap.dataset.curate import filter_recording
+
+    report = filter_recording(file, output, filter_text, overwrite=force, dry_run=dry_run)
+    if as_json:
+        print_json({"dry_run": dry_run, **_plain(report)})
+        return
+    _print_made(report, dry_run)
+
+
+def _plain(report: Any) -> dict[str, Any]:
+    return {**report._asdict(), "path": str(report.path)}
+
+
+def _print_made(report: Any, dry_run: bool) -> None:
+    size = "" if dry_run else f", {bytes_of(report.size)}"
+    would = "would write " if dry_run else ""
+    say(f"{would}{report.path}: {counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}{size}")
+
+
+def recover(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
     output: Annotated[
         Path | None,

@@ -1,29 +1,121 @@
-"""What `verify --replay` prints."""
+"""The command verify: checks files for damage, and with --replay what the environments do now."""
 
 from __future__ import annotations
 
+import shlex
 import textwrap
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.output import counted, number
+from tupli_mcap.cli.options import Json
+from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
 from tupli_mcap.cli.terminal import fail, say, step_progress, terminal_width, visible
 from tupli_mcap.errors import TupliError
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording.check.report import VerifyReport
     from tupli_mcap.replay import Certificate
 
-__all__ = ["Replays", "episode_numbers"]
+__all__ = ["verify"]
 
-_SHOWN = 5  # diverging episodes beside the first; what is beyond is in --json
+_STATES = {"unfinished": "not finished", "recording": "being recorded"}
+_NOTHING = "nothing to be done"
+_PROBLEMS = 20  # of a file that are shown; what is beyond is in --json
+_DIVERGING = 5  # episodes beside the first that are shown; what is beyond is in --json
 _MAX_NUMBERS = 10_000_000
 
 
-def episode_numbers(text: str | None) -> list[int] | None:
+def verify(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(metavar="PATH", help="Recordings, directories, storages.", readable=False),
+    ],
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Also replay recordings and compare, bit for bit.")
+    ] = False,
+    trust: Annotated[
+        bool,
+        typer.Option("--trust", help="With --replay: run the code that the files carry, with all options."),
+    ] = False,
+    episodes: Annotated[
+        str | None, typer.Option(metavar="NUMBERS", help="With --replay: only these, such as 0,4,10-19.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Check files for damage.
+
+    Structure, CRCs, indexes, layouts, alignment and digests are checked. Every episode has to start, go on and
+    end, without a gap or a step twice. Of a storage, artifacts, benchmarks and the catalog are checked too.
+    Nothing is executed, nothing is written. Exit code 1 if something is damaged.
+
+    --replay rebuilds the environment of each recording, takes every episode again with its seed, options and
+    actions, and says where something differs. Exit code 1 if something does, or nothing could be checked.
+    """
+    replays = _Replays(trust, _episode_numbers(episodes)) if replay else None
+    if replays is None and (trust or episodes is not None):
+        raise typer.BadParameter("--trust and --episodes go with --replay")
+    from tupli_mcap.storage.verify import StorageReport, verify_paths
+
+    found = StorageReport()
+    for report in verify_paths(paths):
+        found.files.append(report)
+        if not as_json:
+            _print_verified(report)
+        if replays is not None and report.kind == "recording" and report.ok:
+            replays.add(Path(report.path), quiet=as_json)
+    if as_json:
+        print_json({**found.to_json(), **({} if replays is None else {"replays": replays.to_json()})})
+    elif not found.files:
+        fail("there is nothing to verify; give recordings (.mcap) or directories of them")
+        raise typer.Exit(1)
+    elif len(found.files) > 1:
+        say(f"{number(len(found.files))} verified, {number(len(found.damaged))} damaged")
+    if replays is not None and not replays.tried and not as_json:
+        fail("nothing was replayed: there is no undamaged recording; recover one first")
+    if not found.ok or (replays is not None and not replays.ok):
+        raise typer.Exit(1)
+
+
+def _print_verified(report: VerifyReport) -> None:
+    """A line on a file, one on each problem that does not follow from another, and what to do about them."""
+    from tupli_mcap.recording.check.report import RECOVER
+
+    unread = report.kind == "recording" and not (report.ok or report.episodes)
+    facts = (
+        "its episodes cannot be read as it is"
+        if unread
+        else {
+            "recording": f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}",
+            "storage": f"{counted(report.attachments, 'artifact')}",
+        }[report.kind]
+    )
+    roots = [problem for problem in report.problems if not problem.follows]
+    count = sum(problem.severity == "error" for problem in roots) + report.more
+    damage = counted(count, "problem")
+    state = "" if report.state == "complete" else f", {_STATES[report.state]}"
+    say(f"{report.path}: {'ok' if report.ok else damage} ({facts}{state})")
+    for problem in roots[:_PROBLEMS]:
+        place = f"{problem.place}: " if problem.place else ""
+        print_wrapped(f"{problem.severity}: {place}{problem.message}", "  ", "    ")
+    if len(roots) > _PROBLEMS or report.more:
+        say(f"  ... and {number(len(roots) - min(_PROBLEMS, len(roots)) + report.more)} more; see --json")
+    followers = len(report.problems) - len(roots)
+    if followers:
+        follow = f"{'follows' if followers == 1 else 'follow'} from {'that' if len(roots) == 1 else 'these'}"
+        say(f"  ({number(followers)} more {follow}; see --json)")
+    for advice in dict.fromkeys(problem.advice for problem in roots if problem.advice != _NOTHING):
+        file = f" {shlex.quote(report.path)}" if advice == RECOVER else ""
+        print_wrapped(f"→ {advice}{file}", "  ", "    ")
+
+
+# --- with --replay ---
+
+
+def _episode_numbers(text: str | None) -> list[int] | None:
     """Numbers such as "0,4,10-19"; None for all."""
     if text is None:
         return None
@@ -39,7 +131,7 @@ def episode_numbers(text: str | None) -> list[int] | None:
     return numbers
 
 
-class Replays:
+class _Replays:
     """Recordings replayed one after another; one that cannot be stops nothing."""
 
     def __init__(self, trust: bool, episodes: Sequence[int] | None) -> None:
@@ -111,8 +203,8 @@ def _lines(c: Certificate, seconds: float) -> list[str]:
     if first is not None:
         lines += _spread(first)
         lines += [first.hint] if first.hint else []
-        lines += [str(other) for other in c.divergences[1 : _SHOWN + 1]]
-        hidden = c.diverged.episodes - 1 - _SHOWN
+        lines += [str(other) for other in c.divergences[1 : _DIVERGING + 1]]
+        hidden = c.diverged.episodes - 1 - _DIVERGING
         lines += [f"... and {number(hidden)} more episodes that diverge; see --json"] if hidden > 0 else []
         lines.append(
             f"{number(c.diverged.episodes)} of {counted(c.chosen.episodes, 'episode')} diverge, "

@@ -16,18 +16,12 @@ if TYPE_CHECKING:
     from tupli_mcap.environment import PickleImports
     from tupli_mcap.recording.sign.carried_code import CarriedCode
 
-__all__ = ["register"]
+__all__ = ["trust", "untrust"]
 
 _SHOWN = 40  # entries of a list on the terminal; --json has them all
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    app.command("trust")(_trust)
-    app.command("untrust")(_untrust)
-
-
-def _trust(
+def trust(
     file: Annotated[
         Path | None, typer.Argument(metavar="[FILE]", help="A recording.", readable=False)
     ] = None,
@@ -81,7 +75,7 @@ def _trust_key(text: str, name: str | None, *, as_json: bool) -> None:
         say(f"what {fingerprint(key.public_key)} {name or key.name} signs is trusted")
 
 
-def _untrust(
+def untrust(
     what: Annotated[
         str | None,
         typer.Argument(metavar="[FILE|DIGEST]", help="A recording, or a digest (8 digits may do)."),

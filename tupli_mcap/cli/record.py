@@ -1,0 +1,205 @@
+"""The command record: rollouts of an environment."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tupli_mcap.cli.options import Json
+from tupli_mcap.cli.output import bytes_of, counted, number, print_json
+from tupli_mcap.cli.terminal import say, step_progress
+from tupli_mcap.errors import TupliError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tupli_mcap.recording.write.options import CaptureEnv
+    from tupli_mcap.wrappers.rollout import RolloutSummary
+
+__all__ = ["record"]
+
+
+class _Mode(StrEnum):
+    x = "x"
+    w = "w"
+    a = "a"
+
+
+class _Durability(StrEnum):
+    os = "os"
+    chunk = "chunk"
+    step = "step"
+
+
+class _Compression(StrEnum):
+    zstd = "zstd"
+    lz4 = "lz4"
+    none = "none"
+
+
+class _CaptureEnv(StrEnum):
+    spec = "spec"
+    pickle = "pickle"
+    none = "none"
+
+    @property
+    def argument(self) -> CaptureEnv:
+        """The same for `record_rollouts`."""
+        return None if self is _CaptureEnv.none else "pickle" if self is _CaptureEnv.pickle else "spec"
+
+
+def _check_policy(value: str | None) -> str | None:
+    if value is not None and not all(value.partition(":")[::2]):
+        raise typer.BadParameter(f"expected module:function, found {value!r}")
+    return value
+
+
+_EnvId = Annotated[str, typer.Argument(metavar="ENV_ID", help="As gymnasium.make takes it.")]
+_Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording (.mcap).")]
+_Steps = Annotated[int, typer.Option(min=1, help="Steps to record, in total.")]
+_Seed = Annotated[int | None, typer.Option(min=0, help="Of the first reset and of random actions.")]
+_NumEnvs = Annotated[int, typer.Option(min=1, help="Sub-environments side by side.")]
+_Policy = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MODULE:FUNCTION",
+        callback=_check_policy,
+        help="Called with an observation, returns an action; random without it.",
+    ),
+]
+_ModeOption = Annotated[
+    _Mode,
+    typer.Option(help="If the file exists: x refuses, w replaces, a appends (and makes a missing one)."),
+]
+_CompressionOption = Annotated[_Compression, typer.Option(help="Of the chunks.")]
+_RecordInfo = Annotated[bool, typer.Option("--record-info", help="Record the infos of steps too.")]
+_DurabilityOption = Annotated[
+    _Durability, typer.Option(help="What a power loss leaves: step and chunk wait for the disk.")
+]
+_Live = Annotated[
+    str | None,
+    typer.Option(metavar="VIEWER", help="Show it meanwhile: rerun, foxglove, or the URL of a viewer."),
+]
+_Frames = Annotated[
+    bool, typer.Option("--frames", help="Record what the environment renders (rgb_array) too.")
+]
+_Every = Annotated[int, typer.Option(min=1, help="With --frames: of every so many steps.")]
+_CaptureEnvOption = Annotated[_CaptureEnv, typer.Option(help="What the file carries of the environment.")]
+_MaxBytes = Annotated[
+    int | None, typer.Option(min=1, help="Go on in FILE_0001.mcap, … once so much is in a file.")
+]
+_MaxSeconds = Annotated[
+    float | None,
+    typer.Option(min=0.001, help="The same after so many seconds; a running episode stays whole."),
+]
+
+
+def record(
+    env_id: _EnvId,
+    output: _Output,
+    steps: _Steps = 1000,
+    seed: _Seed = None,
+    num_envs: _NumEnvs = 1,
+    policy: _Policy = None,
+    mode: _ModeOption = _Mode.x,
+    compression: _CompressionOption = _Compression.zstd,
+    record_info: _RecordInfo = False,
+    durability: _DurabilityOption = _Durability.os,
+    live: _Live = None,
+    frames: _Frames = False,
+    every: _Every = 1,
+    capture_env: _CaptureEnvOption = _CaptureEnv.spec,
+    max_bytes: _MaxBytes = None,
+    max_seconds: _MaxSeconds = None,
+    as_json: Json = False,
+) -> None:
+    """Record rollouts of an environment.
+
+    Modules (of a policy, or an ENV_ID such as my_envs:Maze-v0) are looked for in the current directory too,
+    after the installed ones.
+    Ctrl-C ends the recording early; what was recorded stays, and how much that is is said.
+    """
+    if every > 1 and not frames:
+        raise typer.BadParameter("--every says of how many steps frames are recorded; give --frames too")
+    if frames:  # no window is opened: pygame need not look for a screen
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
+
+    if policy is not None or ":" in env_id:
+        sys.path.append("")  # last: a file that happens to lie here replaces no installed module
+    function = None if policy is None else load_policy(policy)
+    with (
+        _saying_what_is_safe(output, max_bytes or max_seconds, replaces=mode is _Mode.w),
+        step_progress(steps) as progress,
+    ):
+        summary = record_rollouts(
+            env_id, output, steps=steps, seed=seed, num_envs=num_envs, policy=function, mode=mode.value,
+            compression=compression.value, record_info=record_info, durability=durability.value, live=live,
+            frames=every if frames else False, capture_env=capture_env.argument, max_bytes=max_bytes,
+            max_seconds=max_seconds, progress=progress,
+        )  # fmt: skip
+    _print_rollout(summary, as_json=as_json)
+
+
+def _print_rollout(summary: RolloutSummary, *, as_json: bool) -> None:
+    if as_json:
+        paths = [str(path) for path in summary.paths]
+        print_json({**summary._asdict(), "path": str(summary.path), "paths": paths})
+        return
+    last = "" if len(summary.paths) == 1 else f" to {summary.path.name}"
+    facts = [
+        counted(summary.episodes, "episode"),
+        counted(summary.steps, "step"),
+        *_mean_text(summary),
+        f"{bytes_of(summary.size)} in {summary.seconds:.1f} s",
+    ]
+    say(f"{summary.paths[0]}{last}: {', '.join(facts)}")
+
+
+@contextlib.contextmanager
+def _saying_what_is_safe(output: Path, limit: float | None, *, replaces: bool) -> Iterator[None]:
+    """Adds to Ctrl-C what the recording holds by now; with a limit, the files it went on in count too."""
+    before = output.stat().st_ino if replaces and output.exists() else None
+    try:
+        yield
+    except KeyboardInterrupt as err:
+        held = _held(output, limit)
+        if before is not None and output.exists() and output.stat().st_ino == before:
+            held = f"{held}; this is the file that was there before"
+        raise KeyboardInterrupt(held) from err
+
+
+def _held(output: Path, limit: float | None) -> str:
+    from tupli_mcap.recording import Recording
+    from tupli_mcap.recording.file_series import series
+
+    first, others = (output, {}) if limit is None else series(output)
+    paths = [path for path in (first, *others.values()) if path.exists()]
+    episodes = steps = 0
+    try:
+        for path in paths:
+            with Recording(path) as recording:
+                episodes += len(recording)
+                steps += recording.num_steps
+    except TupliError as err:
+        return str(err)
+    if not paths:
+        return "nothing was recorded"
+    files = f"{paths[0]} holds" if len(paths) == 1 else f"{paths[0]} to {paths[-1].name} hold"
+    return f"{files} {counted(episodes, 'episode')}, {counted(steps, 'step')}"
+
+
+def _mean_text(summary: RolloutSummary) -> list[str]:
+    """The mean return, and what it leaves out; nothing where no episode was recorded."""
+    from tupli_mcap.recording.description import nan_text
+
+    odd = nan_text(summary.return_nan, summary.episodes)
+    if summary.return_nan < summary.episodes:
+        return [f"mean return {number(summary.return_mean)}{f' ({odd})' if odd else ''}"]
+    return [f"return {odd}"] if odd else []
