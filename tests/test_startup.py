@@ -46,7 +46,7 @@ def run(*arguments: str) -> str:
         ("from tupli_mcap import Recording, verify_recording", (*EXTRAS, *DATABASE)),
         (
             "from tupli_mcap import RecordEpisodes; from tupli_mcap.vector import RecordEpisodes",
-            (*EXTRAS, *DATABASE, "tupli_mcap.viewer.live", "tupli_mcap.recording.edit.repair"),
+            (*EXTRAS, *DATABASE, "tupli_mcap.viewer", "tupli_mcap.recording.edit.repair"),
         ),
         ("from tupli_mcap import FileStorage, TupliDataset, TupliEnvWrapper", EXTRAS),
     ],

@@ -1,4 +1,9 @@
-"""Recordings in the Rerun viewer: their data, a blueprint made from their spaces, and where both go."""
+"""Shows recordings in the Rerun viewer: in a window, a browser, a notebook, or as a file.
+
+`plan` makes Rerun recordings of chosen episodes, `scene` chooses their panels (`panels`) by the spaces, `blueprints`
+places them, `blocks` reads the steps, `sending` sends columns, and `targets` is where all goes. `live` shows a rollout
+while it is recorded; `to_mcap` copies a recording for viewers without a blueprint, such as Foxglove.
+"""
 
 from __future__ import annotations
 
