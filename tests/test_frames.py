@@ -603,9 +603,9 @@ class TestDamage:
 
 def rewrite_wrongly(recording: Recording, target: Path, what: str) -> None:
     """A copy in which one message of the frames is another."""
-    from tupli_mcap.recording.edit.assemble import Transfer
+    from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier
 
-    real = Transfer._messages
+    real = EpisodeCopier._messages
 
     def messages(self: Any, channel: int, first: int, count: int) -> Any:
         for row, (time, body) in enumerate(real(self, channel, first, count), first):
@@ -623,7 +623,7 @@ def rewrite_wrongly(recording: Recording, target: Path, what: str) -> None:
             yield time, bytes(changed)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Transfer, "_messages", messages)
+        patch.setattr(EpisodeCopier, "_messages", messages)
         rewrite_recording(recording, target)  # compressed anew, so that no chunk is copied
 
 

@@ -13,8 +13,8 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.recording.contents import Contents
+from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.replacing import replacing
-from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.write.resume import restore_container
 
@@ -74,9 +74,9 @@ def _write(
     now = time.time_ns()
     for name, (media_type, data) in attachments.items():
         container.add_attachment(name, media_type, data, now)
-    index = IndexBuilder()
+    assembler = Assembler(container)
+    index = assembler.index
     index.rows = bytearray(contents.index.episodes.tobytes())
     index.metadata = bytearray(contents.index.metadata)
     index.count = len(contents.index.episodes)
-    container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, index.encode(container.chunk_rows), now)
-    container.finish()
+    assembler.finish(now)

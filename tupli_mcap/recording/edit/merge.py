@@ -20,8 +20,8 @@ from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.contents import RECORDING_METADATA
-from tupli_mcap.recording.edit.assemble import Target, Transfer
+from tupli_mcap.recording.edit.assemble import Assembler
+from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
 from tupli_mcap.recording.file_series import series
@@ -115,14 +115,11 @@ def merge_recordings(
 
 def _merge(
     sources: Sequence[Recording], container: Container, attachments: Mapping[str, tuple[str, bytes]]
-) -> Target:
+) -> Assembler:
     now, first = time.time_ns(), sources[0]
     turns, next_episode = _numbered(sources, _turns(sources))
-    container.start(library())
-    container.add_metadata(RECORDING_METADATA, _metadata(first, next_episode=next_episode))
-    for name, (media_type, data) in attachments.items():
-        container.add_attachment(name, media_type, data, now)
-    target = Target(container)
+    target = Assembler(container)
+    target.begin(_metadata(first, next_episode=next_episode), attachments, now)
     define(first, target)
     for recording in sources[1:]:
         _define_missing(recording, container)
@@ -134,7 +131,7 @@ def _merge(
             name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
             for name, pairs_of in camera_channels(recording, container).items()
         }
-        Transfer(recording, target, cameras, channels=channels, shift=shift).run(rows)
+        EpisodeCopier(recording, target, cameras, channels=channels, shift=shift).run(rows)
     target.finish(now)
     return target
 

@@ -27,7 +27,7 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.add_journal import add_journal
 from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording
 from tupli_mcap.recording.recover.episodes import Plan, make_plan
-from tupli_mcap.recording.recover.evidence import Channels, Evidence
+from tupli_mcap.recording.recover.evidence import Evidence, RecordedChannels
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.losses import losses
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
@@ -224,7 +224,7 @@ def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") 
     return _recover_ours(evidence, _layout(evidence), Container(fd, source.name, compression))
 
 
-def _layout(evidence: Evidence) -> tuple[StepLayout, Channels] | None:
+def _layout(evidence: Evidence) -> tuple[StepLayout, RecordedChannels] | None:
     """The layout and the channels; None if the recording has no step channel and no rows.
 
     Raises:
@@ -236,7 +236,7 @@ def _layout(evidence: Evidence) -> tuple[StepLayout, Channels] | None:
         steps = step_channels(evidence.channels, name)
         if steps:
             layout = StepLayout.from_metadata(steps[0].metadata)
-            return layout, Channels.of(evidence, layout)
+            return layout, RecordedChannels.of(evidence, layout)
     except FormatError as err:
         raise FormatError(f"{name}: the spaces of the recording are damaged ({err}); {advice}") from err
     if evidence.pieces:
@@ -245,7 +245,7 @@ def _layout(evidence: Evidence) -> tuple[StepLayout, Channels] | None:
 
 
 def _recover_ours(
-    evidence: Evidence, known: tuple[StepLayout, Channels] | None, container: Container
+    evidence: Evidence, known: tuple[StepLayout, RecordedChannels] | None, container: Container
 ) -> RecoveryReport:
     report = RecoveryReport(
         evidence.source.name,
@@ -291,7 +291,7 @@ def _report_plan(report: RecoveryReport, plan: Plan) -> None:
     report.final_states_lost = plan.lost_finals
 
 
-def _infos_lost(evidence: Evidence, channels: Channels) -> int:
+def _infos_lost(evidence: Evidence, channels: RecordedChannels) -> int:
     """Rows missing in `/info`, as far as can be told."""
     if channels.info is None:
         return 0

@@ -12,11 +12,10 @@ import numpy as np
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.contents import RECORDING_METADATA
-from tupli_mcap.recording.edit.assemble import Follower, NewFrames, Target, Transfer
+from tupli_mcap.recording.edit.assemble import Assembler, Follower
+from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
@@ -79,18 +78,16 @@ def write(
 ) -> int:
     """Writes a recording of some of a source's episodes, other than the attachments `left_out`; returns how many chunks
     were copied. A signature is kept if the contents are still what was `signed`."""
-    container.start(library())
-    container.add_metadata(RECORDING_METADATA, metadata)
-    now = time.time_ns()
     kept = {name: info for name, info in source.attachments.items() if name not in attachments}
     if not (signed and stays_signed(source.attachments, attachments)):
         kept.pop(SIGNATURE_NAME, None)
-    for name, info in kept.items():
-        if name not in left_out:
-            container.add_attachment(name, info.media_type, source.read_attachment(name), now)
-    for name, (media_type, data) in attachments.items():
-        container.add_attachment(name, media_type, data, now)
-    target = Target(container)
+    own = {
+        name: (info.media_type, source.read_attachment(name))
+        for name, info in kept.items()
+        if name not in left_out
+    }
+    now, target = time.time_ns(), Assembler(container)
+    target.begin(metadata, {**own, **attachments}, now)
     define(source, target, followers)
     rows = source.index
     if numbers is not None:
@@ -98,12 +95,12 @@ def write(
     cameras = camera_channels(source, container, frames) if source.num_envs else {}
     container.define_channels()
     if source.num_envs:
-        Transfer(source, target, cameras, frames=frames).run(rows)
+        EpisodeCopier(source, target, cameras, frames=frames).run(rows)
     target.finish(now)
     return target.copied
 
 
-def define(source: Recording, target: Target, followers: Sequence[Follower] = ()) -> None:
+def define(source: Recording, target: Assembler, followers: Sequence[Follower] = ()) -> None:
     """The source's channels, and those of the followers after them."""
     container, contents = target.container, source._contents
     own = {i: c for i, c in contents.channels.items() if _FOLLOWS not in c.metadata}

@@ -14,22 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.journal.logs import group_records
-from tupli_mcap.journal.rows import even_rows
+from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
-from tupli_mcap.messages.episodes import record
 from tupli_mcap.messages.frames import CameraTopics
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
-from tupli_mcap.recording.channels import Channels as NewChannels
-from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.channels import Channels, register_channels
+from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.repaired_frames import OldCameras, kept_frames
-from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
-from tupli_mcap.recording.recover.evidence import Channels, Evidence, PackedStore
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 
 __all__ = ["RECOVERED", "RepairWriter"]
 
@@ -41,7 +37,6 @@ _METADATA = {
     "created_ns": re.compile("[0-9]{1,20}", re.ASCII),
     "benchmark_id": re.compile(".*", re.DOTALL),
 }
-_CHUNK = 256 * 1024
 _COPY = 1 << 20
 
 
@@ -50,19 +45,18 @@ class RepairWriter:
 
     def __init__(self, container: Container, evidence: Evidence) -> None:
         self._container = container
+        self._target = Assembler(container)
         self._evidence = evidence
         self._now = time.time_ns()
-        self._index = IndexBuilder()
         self.metadata_lost: list[str] = []
 
     def begin(self, next_episode: int | None) -> None:
         """Magic, header, metadata and the attachments that are good. No later episode gets a number that was lost."""
         container, found = self._container, self._evidence
-        container.start(library())
         metadata = self._metadata_of_recording()
         if next_episode is not None:
             metadata["next_episode"] = str(next_episode)
-        container.add_metadata(RECORDING_METADATA, metadata)
+        self._target.begin(metadata, {}, self._now)
         for attachment in found.attachments.values():
             offset = container.position
             for at in range(attachment.offset, attachment.offset + attachment.length, _COPY):
@@ -87,7 +81,7 @@ class RepairWriter:
         # Rows have other numbers now: a journal of the damaged file must not merge into this one.
         return {**others, **made, **kept, "rewritten": uuid.uuid4().hex}
 
-    def steps(self, layout: StepLayout, old: Channels, plan: Plan, store: PackedStore) -> None:
+    def steps(self, layout: StepLayout, old: RecordedChannels, plan: Plan, store: PackedStore) -> None:
         """Every message of the episodes that are kept."""
         channels = self._evidence.channels
         vector = Topics.of_step(channels[old.steps[0]].topic).is_vector
@@ -127,7 +121,7 @@ class RepairWriter:
                     self._copy(store, image, ids[env], mine, image_type, patch=False)
         self._events(store, layout, old, new, plan, rows)
         if old.info is not None and new.info is not None:
-            self._put(new.info, self._infos(store, old.info, plan))
+            self._target.add_messages(new.info, self._infos(store, old.info, plan))
         topics = {channel.topic: channel.id for channel in self._container.channels.values()}
         for name, pairs in zip(cameras.names, cameras.ids, strict=True):
             for env, pair in enumerate(pairs):
@@ -139,14 +133,12 @@ class RepairWriter:
     ) -> None:
         """The frames of one camera, which keep their times."""
         found = partial(kept_frames, self._evidence, store, old, episodes)
-        self._put(new[0], ((frame.time_ns, frame.picture) for frame in found()))
-        self._put(new[1], ((frame.time_ns, frame.pair) for frame in found()))
+        self._target.add_messages(new[0], ((frame.time_ns, frame.picture) for frame in found()))
+        self._target.add_messages(new[1], ((frame.time_ns, frame.pair) for frame in found()))
 
     def finish(self) -> None:
         """The index, the summary and the footer."""
-        data = self._index.encode(self._container.chunk_rows)
-        self._container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, self._now)
-        self._container.finish()
+        self._target.finish(self._now)
 
     # ---- rows
 
@@ -162,35 +154,28 @@ class RepairWriter:
     ) -> None:
         """The rows of `episodes`; with `patch` they get the episodes' numbers, and steps from 0."""
         if dtype is None:
-            self._put(new, self._variable(store, old, episodes))
-            return
-        batch: list[bytes] = []
-        size = written = 0
+            self._target.add_messages(new, self._variable(store, old, episodes))
+        else:
+            self._target.add_rows(new, self._constant(store, old, episodes, dtype, patch=patch))
+
+    def _constant(
+        self,
+        store: PackedStore,
+        channel: int,
+        episodes: Iterable[PlannedEpisode],
+        dtype: np.dtype[Any],
+        *,
+        patch: bool,
+    ) -> Iterator[Array]:
         for episode in episodes:
             run = episode.run
-            for span in store.spans(old, store.packed(old, run.row), run.steps):
-                part = store.rows(span.chunk, dtype, keep=True)[span.begin : span.end]
-                data = bytearray(part.tobytes())
-                rows = np.frombuffer(data, dtype)
+            for span in store.spans(channel, store.packed(channel, run.row), run.steps):
+                rows: Array = store.rows(span.chunk, dtype, keep=True)[span.begin : span.end]
                 if patch and not (episode.head and episode.number == run.episode):
+                    rows = np.frombuffer(bytearray(rows.tobytes()), dtype)
                     rows["episode"] = episode.number
                     rows["step"] -= run.step
-                batch.append(bytes(data))
-                size += len(data)
-                if size >= _CHUNK:
-                    written += self._put_rows(new, b"".join(batch), dtype, written)
-                    batch, size = [], 0
-        self._put_rows(new, b"".join(batch), dtype, written)
-
-    def _put_rows(self, channel: int, data: bytes, dtype: np.dtype[Any], first: int) -> int:
-        if not data:
-            return 0
-        raw = bytearray(data)
-        rows = np.frombuffer(raw, dtype)
-        rows["#sequence"] = first + np.arange(len(rows))
-        rows["#channel"] = channel
-        self._container.add_chunk(even_rows(channel, first, raw, rows))
-        return len(rows)
+                yield rows
 
     def _variable(
         self, store: PackedStore, channel: int, episodes: Iterable[PlannedEpisode]
@@ -204,30 +189,14 @@ class RepairWriter:
                     yield log_time, numbers + bytes(body[8:])
                     step += 1
 
-    def _put(self, channel: int, messages: Iterable[tuple[int, bytes]]) -> None:
-        """Messages (log_time, body) of a channel, in chunks of the usual size; times never decrease."""
-        batch = bytearray()
-        latest = 0
-        for sequence, (log_time, body) in enumerate(messages):
-            latest = max(latest, log_time)
-            batch += record(channel, sequence, latest, body)
-            if len(batch) >= _CHUNK:
-                self._emit(batch)
-        self._emit(batch)
-
-    def _emit(self, batch: bytearray) -> None:
-        for rows in group_records(memoryview(bytes(batch))):
-            self._container.add_chunk(rows)
-        batch.clear()
-
     # ---- episodes
 
     def _events(
         self,
         store: PackedStore,
         layout: StepLayout,
-        old: Channels,
-        new: NewChannels,
+        old: RecordedChannels,
+        new: Channels,
         plan: Plan,
         rows: dict[int, int],
     ) -> None:
@@ -245,7 +214,7 @@ class RepairWriter:
             text = self._metadata(episode, last[episode.run.episode] == episode.number)
             end = episode.end.end._replace(first_row=first, metadata=text)
             moved[episode.number] = end
-            self._index.add(
+            self._target.index.add(
                 first, end.length, end.episode_return, episode.start.time, episode.end.time,
                 episode.start.start.seed_number,
                 start_rows[end.episode], end_rows[end.episode], final_rows.get(end.episode, -1),
@@ -256,9 +225,11 @@ class RepairWriter:
             for e in starts
             for time, start, _ in (*e.resets, e.start)
         )
-        self._put(new.start, told)
-        self._put(new.end, ((e.end.time, moved[e.number].encode()) for e in ends))
-        self._put(new.final_state, ((e.end.time, self._final(e, store, old)) for e in with_final))
+        self._target.add_messages(new.start, told)
+        self._target.add_messages(new.end, ((e.end.time, moved[e.number].encode()) for e in ends))
+        self._target.add_messages(
+            new.final_state, ((e.end.time, self._final(e, store, old)) for e in with_final)
+        )
 
     def _metadata(self, episode: PlannedEpisode, last: bool) -> str:
         """The metadata of the old episode where its end is here, and where the steps of a piece were."""
@@ -282,7 +253,7 @@ class RepairWriter:
                 origin["metadata"] = json.loads(episode.orphan)
         return json.dumps({**values, RECOVERED: origin})
 
-    def _final(self, episode: PlannedEpisode, store: PackedStore, old: Channels) -> bytes:
+    def _final(self, episode: PlannedEpisode, store: PackedStore, old: RecordedChannels) -> bytes:
         if old.final is None or episode.final is None or episode.final < 0:
             return final_state(self._evidence, episode)
         numbers = (episode.number, episode.run.env)

@@ -28,7 +28,7 @@ from tupli_mcap.mcap.records import parse_record, records
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.recover.evidence import Channels, Evidence, PackedStore
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.find_journal import STEPS_IN_JOURNAL, belongs, misplaced_journal
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -98,10 +98,12 @@ def take_journal(evidence: Evidence, journal: JournalContents) -> None:
     steps = step_channels(evidence.channels, evidence.source.name)
     if steps:
         layout = StepLayout.from_metadata(steps[0].metadata)
-        take_rows(evidence, journal, layout, Channels.of(evidence, layout))
+        take_rows(evidence, journal, layout, RecordedChannels.of(evidence, layout))
 
 
-def take_rows(evidence: Evidence, journal: JournalContents, layout: StepLayout, channels: Channels) -> None:
+def take_rows(
+    evidence: Evidence, journal: JournalContents, layout: StepLayout, channels: RecordedChannels
+) -> None:
     """The same of a journal whose channels are known; takes the steps of `channels`, which may be those of the first
     sub-environments."""
     known = {channel: evidence.stop(channel) for channel in evidence.pieces} if evidence.strict else {}
@@ -171,7 +173,7 @@ class _Steps:
     """Takes the steps of a journal with their images, and the states of the running ones."""
 
     def __init__(
-        self, evidence: Evidence, journal: JournalContents, layout: StepLayout, channels: Channels
+        self, evidence: Evidence, journal: JournalContents, layout: StepLayout, channels: RecordedChannels
     ) -> None:
         self._evidence, self._journal = evidence, journal
         self._layout, self._channels = layout, channels
@@ -257,7 +259,7 @@ class _Steps:
         return data
 
 
-def _starts(store: PackedStore, channels: Channels) -> dict[tuple[int, int], int]:
+def _starts(store: PackedStore, channels: RecordedChannels) -> dict[tuple[int, int], int]:
     """First rows of episodes, by sub-environment and number."""
     found = {}
     for _, _, body in store.all_messages(channels.start):

@@ -15,7 +15,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import EpisodeIndex
-from tupli_mcap.recording.recover.evidence import Channels, Evidence, PackedStore
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.step_runs import Ranges, StepRun, step_runs
 
 __all__ = [
@@ -130,7 +130,7 @@ def final_state(evidence: Evidence, episode: PlannedEpisode) -> bytes:
     return episode.number.to_bytes(4, "little") + run.env.to_bytes(4, "little") + state
 
 
-def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channels: Channels) -> Plan:
+def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channels: RecordedChannels) -> Plan:
     """Decides what becomes of every row that is here.
 
     Raises:
@@ -151,7 +151,7 @@ def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channe
 # ---- what is told
 
 
-def _read_told(evidence: Evidence, store: PackedStore, channels: Channels) -> Told:
+def _read_told(evidence: Evidence, store: PackedStore, channels: RecordedChannels) -> Told:
     """Starts, ends and final states that are here; in repair, messages that cannot be decoded are passed over."""
     told = Told()
     for row, time, body in store.all_messages(channels.start):
@@ -207,7 +207,7 @@ def _add_index(told: Told, index: EpisodeIndex | None) -> None:
         told.ends[end.episode] = End(int(row["end_time"]), end)
 
 
-def _totals(evidence: Evidence, channels: Channels, told: Told) -> list[int]:
+def _totals(evidence: Evidence, channels: RecordedChannels, told: Told) -> list[int]:
     """Rows that each sub-environment had, as far as anything tells."""
     totals = [evidence.stop(channel) for channel in channels.steps]
     statistics = evidence.tail.statistics
@@ -227,7 +227,7 @@ def _totals(evidence: Evidence, channels: Channels, told: Told) -> list[int]:
 
 class _Planner:
     def __init__(
-        self, evidence: Evidence, plan: Plan, runs: list[StepRun], channels: Channels, *, images: bool
+        self, evidence: Evidence, plan: Plan, runs: list[StepRun], channels: RecordedChannels, *, images: bool
     ) -> None:
         self._evidence, self._plan, self._told = evidence, plan, plan.told
         self._runs, self._images = runs, images

@@ -24,7 +24,7 @@ from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore, Span
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.recover.file_end import Tail
 
-__all__ = ["Channels", "Evidence", "PackedStore", "Piece", "RepairedChunk", "memory_entry"]
+__all__ = ["Evidence", "PackedStore", "Piece", "RecordedChannels", "RepairedChunk", "memory_entry"]
 
 _CACHE = 64 << 20
 _HEADERS = 16  # chunks whose headers are kept: a message at a time is taken from them
@@ -178,7 +178,7 @@ class Evidence:
         return found
 
 
-class Channels(NamedTuple):
+class RecordedChannels(NamedTuple):
     """Ids of channels: by sub-environment, and by image leaf then sub-environment; None: not known."""
 
     steps: list[int]
@@ -189,7 +189,7 @@ class Channels(NamedTuple):
     info: int | None
 
     @classmethod
-    def of(cls, evidence: Evidence, layout: StepLayout) -> Channels:
+    def of(cls, evidence: Evidence, layout: StepLayout) -> RecordedChannels:
         """The channels of a recording, by their topics."""
         found = step_channels(evidence.channels, evidence.source.name)
         topics = {channel.topic: channel.id for channel in evidence.channels.values()}

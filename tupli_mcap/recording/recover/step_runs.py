@@ -15,7 +15,7 @@ from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.recover.evidence import Channels, Evidence, PackedStore
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 
 __all__ = ["Ranges", "StepFacts", "StepRun", "intersection", "runs_in", "step_facts", "step_runs"]
 
@@ -103,7 +103,7 @@ def intersection(a: Ranges, b: Ranges) -> Ranges:
 
 
 def step_runs(
-    evidence: Evidence, store: PackedStore, layout: StepLayout, channels: Channels
+    evidence: Evidence, store: PackedStore, layout: StepLayout, channels: RecordedChannels
 ) -> Iterator[StepRun]:
     """The runs of all sub-environments, in the order of their rows; of steps whose images are all here.
 

@@ -28,7 +28,7 @@ from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.recover.add_journal import take_journal
 from tupli_mcap.recording.recover.episodes import IN_A_HOLE, RUNNING, PlannedEpisode, final_state, make_plan
-from tupli_mcap.recording.recover.evidence import Channels, Evidence, PackedStore, memory_entry
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels, memory_entry
 from tupli_mcap.recording.recover.find_journal import belongs, find_journal, misplaced_journal
 from tupli_mcap.recording.recover.prefix import head, prefix
 
@@ -72,7 +72,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
     steps = step_channels(evidence.channels, source.name)
     if steps:
         layout = StepLayout.from_metadata(steps[0].metadata)
-        channels = Channels.of(evidence, layout)
+        channels = RecordedChannels.of(evidence, layout)
         _complete(evidence, layout, channels, contents)
         if journal is not None:
             for text in _left_out(evidence, journal, channels):
@@ -80,7 +80,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
     return contents
 
 
-def _complete(evidence: Evidence, layout: StepLayout, channels: Channels, contents: Contents) -> None:
+def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels, contents: Contents) -> None:
     """Makes the missing starts and ends of episodes, and the index."""
     if channels.start is None or channels.end is None or channels.final is None:
         return
@@ -173,7 +173,7 @@ def _index(
     return EpisodeIndex.decode(builder.encode(table.tobytes()), "recovered index")
 
 
-def _left_out(evidence: Evidence, journal: JournalContents, channels: Channels) -> Iterator[str]:
+def _left_out(evidence: Evidence, journal: JournalContents, channels: RecordedChannels) -> Iterator[str]:
     """What a reader has to be told."""
     source = evidence.source
     for channel, steps in evidence.beyond.items():

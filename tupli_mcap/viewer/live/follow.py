@@ -40,7 +40,7 @@ from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, 
 from tupli_mcap.recording.contents import check_metadata, step_channels
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recover.add_journal import define, take_rows
-from tupli_mcap.recording.recover.evidence import Channels, Evidence, Piece
+from tupli_mcap.recording.recover.evidence import Evidence, Piece, RecordedChannels
 from tupli_mcap.recording.recover.file_end import Tail
 from tupli_mcap.recording.recover.find_journal import belongs
 from tupli_mcap.recording.recover.prefix import prefix
@@ -152,7 +152,7 @@ class Follower:
         self._of_env = [Topics.of_step(channel.topic) for channel in channels]
         self._codecs = image_codecs(layout, found.channels)
         self._source, self._metadata = source, metadata
-        self._known = Channels.of(found, layout)._replace(steps=self.steps)
+        self._known = RecordedChannels.of(found, layout)._replace(steps=self.steps)
         self._file = _GrowingFile(source, found.good_end, begin)
         self._seen = dict(self._file.earlier)  # how many rows of each channel were looked at
         envs = range(len(self.steps))

@@ -1,0 +1,257 @@
+"""Copies episodes of recordings into another one: renumbers rows, and copies chunks in which nothing changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.mcap.records import BODY
+from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart
+from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
+from tupli_mcap.recording.edit.assemble import Assembler
+from tupli_mcap.recording.recording import Recording
+
+__all__ = ["EpisodeCopier", "NewFrames"]
+
+
+class NewFrames(Protocol):
+    """Frames of some episodes, which take the place of those that a camera has of them."""
+
+    camera: str
+
+    def of(self, episode: int) -> Iterable[tuple[int, EncodedFrame]] | None:
+        """(step, frame) of an episode, in order; None: what the recording has of it stays."""
+        ...
+
+
+class EpisodeCopier:
+    """Copies episodes of `source` to `target`, behind those that are there.
+
+    Args:
+        channels: the target's ids of the source's channels, where they differ.
+        shift: added to the numbers of the episodes.
+        cameras: by camera, then by sub-environment, the ids of its channels.
+        frames: of a camera, in place of the source's.
+    """
+
+    def __init__(
+        self,
+        source: Recording,
+        target: Assembler,
+        cameras: Mapping[str, Sequence[tuple[int, int]]],
+        *,
+        channels: Mapping[int, int] | None = None,
+        shift: int = 0,
+        frames: NewFrames | None = None,
+    ) -> None:
+        self._source, self._target, self._shift = source, target, shift
+        self._channels = channels or {}
+        self._cameras, self._new_frames = cameras, frames
+        self._store, self._topics = source._store, source._topics
+        self._held: dict[
+            int, int
+        ] = {}  # times must not decrease, whatever the clock did between two episodes
+
+    def run(self, rows: Array) -> None:
+        """Copies the episodes that `rows` of the source's index name."""
+        layout = self._source.layout
+        firsts = np.zeros(len(rows), dtype=np.int64)
+        for env, channel in enumerate(self._source._step_channels):
+            mine = np.flatnonzero(rows["env"] == env)
+            mine = mine[np.argsort(rows["first_row"][mine], kind="stable")]
+            lengths = rows["length"][mine].astype(np.int64)
+            firsts[mine] = self._target.next_row(self._to(channel)) + np.cumsum(lengths) - lengths
+            spans = _merged([(int(rows["first_row"][i]), int(rows["length"][i])) for i in mine])
+            self._copy(channel, spans, layout.step_message.dtype if layout.constant else None)
+            topics = Topics.of_step(self._source._contents.channels[channel].topic)
+            for leaf in layout.images:
+                images = self._topics[topics.image(leaf.name)]
+                self._copy(images, spans, layout.image_messages[leaf.name].dtype)
+        self._events(rows, firsts)
+        self._frames(rows)
+        if INFO in self._topics:
+            self._infos(rows["episode"])
+
+    def _to(self, channel: int) -> int:
+        """The target's id of a channel."""
+        return self._channels.get(channel, channel)
+
+    def _copy_first(self, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
+        if self._shift or self._to(channel) != channel:
+            return 0
+        return self._target.copy_first(self._source, channel, count, dtype)
+
+    def _copy(self, channel: int, spans: list[tuple[int, int]], dtype: np.dtype[Any] | None) -> None:
+        """Rows `spans` of a channel of steps or images, renumbered, in chunks of the usual size."""
+        done = self._copy_first(channel, spans[0][1], dtype) if spans and spans[0][0] == 0 else 0
+        if done:
+            spans = [(done, spans[0][1] - done), *spans[1:]]
+        if dtype is None:
+            found = (m for first, count in spans for m in self._messages(channel, first, count))
+            self._write(channel, found, numbered=True)
+            return
+        self._target.add_rows(self._to(channel), self._rows(channel, spans, dtype))
+
+    def _rows(self, channel: int, spans: Iterable[tuple[int, int]], dtype: np.dtype[Any]) -> Iterator[Array]:
+        """Rows of constant size, with the new numbers of their episodes."""
+        for first, count in spans:
+            for span in self._store.spans(channel, first, count):
+                part: Array = self._store.rows(span.chunk, dtype, keep=False)[span.begin : span.end]
+                if self._shift and "episode" in (dtype.names or ()):
+                    part = np.frombuffer(bytearray(part.tobytes()), dtype)
+                    part["episode"] += np.uint32(self._shift)
+                yield part
+
+    def _messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
+        """(log_time, body) of messages of a channel."""
+        for span in self._store.spans(channel, first, count):
+            loaded, records = self._store.records(span.chunk)
+            data = memoryview(loaded)
+            for start, end in records[span.begin : span.end].tolist():
+                yield int.from_bytes(data[start + 15 : start + 23], "little"), bytes(data[start + BODY : end])
+
+    def _copy_places(self, channel: int, places: Array, *, numbered: bool) -> None:
+        """The rows `places` (ascending) of a channel of single messages."""
+        moved = np.flatnonzero(places != np.arange(len(places)))
+        done = self._copy_first(channel, int(moved[0]) if len(moved) else len(places), None)
+        spans = _merged([(place, 1) for place in places[done:].tolist()])
+        found = (m for first, count in spans for m in self._messages(channel, first, count))
+        self._write(channel, found, numbered=numbered)
+
+    def _write(self, channel: int, messages: Iterable[tuple[int, bytes]], *, numbered: bool = False) -> None:
+        """Adds messages of a channel (log_time, body); `numbered` ones begin with the number of an episode."""
+        if numbered and self._shift:
+            messages = ((time_ns, self._renumbered(body)) for time_ns, body in messages)
+        self._target.add_messages(self._to(channel), messages)
+
+    def _renumbered(self, body: bytes) -> bytes:
+        number = int.from_bytes(body[:4], "little") + self._shift
+        return number.to_bytes(4, "little") + body[4:]
+
+    def _events(self, rows: Array, firsts: Array) -> None:
+        """Starts, ends and final states, and the rows of the index."""
+        target, topics = self._target, self._topics
+        begins = {
+            topic: target.next_row(self._to(topics[topic]))
+            for topic in (EPISODE_START, EPISODE_END, FINAL_STATE)
+        }
+        latest = {topic: target.latest(self._to(topics[topic])) for topic in (EPISODE_START, EPISODE_END)}
+        starts: list[tuple[int, bytes]] = []
+        ends: list[tuple[int, bytes]] = []
+        finals: list[tuple[int, bytes]] = []
+        # ends keep their order, which is not that of the episodes in a vector environment
+        end_places = _places(rows["end_row"])
+        final_places = _places(rows["final_row"][rows["final_row"] >= 0])
+        positions = {int(number): i for i, number in enumerate(self._source.index["episode"])}
+        for row, first in zip(rows, firsts, strict=True):
+            last = int(row["start_row"])
+            resets = len(self._source.resets_before(positions[int(row["episode"])]))
+            for start_time, body in self._messages(topics[EPISODE_START], last - resets, resets + 1):
+                start = EpisodeStart.decode(memoryview(body))
+                number = start.episode + self._shift
+                starts.append((start_time, start._replace(episode=number, first_row=int(first)).encode()))
+            ((end_time, body),) = self._messages(topics[EPISODE_END], int(row["end_row"]), 1)
+            end = EpisodeEnd.decode(memoryview(body))
+            end = end._replace(episode=end.episode + self._shift, first_row=int(first))
+            final = -1
+            if row["final_row"] >= 0:
+                final = begins[FINAL_STATE] + final_places[len(finals)]
+                finals += self._messages(topics[FINAL_STATE], int(row["final_row"]), 1)
+            target.index.add(
+                int(first),
+                end.length,
+                end.episode_return,
+                max(int(row["start_time"]), latest[EPISODE_START]),
+                max(int(row["end_time"]), latest[EPISODE_END]),
+                int(row["seed"]) if row["has_seed"] else None,
+                begins[EPISODE_START] + len(starts) - 1,
+                begins[EPISODE_END] + end_places[len(ends)],
+                final,
+                end.episode,
+                end.env,
+                end.end,
+                end.metadata,
+            )
+            ends.append((end_time, end.encode()))
+        self._write(topics[EPISODE_START], _in_time(starts))
+        self._write(topics[EPISODE_END], _in_time(_in_order(ends, end_places)))
+        self._write(topics[FINAL_STATE], _in_time(_in_order(finals, final_places)), numbered=True)
+
+    def _frames(self, rows: Array) -> None:
+        """The frames of episodes: pictures, and what they show row by row."""
+        source, new = self._source, self._new_frames
+        for camera, channels in self._cameras.items():
+            for env, (pictures, pairs) in enumerate(channels):
+                mine = rows[rows["env"] == env]
+                mine = mine[np.argsort(mine["first_row"], kind="stable")]
+                if new is not None and new.camera == camera:
+                    for channel in (pictures, pairs):
+                        found = (self._frames_of(new, row, channel, channel == pictures) for row in mine)
+                        self._write(channel, (message for messages in found for message in messages))
+                elif camera in source.cameras:
+                    places = [self._frame_rows(camera, row) for row in mine]
+                    joined = np.concatenate(places) if places else np.zeros(0, np.int64)
+                    theirs = source._cameras.channels(camera, env)
+                    self._copy_places(theirs[0], joined, numbered=False)
+                    self._copy_places(theirs[1], joined, numbered=True)
+
+    def _frame_rows(self, camera: str, row: Any) -> Array:
+        """Which rows of its channels show an episode."""
+        number, length = int(row["episode"]), int(row["length"])
+        return self._source._cameras.rows(camera, int(row["env"]), number, length)[0]
+
+    def _frames_of(
+        self, new: NewFrames, row: Any, channel: int, pictures: bool
+    ) -> Iterator[tuple[int, bytes]]:
+        """(log_time, body) of the messages of an episode's frames: new ones, or those that stay."""
+        number = int(row["episode"])
+        drawn = new.of(number)
+        if drawn is not None:
+            for step, frame in drawn:
+                time_ns = self._held[channel] = max(frame.time_ns, self._held.get(channel, 0))
+                held = frame._replace(time_ns=time_ns)
+                yield time_ns, encode_frame(new.camera, held) if pictures else encode_pair(number, step)
+        elif new.camera in self._source.cameras:
+            for place in self._frame_rows(new.camera, row).tolist():
+                yield from self._messages(channel, place, 1)
+
+    def _infos(self, numbers: Array) -> None:
+        channel = self._topics[INFO]
+        everything = self._messages(channel, 0, self._store.count(channel))
+        found = np.array([int.from_bytes(body[:4], "little") for _, body in everything], np.int64)
+        self._copy_places(channel, np.flatnonzero(np.isin(found, numbers)), numbered=True)
+
+
+def _places(rows: Any) -> list[int]:
+    """Where each of some rows comes once the others are gone."""
+    places = np.empty(len(rows), np.int64)
+    places[np.argsort(rows, kind="stable")] = np.arange(len(rows))
+    found: list[int] = places.tolist()
+    return found
+
+
+def _in_order(messages: list[tuple[int, bytes]], places: Sequence[int]) -> list[tuple[int, bytes]]:
+    return [messages[i] for i in np.argsort(places, kind="stable").tolist()]
+
+
+def _in_time(messages: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    """Times that never decrease (episodes of several sub-environments end out of order)."""
+    latest, kept = 0, []
+    for log_time, body in messages:
+        latest = max(latest, log_time)
+        kept.append((latest, body))
+    return kept
+
+
+def _merged(spans: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    merged: list[tuple[int, int]] = []
+    for first, count in spans:
+        if merged and merged[-1][0] + merged[-1][1] == first:
+            merged[-1] = (merged[-1][0], merged[-1][1] + count)
+        else:
+            merged.append((first, count))
+    return merged
