@@ -171,7 +171,8 @@ class OfRows(Subject):
         return CommittedRows(contents, "steps", self.channels.index(channel), self.message.dtype, channel)
 
     def taken(self, contents: JournalContents, channel: int, first: int) -> list[int]:
-        return [self.number(row) for row in rows_of(self.committed(contents, channel), first)]
+        rows = rows_of(self.committed(contents, channel), first)
+        return [] if rows is None else [self.number(row) for row in rows]
 
     def number(self, record: Any) -> int:
         row = record if isinstance(record, np.void) else np.frombuffer(record, self.message.dtype)[0]
@@ -218,7 +219,8 @@ class OfRecords(Subject):
 
     def taken(self, contents: JournalContents, channel: int, first: int) -> list[int]:
         committed = committed_records(contents, self.area().name).get(channel)
-        return [] if committed is None else self.numbers(rows_of(committed, first))
+        rows = None if committed is None else rows_of(committed, first)
+        return [] if rows is None else self.numbers(rows)
 
 
 class Variable(OfRecords):
@@ -274,8 +276,8 @@ class Images(Subject):
         return CommittedRows(contents, "state/0", 0, self.message.dtype, 1)
 
     def taken(self, contents: JournalContents, channel: int, first: int) -> list[int]:
-        rows = rows_of(self.committed(contents), first)[: max(0, self.done - first)]
-        return [self.number(row) for row in rows]
+        rows = rows_of(self.committed(contents), first, self.done)
+        return [] if rows is None else [self.number(row) for row in rows]
 
     def number(self, record: Any) -> int:
         row = record if isinstance(record, np.void) else np.frombuffer(record, self.message.dtype)[0]
