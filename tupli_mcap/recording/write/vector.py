@@ -159,7 +159,7 @@ class VectorRecorder:
             final_states = {i: self._encode_final(state) for i, state in finals.items()} if finals else None
             batch = store.check(actions, states, rewards, terminals, timeouts, active)
             if self._fresh:
-                self._start(store.row_counts(), active)
+                self._start(store, active)
             if final_states:
                 self._put_finals(final_states)
             store.put(batch, self._numbers, ends=any_done)
@@ -338,12 +338,12 @@ class VectorRecorder:
             raise
         self._end(late)
 
-    def _start(self, counts: Sequence[int], active: Array | None) -> None:
-        """Starts the episodes of the sub-environments that wait for one and take a step; `counts` are their rows."""
+    def _start(self, store: BatchStore, active: Array | None) -> None:
+        """Starts the episodes of the sub-environments that wait for one and take a step."""
         waiting = sorted(i for i in self._waiting if active is None or active[i])
         if not waiting:
             return
-        writer, facts_of = self._writer, self._facts
+        writer, counts, facts_of = self._writer, store.row_counts(), self._facts
         for i in waiting:
             facts, facts_of[i] = facts_of[i], None
             if facts is None:  # stepped on after an end, without a reset

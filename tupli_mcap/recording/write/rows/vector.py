@@ -32,6 +32,12 @@ __all__ = ["VectorRows"]
 
 _ACTION, _REWARD, _STATE = range(3)
 _BOOL = np.dtype(np.bool_)  # those may hold other bytes than 0 and 1
+_Values = list[
+    tuple[Array, Any, int]
+]  # of leaves: their place in the rows, values, 1 if it is in the next rows
+_Images = Sequence[tuple[Sequence[ImageRows], list[Array]]]  # of leaves: the stores, and what each is given
+# values, images, terminals, timeouts, and who took a step; not a class: one is made in every step
+Batch = tuple[_Values, _Images, Array, Array, Array | None]
 
 
 class _Field(NamedTuple):
@@ -42,20 +48,6 @@ class _Field(NamedTuple):
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     ahead: int
-
-
-class CheckedBatch(NamedTuple):
-    """What `VectorRows.put` writes.
-
-    `values` are those of leaves, each with its place in the rows and 1 if that is in the next ones; `images` are by
-    leaf, each with the stores of the sub-environments.
-    """
-
-    values: list[tuple[Array, Any, int]]
-    images: Sequence[tuple[Sequence[ImageRows], list[Array]]]
-    terminals: Array
-    timeouts: Array
-    active: Array | None
 
 
 class VectorRows:
@@ -144,7 +136,7 @@ class VectorRows:
 
     def check(
         self, actions: Any, states: Any, rewards: Any, terminals: Array, timeouts: Array, active: Array | None
-    ) -> CheckedBatch:
+    ) -> Batch:
         """As `BatchStore.check`."""
         images = self._check_images(states) if self._images else ()
         if self._nested:
@@ -160,9 +152,9 @@ class VectorRows:
                 value = exact_array(value, dtype, shape, leaf.path)
             if view is not None:
                 values.append((view, value, ahead))
-        return CheckedBatch(values, images, terminals, timeouts, active)
+        return values, images, terminals, timeouts, active
 
-    def _check_images(self, states: Any) -> list[tuple[Sequence[ImageRows], list[Array]]]:
+    def _check_images(self, states: Any) -> _Images:
         found, n = [], len(self._channels)
         for stores, leaf in self._images:
             batch = leaf_value(states, leaf)
@@ -186,7 +178,7 @@ class VectorRows:
             for i in range(len(stores)) if mask is None else np.flatnonzero(mask).tolist():
                 stores[i].put_first(stores[i].check(images[i]))
 
-    def put(self, batch: CheckedBatch, numbers: Array, *, ends: bool) -> None:
+    def put(self, batch: Batch, numbers: Array, *, ends: bool) -> None:
         """As `BatchStore.put`."""
         values, images, terminals, timeouts, active = batch
         for stores, pictures in images:  # a committed step has the image of the state after it
