@@ -15,7 +15,7 @@ import pytest
 
 from tupli_mcap import FileStorage, RecordEpisodes, Recording, rewrite_recording
 from tupli_mcap.environment import EnvironmentRecord, capture
-from tupli_mcap.recording.edit import assemble as transfer
+from tupli_mcap.recording.edit import copy_episodes
 from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery
 from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
 
@@ -166,12 +166,12 @@ def _write_texts(directory: Path) -> None:
                 return _START.decode(body)._replace(options=text, reset_info=text)
 
         with pytest.MonkeyPatch.context() as patch, Recording(directory / "spec_wrapper.mcap") as recording:
-            patch.setattr(transfer, "EpisodeEnd", Ends)
-            patch.setattr(transfer, "EpisodeStart", Starts)
+            patch.setattr(copy_episodes, "EpisodeEnd", Ends)
+            patch.setattr(copy_episodes, "EpisodeStart", Starts)
             rewrite_recording(recording, directory / f"text_{i}.mcap")
 
 
-_END, _START = transfer.EpisodeEnd, transfer.EpisodeStart
+_END, _START = copy_episodes.EpisodeEnd, copy_episodes.EpisodeStart
 
 
 def _write_spaces(directory: Path) -> None:

@@ -44,7 +44,7 @@ from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
 from tupli_mcap.recording.recover.damaged import gather
 from tupli_mcap.recording.recover.episodes import NewPlaces, make_plan
-from tupli_mcap.recording.recover.evidence import Channels
+from tupli_mcap.recording.recover.evidence import RecordedChannels
 from tupli_mcap.recording.recover.file_end import Tail, read_tail
 from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, sign_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -532,7 +532,7 @@ def test_a_step_is_not_held_against_each_piece_of_its_episode(tmp_path: Path) ->
     source = PathSource(path)
     gathered = gather(source, read_tail(source))
     layout = Recording(path).layout
-    (whole,) = make_plan(gathered, gathered.store(), layout, Channels.of(gathered, layout)).episodes
+    (whole,) = make_plan(gathered, gathered.store(), layout, RecordedChannels.of(gathered, layout)).episodes
     source.close()
 
     def looked(count: int) -> int:

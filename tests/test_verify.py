@@ -43,8 +43,7 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart
 from tupli_mcap.recording import VerifyReport
-from tupli_mcap.recording.edit import assemble as transfer
-from tupli_mcap.recording.edit import rewrite
+from tupli_mcap.recording.edit import assemble, rewrite
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage.verify import verify_paths, verify_storage
@@ -240,7 +239,7 @@ def test_other_files_are_not_verified(tmp_path: Path) -> None:
 # ---- contents that are consistent, but wrong
 
 
-class Forger(transfer.Target):
+class Forger(assemble.Assembler):
     """What a recording is rewritten to with a mistake, as a faulty writer would: CRCs and summary are right."""
 
     mistake = ""
@@ -308,7 +307,7 @@ class Forger(transfer.Target):
 def forge(recording: Recording, container: Container, mistake: str) -> None:
     """Rewrites a recording with a mistake."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rewrite, "Target", Forger)
+        patch.setattr(rewrite, "Assembler", Forger)
         patch.setattr(Forger, "mistake", mistake)
         rewrite.write(recording, container, dict(recording.metadata), None, {}, signed=False)
 

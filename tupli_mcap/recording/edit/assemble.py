@@ -112,7 +112,7 @@ class Assembler:
             self.held += int(early.sum())
             for name in ("#log_time", "#publish_time"):
                 rows[name] = np.maximum(rows[name], latest)
-        self._add_chunk(even_rows(channel, first, data, rows))
+        self.add_chunk(even_rows(channel, first, data, rows))
 
     def add_messages(self, channel: int, messages: Iterable[tuple[int, bytes]]) -> None:
         """Adds messages (log_time, body) of any size, in chunks of the usual size."""
@@ -129,10 +129,10 @@ class Assembler:
 
     def _emit(self, batch: bytearray) -> None:
         for rows in group_records(memoryview(bytes(batch))):
-            self._add_chunk(rows)
+            self.add_chunk(rows)
         batch.clear()
 
-    def _add_chunk(self, rows: Rows) -> None:
+    def add_chunk(self, rows: Rows) -> None:
         """Adds rows to their channel, and to those that follow it."""
         self.container.add_chunk(rows)
         self._latest[rows.channel] = int(rows.times[-1])
