@@ -1,6 +1,7 @@
 """New recordings out of others.
 
-assemble                          takes episodes over into a new file
+assemble                          the new file: numbers its rows, writes chunks, index and summary
+copy_episodes                     episodes of a recording into it, with new numbers
 copy_chunks                       chunks that can be copied as they are
 merge                             several recordings into one, or one into several
 rewrite                           a recording with fewer episodes

@@ -1,4 +1,5 @@
-"""Rows that are not in the file yet, a class for each kind of channel; they commit, and hand over full chunks.
+"""Rows that are not in the file yet, a class for each kind of channel: they commit rows to a half of the journal, and
+when it is full, go on in the other one and hand over a chunk.
 
 contract          what all of them keep to
 single, vector    steps of constant size, of one environment and of many
