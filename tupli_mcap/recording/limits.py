@@ -28,6 +28,7 @@ StepsAt = Callable[[Array], tuple[Array, Array]]
 """What the steps at some rows say: `episode` and `step` as one number (`<u8`), and the two flags as one (`<u2`)."""
 
 _U32 = 2**32 - 1
+_GOES_ON = 2  # what the flags of a step say that does not end its episode, see `_end_of`
 _CHUNK_FIXED = 9 + 40  # of a Chunk record, before and after the name of its compression
 _NAMED = np.array([_CHUNK_FIXED + len(name.replace("none", "")) for name in COMPRESSIONS], np.uint64)
 _RATIOS = np.array([MAX_RATIO[name] for name in COMPRESSIONS], np.uint64)
@@ -134,72 +135,81 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
 
 
 class StepClaims:
-    """What the episode index says of the rows of a step channel: where episodes begin and end, and how.
+    """What the episode index says of the rows of a step channel: where episodes end, and how.
 
-    The index is held against the first and the last row of each episode, and against the first row of each chunk: that
-    finds every boundary that is not where the rows have it. Nothing changes in it; threads and stores may share it.
+    The index is held against the last row of each episode and of each chunk. Such a row says how many steps of its
+    episode came before it, so this finds every boundary that is not where the rows have it. Threads and stores may
+    share the object.
 
     Args:
         index: EPISODE_ROWS; no two episodes share a row.
         env: the sub-environment whose channel it is.
+        chunks: CHUNK_ROWS of the channel, in the order of their rows, without gaps.
     """
 
-    def __init__(self, index: Array, env: int) -> None:
-        self._index, self._env = index, env
+    def __init__(self, index: Array, env: int, chunks: Array) -> None:
+        self._index, self._env, self._chunks = index, env, chunks
 
     @cached_property
-    def _boundaries(self) -> tuple[Array, Array, Array]:
-        """The first and the last row of each episode in turn, `episode` and `step` there; the end of each episode."""
+    def _claims(self) -> tuple[Array, Array, Array, dict[int, slice]]:
+        """The rows that are looked at, counted within their chunk; the `episode` and `step`, and the end, that each
+        should say; by the first row of a chunk, which of them are its.
+        """
         index = self._index
         mine = index["env"] == self._env
         if not mine.all():
             index = index[mine]
         # field by field: NumPy takes far longer for rows of many fields
-        parts = [index[name] for name in ("first_row", "length", "episode", "end")]
-        if (parts[0][1:] < parts[0][:-1]).any():
-            order = np.argsort(parts[0], kind="stable")
-            parts = [part[order] for part in parts]
-        firsts, lengths, episodes, how = parts
-        rows = np.empty((len(index), 2), np.int64)
-        rows[:, 0], rows[:, 1] = firsts, firsts + lengths - 1
-        numbers = np.empty((len(index), 2), np.uint64)
-        numbers[:, 0], numbers[:, 1] = episodes, episodes + (lengths - 1 << np.uint64(32))
-        return rows.ravel(), numbers.ravel(), np.ascontiguousarray(how)
+        firsts, lengths = index["first_row"].astype(np.int64), index["length"].astype(np.int64)
+        episodes, how = index["episode"].astype(np.int64), np.ascontiguousarray(index["end"])
+        if (firsts[1:] < firsts[:-1]).any():
+            order = np.argsort(firsts, kind="stable")
+            firsts, lengths, episodes, how = firsts[order], lengths[order], episodes[order], how[order]
+        rows, numbers = firsts + lengths - 1, episodes + (lengths - 1 << 32)
 
-    def check(self, first: int, count: int, steps_at: StepsAt, where: str) -> None:
-        """Holds consecutive rows against the index.
+        chunks = self._chunks[self._chunks["rows"] > 0]
+        starts, counts = chunks["first"].astype(np.int64), chunks["rows"].astype(np.int64)
+        last = starts + counts - 1
+        at = rows.searchsorted(last)  # the episode that goes on after a chunk, if one does
+        goes_on = at < len(rows)
+        goes_on[goes_on] = (firsts[at[goes_on]] <= last[goes_on]) & (rows[at[goes_on]] != last[goes_on])
+        at, last = at[goes_on], last[goes_on]
+        numbers = np.insert(numbers, at, episodes[at] + (last - firsts[at] << 32))
+        rows, how = np.insert(rows, at, last), np.insert(how, at, _GOES_ON)
+
+        bounds = rows.searchsorted(np.append(starts, starts[-1:] + counts[-1:]))
+        rows -= np.repeat(starts, np.diff(bounds))
+        of_chunk = map(slice, bounds[:-1].tolist(), bounds[1:].tolist())
+        return rows, numbers, how, dict(zip(starts.tolist(), of_chunk, strict=True))
+
+    def check(self, first: int, steps_at: StepsAt, where: str) -> None:
+        """Holds the rows of a chunk against the index.
 
         Args:
-            first: the number of the first row.
-            count: of rows, at least one.
-            steps_at: what the rows say; 0 is the first row.
+            first: the number of its first row.
+            steps_at: what its rows say; 0 is the first row.
             where: the file, and what of it is read.
 
         Raises:
             FormatError: a row is of another episode or step, or the flags of an episode's last row say another end.
         """
-        rows, numbers, how = self._boundaries
-        low, high = rows.searchsorted((first, first + count)).tolist()
-        low -= low % 2  # the first row may belong to an episode that began before
-        places, expected, ends = rows[low:high] - first, numbers[low:high], how[low // 2 : high // 2]
-        if len(places) and places[0] < 0:
-            expected = expected.copy()
-            expected[0] += np.uint64(-int(places[0]) << 32)
-            places[0] = 0
+        rows, numbers, how, of_chunk = self._claims
+        mine = of_chunk[first]
+        places, expected, ends = rows[mine], numbers[mine], how[mine]
         found, flags = steps_at(places)
         if found.tobytes() != expected.tobytes():
-            i = int(np.argmax(found != expected))
+            i = int(np.argmax(found != expected.view(found.dtype)))
             one, other = int(found[i]), int(expected[i])
             raise FormatError(
                 f"{where}: expected step {other >> 32} of episode {other & _U32} in row {first + places[i]} as the "
                 f"episode index says, found step {one >> 32} of episode {one & _U32}; recover it into a new file"
             )
-        told = _end_of()[flags[1::2]]
+        told = _end_of()[flags]
         if told.tobytes() != ends.tobytes():
             i = int(np.argmax(told != ends))
             raise FormatError(
-                f"{where}: expected the end {ends[i]} of episode {int(expected[2 * i]) & _U32} as the episode index "
-                f"says, found other flags in its last row, {first + places[2 * i + 1]}; recover it into a new file"
+                f"{where}: expected the end {ends[i]} of episode {int(expected[i]) & _U32} as the episode index says, "
+                f"found other flags in row {first + places[i]}; recover it into a new file"
             )
 
 

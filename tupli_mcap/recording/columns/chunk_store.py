@@ -149,10 +149,9 @@ def _are_rows(data: Any, rows: int, size: int, channel: int) -> bool:
 
 def _steps_of_rows(data: Any, size: int, places: Array) -> tuple[Array, Array]:
     """`StepsAt` for rows of constant size."""
-    rows = np.frombuffer(data, f"V{size}").take(places)  # whole rows: one walk for both
-    return np.ndarray(len(rows), _U8, rows, BODY, (size,)), np.ndarray(
-        len(rows), _U2, rows, size - 2, (size,)
-    )
+    count = len(data) // size
+    numbers = np.ndarray(count, _U8, data, BODY, (size,))[places]
+    return numbers, np.ndarray(count, _U2, data, size - 2, (size,))[places]
 
 
 def _steps_of_records(data: Any, starts: Array, stops: Array, places: Array) -> tuple[Array, Array]:
@@ -223,6 +222,10 @@ class ChunkStore:
     def chunks(self, channel: int) -> list[int]:
         """The chunks of a channel in the order of their rows."""
         return [int(i) for i in self._by_channel[channel][0]] if channel in self._by_channel else []
+
+    def table_of(self, channel: int) -> Array:
+        """CHUNK_ROWS of a channel in the order of their rows."""
+        return self.table[self.chunks(channel)]
 
     def spans(self, channel: int, first: int, count: int) -> Iterator[Span]:
         """Where the rows `first:first + count` of a channel lie."""
@@ -359,18 +362,18 @@ class ChunkStore:
         if not _are_rows(data, n, dtype.itemsize, channel):
             raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
         if self.claims is not None and not self._held[i]:
-            self._hold_rows(i, data, n, dtype.itemsize)
+            self._hold_rows(i, data, channel, n, dtype.itemsize)
         kept.rows = rows
         return rows
 
-    def _hold_rows(self, i: int, data: Any, n: int, size: int) -> None:
+    def _hold_rows(self, i: int, data: Any, channel: int, n: int, size: int) -> None:
         """Raises FormatError unless the rows of a chunk are those that the index says."""
         first, where = int(self.table["first"][i]), f"{self._source.name}: chunk {i}"
-        claims = None if self.claims is None else self.claims.get(int(self.table["channel"][i]))
+        claims = None if self.claims is None else self.claims.get(channel)
         if claims is None or not n:
             _check_sequence(np.ndarray(n, _U4, data, _SEQUENCE_AT, (size,)), first, where)
         else:
-            claims.check(first, n, functools.partial(_steps_of_rows, data, size), where)
+            claims.check(first, functools.partial(_steps_of_rows, data, size), where)
         self._held[i] = True  # its CRC says that it stays the same
 
     def _hold_records(self, i: int, data: Any, records: Array) -> None:
@@ -381,9 +384,7 @@ class ChunkStore:
             starts, stops = records[:, 0], records[:, 1]
             if int((stops - starts).min()) < _LEAST_STEP:
                 raise FormatError(f"{where} holds messages that are no steps")
-            claims.check(
-                first, len(records), functools.partial(_steps_of_records, data, starts, stops), where
-            )
+            claims.check(first, functools.partial(_steps_of_records, data, starts, stops), where)
         self._held[i] = True
 
     def _decoded(self, i: int, codec: Decoder, *, keep: bool) -> KeptChunk:
