@@ -41,7 +41,7 @@ IMAGE = StepLayout(spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Discrete(99))
 def only(*numbers: Any) -> int:
     """What all of them are."""
     found = {float(n) for n in numbers}
-    assert len(found) == 1
+    assert len(found) == 1, f"parts of several rows: {found}"
     return int(found.pop())
 
 
@@ -90,7 +90,8 @@ class Subject:
 
     def add_chunk(self, rows: Rows) -> None:
         """The rows are in the file."""
-        assert rows.first == len(self.file[rows.channel])
+        held = len(self.file[rows.channel])
+        assert rows.first == held, f"row {rows.first} of channel {rows.channel} comes after {held} rows"
         self.file[rows.channel] += self.numbers(rows)
 
     def start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], None]:
@@ -112,7 +113,8 @@ class Subject:
         for channel in self.channels:
             known = self.file[channel]
             found = known + self.taken(contents, channel, len(known))
-            assert found in (list(range(self.done)), list(range(self.done + 1)))
+            whole = list(range(self.done)), list(range(self.done + 1))
+            assert found in whole, f"channel {channel} has lost rows: {found} of {self.done}"
 
     def check_now(self) -> None:
         """As `check`, of the file that the journal is, and between rows."""
@@ -120,7 +122,8 @@ class Subject:
         self.check(contents)
         for channel in self.channels:
             if self.runs:
-                assert self.running(contents, channel) == self.done
+                found = self.running(contents, channel)
+                assert found == self.done, f"channel {channel} has lost its running row: {found}"
 
     def write(self) -> None:
         """The next row, looked at all the while."""
@@ -182,7 +185,7 @@ class OfRows(Subject):
         if self.done == 0:
             return 0
         state = self.committed(contents, channel).following(self.done - 1, BOX.state_end)
-        assert state is not None
+        assert state is not None, "the running row's state is not there"
         return only(*np.frombuffer(state).tolist())
 
 
@@ -247,7 +250,7 @@ class Variable(OfRecords):
 
     def running(self, contents: JournalContents, channel: int) -> int:
         state = running_record(contents, "steps/0", self.done, TEXT)
-        assert state is not None
+        assert state is not None, "the running row's state is not there"
         assert state[4:].rstrip(b"\0").decode() == self.text(self.done)
         return self.done
 
@@ -396,15 +399,15 @@ class LeavesTheRunningRow(StepLog):
 
 
 @pytest.mark.parametrize(
-    ("subject", "kind", "check"),
+    ("subject", "kind", "check", "found"),
     [
-        (Vector, CommitsBefore, keeps_all_rows),
-        (Images, WaitsForNothing, keeps_all_rows),
-        (Variable, LeavesTheRunningRow, moves_with_its_running_row),
+        (Vector, CommitsBefore, keeps_all_rows, "parts of several rows"),
+        (Images, WaitsForNothing, keeps_all_rows, "row 4 of channel 1 comes after 2 rows"),
+        (Variable, LeavesTheRunningRow, moves_with_its_running_row, "the running row's state is not there"),
     ],
 )
 def test_a_broken_store_is_found_out(
-    tmp_path: Path, subject: type[Subject], kind: type[Any], check: Callable[[Subject], None]
+    tmp_path: Path, subject: type[Subject], kind: type[Any], check: Callable[[Subject], None], found: str
 ) -> None:
-    with pytest.raises(AssertionError):
+    with pytest.raises(AssertionError, match=found):
         check(subject(tmp_path, kind, sealed=False))

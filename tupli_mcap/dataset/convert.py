@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -154,14 +154,7 @@ class TorchTupleParser(BaseTupleParser):
             import torch  # type: ignore[import-not-found, unused-ignore]
         except ImportError as err:
             raise missing_extra("tensors need PyTorch", "torch") from err
-        obs, act, rew, term, trunc = NumpyTupleParser.parse_lists(obs, act, rew, term, trunc)
-        return (
-            map_arrays(torch.from_numpy, obs),
-            map_arrays(torch.from_numpy, act),
-            map_arrays(torch.from_numpy, rew),
-            map_arrays(torch.from_numpy, term),
-            map_arrays(torch.from_numpy, trunc),
-        )
+        return _convert_each(torch.from_numpy, NumpyTupleParser.parse_lists(obs, act, rew, term, trunc))
 
 
 class TensorflowTupleParser(BaseTupleParser):
@@ -180,14 +173,12 @@ class TensorflowTupleParser(BaseTupleParser):
             raise MissingExtraError(
                 "tensors need TensorFlow, which is not installed; pip install tensorflow"
             ) from err
-        obs, act, rew, term, trunc = NumpyTupleParser.parse_lists(obs, act, rew, term, trunc)
-        return (
-            map_arrays(tf.convert_to_tensor, obs),
-            map_arrays(tf.convert_to_tensor, act),
-            map_arrays(tf.convert_to_tensor, rew),
-            map_arrays(tf.convert_to_tensor, term),
-            map_arrays(tf.convert_to_tensor, trunc),
-        )
+        return _convert_each(tf.convert_to_tensor, NumpyTupleParser.parse_lists(obs, act, rew, term, trunc))
+
+
+def _convert_each(convert: Callable[[Any], Any], columns: Five) -> Five:
+    obs, act, rew, term, trunc = (map_arrays(convert, column) for column in columns)
+    return obs, act, rew, term, trunc
 
 
 def _as_arrays(column: Any) -> Any:
