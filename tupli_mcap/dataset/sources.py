@@ -24,7 +24,7 @@ from tupli_mcap.schema import (
     compile_predicate,
 )
 from tupli_mcap.schema.models import unchecked_header
-from tupli_mcap.schema.times import iso_utc
+from tupli_mcap.schema.times import iso_utc, iso_utc_each
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.sidecar import Notes
@@ -205,10 +205,11 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
     index = recording.index
     columns: list[Any] = [
         index[field].tolist()
-        for field in ("episode", "env", "length", "end", "return", "has_seed", "seed", "end_time")
+        for field in ("episode", "env", "length", "end", "return", "has_seed", "seed")
     ]
+    columns.append(iso_utc_each(index["end_time"]))
     uuid, benchmark_id = recording.uuid, recording.benchmark_id
-    for number, env, length, end, total, has_seed, seed, time, metadata in zip(
+    for number, env, length, end, total, has_seed, seed, ended, metadata in zip(
         *columns, recording.all_metadata(), strict=True
     ):
         if number in deleted:
@@ -218,7 +219,7 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
                 "id": f"{uuid}-{number}",
                 "created_by": "",
                 "published_in": [],
-                "created_at": iso_utc(time),
+                "created_at": ended,
                 "benchmark_id": benchmark_id,
                 "metadata": {} if metadata == "{}" else _metadata(metadata, name, number),
                 "n_tuples": length,

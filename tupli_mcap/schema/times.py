@@ -12,7 +12,11 @@ import datetime
 import re
 from typing import Final, NamedTuple
 
-__all__ = ["TimeSpan", "iso_utc", "local_text", "span_of", "text_of", "time_ns"]
+import numpy as np
+
+from tupli_mcap.arrays import Array
+
+__all__ = ["TimeSpan", "iso_utc", "iso_utc_each", "local_text", "span_of", "text_of", "time_ns"]
 
 EXPECTED: Final = (
     'a time, such as "2026-11-23", "2026-11-23 03:31:07", "2026-11-23T03:31:07+01:00", "today", "yesterday", "7d ago" '
@@ -121,6 +125,12 @@ def time_ns(text: object) -> int | None:
 def iso_utc(time_ns: int) -> str:
     """A time (ns) as a fact says it: ISO 8601 in UTC, to the microsecond."""
     return (_EPOCH + time_ns // 1000 * _MICROSECOND).isoformat(timespec="microseconds")
+
+
+def iso_utc_each(times_ns: Array) -> list[str]:
+    """`iso_utc` of many times (uint64)."""
+    texts = np.datetime_as_string((times_ns // 1000).astype("datetime64[us]"), unit="us").tolist()
+    return [f"{text}+00:00" for text in texts]
 
 
 def local_text(time_ns: int) -> str:
