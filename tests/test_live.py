@@ -224,7 +224,7 @@ def test_a_follower_sees_what_is_recorded(
     seen: list[tuple[NewSteps, dict[int, Any]]] = []
     ended: list[Any] = []
     env, looker = followed(path, Sampler(space, space), num_envs, chunk_size=chunk_size)
-    env._recorder.leaves_to_rows = told
+    env._recorder.derives_episodes = told
 
     def watch() -> None:
         last = False

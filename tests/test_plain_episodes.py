@@ -1,4 +1,4 @@
-"""Episodes that rows tell of: as if every start and end had been written when it happened.
+"""Episodes that are derived from rows: as if every start and end had been written when it happened.
 
 The oracle is the same rollout, recorded by a recorder that writes them at once.
 """
@@ -21,7 +21,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from tupli_mcap import RecordEpisodes, Recording, verify_recording
 from tupli_mcap.errors import RecordingError, StepError
-from tupli_mcap.journal.derive import EpisodeRows
+from tupli_mcap.journal.derive import EpisodeDeriver
 from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
@@ -57,7 +57,7 @@ class Uneven(gym.Env[Any, Any]):
 
 def at_once(env: Any) -> Any:
     """A recorder that writes every start and end when it happens."""
-    env._recorder.leaves_to_rows = False
+    env._recorder.derives_episodes = False
     return env
 
 
@@ -204,7 +204,7 @@ def test_it_is_used(tmp_path: Path) -> None:
             if terminal or timeout:
                 env.reset()
         rows, events = env._writer.rows, env._writer.events
-        assert isinstance(rows, SingleRows) and rows.tells
+        assert isinstance(rows, SingleRows) and rows.derives
         assert events is not None and sum(events.sequences.values()) == 1
         assert env._writer.next_episode > 10
     with Recording(tmp_path / "r.mcap") as recording:
@@ -233,9 +233,9 @@ def test_returns_are_sums_in_the_order_of_the_steps() -> None:
     for reward in rows["reward"].tolist():
         total += reward
     for parts in ([500], [1, 499], [100, 0, 250, 150]):
-        episodes, at = EpisodeRows(1, 44), 0
+        episodes, at = EpisodeDeriver(1, 44), 0
         for count in parts:
-            found = episodes.take(rows[None, at : at + count], {0: bytes(1)} if at + count == 500 else None)
+            found = episodes.derive(rows[None, at : at + count], {0: bytes(1)} if at + count == 500 else None)
             at += count
         assert found.ends["return"].tolist() == [total]
         assert found.ends["length"].tolist() == [500]

@@ -488,7 +488,7 @@ def keep(live: Path, path: Path) -> None:
 
 
 class Silent(Played):
-    """A reset tells nothing, so that rows tell of episodes."""
+    """A reset gives no info, so that episodes are derived from rows."""
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         state, _ = super().reset(seed=seed, options=options)

@@ -28,7 +28,7 @@ def _commit_before_the_data() -> None:
 
             return hastily
 
-        self.put, self.put_plain = hasty(self.put), hasty(self.put_plain)
+        self.put = hasty(self.put)
 
     rows.SingleRows.__init__ = init  # type: ignore[method-assign]
 

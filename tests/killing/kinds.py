@@ -37,7 +37,7 @@ class Kind:
     reward: gym.Space[Any] | None = None
     plain: bool = False  # states of one value each, for they are large
     rotates: bool = False  # goes on in other files
-    silent: bool = False  # a reset tells nothing, so that rows tell of episodes
+    silent: bool = False  # a reset gives no info, so that episodes are derived from rows
     window: int | None = None  # the axis of states that holds the newest frames, the oldest first
     large: int = 0  # every episode's texts are longer than the last one's, up to here
 

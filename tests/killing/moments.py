@@ -45,7 +45,7 @@ class Moment:
     closes: bool = False  # the process closes its recording, to get there
     appends: bool = False  # only where a recording goes on
     grows: bool = False  # only where steps become larger than the journal
-    told: bool = False  # only where rows tell of episodes
+    told: bool = False  # only where episodes are derived from rows
     threaded: bool = False  # only where a thread writes the chunks
     syncs: bool = False  # only where file and journal are synced
     rotates: bool = False  # only where a recording goes on in other files
@@ -62,7 +62,7 @@ MOMENTS = {
         Moment(
             "stores",
             (
-                *(f"encoder.<locals>.{name}" for name in ("put", "put_plain", "put_next")),
+                *(f"encoder.<locals>.{name}" for name in ("put", "put_next")),
                 "StepLog.commit",
                 "VectorRows.put",
                 "ImageRows.put",
@@ -74,12 +74,12 @@ MOMENTS = {
         ),
         Moment(
             "told",
-            ("SingleRows._tell", "VectorRows._tell", "EpisodeLog.extend"),
+            ("SingleRows._derive", "VectorRows._derive", "EpisodeLog.extend"),
             times=3,
             told=True,
             flushes=True,
         ),
-        Moment("settled", ("SingleRecorder._settle", "VectorRecorder._settle"), times=4),
+        Moment("settled", ("SingleRecorder._write_pending", "VectorRecorder._write_pending"), times=4),
         Moment(
             "episode log",
             ("EventLog.append", "EpisodeLog.start", "EpisodeLog.end", "EventLog.drop_last"),

@@ -204,8 +204,7 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
     """Headers as a storage would list them; `recording` of each is the name the file was opened by."""
     index = recording.index
     columns: list[Any] = [
-        index[field].tolist()
-        for field in ("episode", "env", "length", "end", "return", "has_seed", "seed")
+        index[field].tolist() for field in ("episode", "env", "length", "end", "return", "has_seed", "seed")
     ]
     columns.append(iso_utc_each(index["end_time"]))
     uuid, benchmark_id = recording.uuid, recording.benchmark_id

@@ -17,7 +17,7 @@ from tupli_mcap.journal.seals import STATE
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd
 
-__all__ = ["EpisodeBatch", "EpisodeRows", "StartedEpisode"]
+__all__ = ["EpisodeBatch", "EpisodeDeriver", "StartedEpisode"]
 
 _START = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("time", "<u8")])
 _END = np.dtype(
@@ -40,8 +40,8 @@ class StartedEpisode(NamedTuple):
 
 
 class EpisodeBatch(NamedTuple):
-    """What rows have told: `starts` (episode, env, first_row, time), `ends` (those, length, return, end) and their
-    final states, as they follow `episode` and `env` in `/final_state` (uint8, a row an end); each in the order of time.
+    """What was derived: `starts` (episode, env, first_row, time), `ends` (those, length, return, end) and their final
+    states, as they follow `episode` and `env` in `/final_state` (uint8, a row an end); each in the order of time.
     """
 
     starts: Array
@@ -49,10 +49,12 @@ class EpisodeBatch(NamedTuple):
     states: Array
 
 
-class EpisodeRows:
-    """Follows the rows of `num_envs` sub-environments, batch after batch.
+class EpisodeDeriver:
+    """Derives the episodes of `num_envs` sub-environments from their rows, batch after batch.
 
-    `running` are the numbers of the running episodes, -1 where there is none; `totals` their returns so far.
+    Attributes:
+        running: the numbers of the running episodes, -1 where there is none: int64 (num_envs,).
+        totals: their returns so far: float64 (num_envs,).
     """
 
     def __init__(self, num_envs: int, state_end: int) -> None:
@@ -62,7 +64,7 @@ class EpisodeRows:
         self.begin([None] * num_envs)
 
     def begin(self, started: Sequence[StartedEpisode | None]) -> None:
-        """The next rows are the first ones of these episodes, whose start is written, or of some to be started."""
+        """The next rows are the first ones of these episodes, whose starts are written; None: no start is."""
         self.running = np.array([-1 if one is None else one.number for one in started])
         self._first_rows = np.array([0 if one is None else one.first_row for one in started])
         self._lengths = np.zeros(self._n, np.int64)
@@ -72,14 +74,16 @@ class EpisodeRows:
         self._waits = np.zeros(self._n, np.bool_)
 
     def wait_for(self, end: EpisodeEnd, time_ns: int) -> None:
-        """The next row is a hole that keeps the final state of an episode that has ended otherwise."""
+        """The next row is a hole with the final state of an episode whose end was not derived."""
         facts = end.episode, end.env, end.first_row, end.length, end.episode_return, end.end, time_ns
         self._waiting[end.env], self._waits[end.env] = facts, True
 
-    def take(self, rows: Array, pending: Mapping[int, bytes] | None = None) -> EpisodeBatch:
-        """What new rows tell (a line a sub-environment, with holes, in their order).
+    def derive(self, rows: Array, pending: Mapping[int, bytes] | None = None) -> EpisodeBatch:
+        """The starts, ends and final states that new rows bring.
 
-        `pending`: final states of episodes that the last rows have ended, by sub-environment.
+        Args:
+            rows: (num_envs, rows), in their order, with holes.
+            pending: final states of episodes that the last rows have ended, by sub-environment.
         """
         found = _Segments(rows["#sequence"], rows["terminal"] | rows["timeout"])
         going_on = found.is_first & (self.running[found.env] >= 0)
@@ -106,7 +110,7 @@ class EpisodeRows:
         self._first_rows[found.env[final]] = first_rows[final]
         self._lengths[found.env[final]] = lengths[final]
         self.totals[found.env[final]] = totals[final]
-        return self._told(rows, starts[~going_on], ends[found.ended], found.last[found.ended], pending or {})
+        return self._batch(rows, starts[~going_on], ends[found.ended], found.last[found.ended], pending or {})
 
     def _reset_times(self, rows: Array, found: _Segments) -> Array:
         """The times of the holes before each segment."""
@@ -118,7 +122,7 @@ class EpisodeRows:
             self._began[is_hole] = times[is_hole, -1]
         return before
 
-    def _told(
+    def _batch(
         self, rows: Array, starts: Array, ends: Array, last: Array, pending: Mapping[int, bytes]
     ) -> EpisodeBatch:
         width, size = rows.shape[1], self._state.stop - self._state.start

@@ -64,26 +64,23 @@ class RowEncoder:
     """Writes rows into a buffer, and knows where the next one goes.
 
     `put(action, state, reward, terminal, timeout)` writes and commits a step; `put_state(state)` starts a row.
-    `put_plain` is `put` for episodes whose return nobody asks for while they run: `total` leaves it out.
     `put_next(episode, state)` leaves the running row, which holds the final state, as a hole, and starts the row after
     it, the first one of `episode`; the hole's time is now, but not before the last step's. All of them raise StepError
     for what cannot be stored exactly, and nothing has changed then.
 
     `offset()` is where the running row is in the buffer, `count()` the sequence of the next step, `total()` the return
     so far. `move(start, last, end)` makes the row at `start` the running one, behind the row at `last`; when the one at
-    `end` has been started, `switch` is called. `begin(prefix, total)`: what the rows to come hold before their state,
-    and the return before them.
+    `end` has been started, `switch` is called. `begin(prefix)`: another episode; what its rows hold before their state.
     """
 
     put: Callable[[Any, Any, Any, Any, Any], None]
-    put_plain: Callable[[Any, Any, Any, Any, Any], None]
     put_state: Callable[[Any], None]
     put_next: Callable[[int, Any], None]
     offset: Callable[[], int]
     count: Callable[[], int]
     total: Callable[[], Any]
     move: Callable[[int, int, int], None]
-    begin: Callable[[bytes, Any], None]
+    begin: Callable[[bytes], None]
     state_end: int  # bytes of a row up to the end of its state
     source: str
 
@@ -244,7 +241,22 @@ def encoder():
     offset = start = last = end = 0
     sequence, prefix, total = first, b'', 0.0
 
-{put}{put_plain}\
+    def put(action, state, reward, terminal, timeout):
+        nonlocal offset, sequence, total
+        try:
+{lines}\
+        except refusals:
+            raise
+        except Exception as err:
+            raise diagnose(action, state, reward, err) from err
+        commit(buffer, offset + {sequence}, sequence, time_ns())
+{committed}\
+        sequence += 1
+        total += {amount}
+        offset += {size}
+        if offset == end:
+            switch()
+
     def put_state(state):
         try:
 {first_lines}\
@@ -271,32 +283,14 @@ def encoder():
         offset = start = new_start
         last, end = new_last, new_end
 
-    def begin(new_prefix, new_total):
+    def begin(new_prefix):
         nonlocal prefix, total
-        prefix, total = new_prefix, new_total
+        prefix, total = new_prefix, 0.0
 
     return dict(
-        put=put, put_plain=put_plain, put_state=put_state, put_next=put_next, move=move, begin=begin,
+        put=put, put_state=put_state, put_next=put_next, move=move, begin=begin,
         offset=lambda: offset, count=lambda: sequence, total=lambda: total,
     )
-"""
-_PUT = """\
-    def {name}(action, state, reward, terminal, timeout):
-        nonlocal {changed}
-        try:
-{lines}\
-        except refusals:
-            raise
-        except Exception as err:
-            raise diagnose(action, state, reward, err) from err
-        commit(buffer, offset + {sequence}, sequence, time_ns())
-{committed}\
-        sequence += 1
-{counted}\
-        offset += {size}
-        if offset == end:
-            switch()
-
 """
 
 
@@ -306,16 +300,10 @@ def _render(code: _Code, size: int, *, is_sealed: bool) -> str:
     def block(lines: Sequence[str]) -> str:
         return "".join(f"            {line}\n" for line in lines)
 
-    def put(name: str, changed: str, counted: str) -> str:
-        committed = "        seal(offset)\n" if is_sealed else ""
-        return _PUT.format(
-            name=name, changed=changed, lines=block(code.put), sequence=SEQUENCE_OFFSET,
-            committed=committed, counted=counted, size=size,
-        )  # fmt: skip
-
     return _ENCODER.format(
-        put=put("put", "offset, sequence, total", f"        total += {code.amount}\n"),
-        put_plain=put("put_plain", "offset, sequence", ""),
+        lines=block(code.put),
+        committed="        seal(offset)\n" if is_sealed else "",
+        amount=code.amount,
         first_lines=block(code.put_state),
         next_lines=block(code.put_next),
         size=size,

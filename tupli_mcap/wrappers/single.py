@@ -134,7 +134,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         self._open(path, options, StepLayout(env.observation_space, env.action_space, reward_space), None)
 
     def _recorder_of(self, writer: RecordingWriter) -> SingleRecorder:
-        recorder = SingleRecorder(writer, self._spaces, self._infos, leaves_to_rows=self._plain)
+        recorder = SingleRecorder(writer, self._spaces, self._infos, derives_episodes=self._plain)
         recorder.resets_itself = _resets_itself(self.env)
         return recorder
 

@@ -107,7 +107,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
 
     def _recorder_of(self, writer: RecordingWriter) -> VectorRecorder:
         return VectorRecorder(
-            writer, self._spaces, self.num_envs, self._autoreset, self._infos, leaves_to_rows=self._plain
+            writer, self._spaces, self.num_envs, self._autoreset, self._infos, derives_episodes=self._plain
         )
 
     def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> VectorFrames:

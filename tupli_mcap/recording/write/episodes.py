@@ -83,7 +83,7 @@ class EpisodeLog(EventLog):
     ) -> None:
         self._start, self._final, self._end = ids = channels.start, channels.final_state, channels.end
         self._index = index
-        self._running: dict[int, StartedEpisode] = {}  # started, and to be ended by what rows tell
+        self._running: dict[int, StartedEpisode] = {}  # started; their ends will be derived
         super().__init__(
             journal, name, sink, {channel: counts[channel] for channel in ids}, time_ns, file_size
         )
@@ -160,26 +160,26 @@ class EpisodeLog(EventLog):
             metadata,
         )  # fmt: skip
 
-    def leave_to_rows(self, episode: StartedEpisode) -> None:
-        """The end of an episode will be told by its rows."""
+    def expect_end(self, episode: StartedEpisode) -> None:
+        """The end of a started episode will be derived from its rows."""
         self._running[episode.number] = episode
 
     def take_back(self, number: int) -> StartedEpisode:
-        """An episode whose rows have told its start, but will not tell its end."""
+        """A running episode whose end will be logged: it is not derived after all."""
         return self._running.pop(number)
 
-    def extend(self, told: EpisodeBatch) -> None:
-        """Adds `/episode_start`, `/final_state` and `/episode_end` of what rows have told."""
-        if not len(told.starts) and not len(told.ends):
+    def extend(self, batch: EpisodeBatch) -> None:
+        """Adds `/episode_start`, `/final_state` and `/episode_end` of derived episodes."""
+        if not len(batch.starts) and not len(batch.ends):
             return
-        begun, final, ended = self._tables(told)
+        begun, final, ended = self._tables(batch)
         self.latest_ns = max(self.latest_ns, *(int(t["#log_time"][-1]) for t in (begun, ended) if len(t)))
         self._tell_index(begun, ended, final["#sequence"])
         self._add({self._start: begun, self._final: final, self._end: ended})
 
-    def _tables(self, told: EpisodeBatch) -> tuple[Array, Array, Array]:
+    def _tables(self, batch: EpisodeBatch) -> tuple[Array, Array, Array]:
         """Records of starts, final states and ends."""
-        starts, ends, states = told
+        starts, ends, states = batch
         size = states.shape[1]
         begun = self._table(self._start, _START_BODY, _START, starts)
         final = self._table(self._final, bytes(8 + size), (*_BOTH, ("state", f"V{size}", 8)), ends)

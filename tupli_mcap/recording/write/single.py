@@ -61,9 +61,9 @@ class SingleRecorder:
         spaces: StepLayout,
         infos: InfoRecorder | None = None,
         *,
-        leaves_to_rows: bool = False,
+        derives_episodes: bool = False,
     ) -> None:
-        self.leaves_to_rows = leaves_to_rows  # plain episodes
+        self.derives_episodes = derives_episodes
         self.metadata = "{}"
         self._writer = writer
         self._spaces = spaces
@@ -72,7 +72,7 @@ class SingleRecorder:
         self._earlier: list[ResetFacts] = []  # resets before it that no step followed
         self._episode: StartedEpisode | None = None
         self._over: int | None = None  # how the last step has ended its episode, if that is not written yet
-        self._rows: SingleRows | None = None  # those that can tell of episodes
+        self._rows: SingleRows | None = None  # if episodes can be derived from them
         self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset
         writer.on_close = self._stop
@@ -95,7 +95,7 @@ class SingleRecorder:
         """
         if self._writer.closed:
             self._closed()
-        self._settle()
+        self._write_pending()
         if self._reset is not None or self._episode is not None:
             self._keep_start_for(facts)
             self.end(INTERRUPTED)
@@ -133,25 +133,25 @@ class SingleRecorder:
         if over is None or rows is None or writer.lost_streams:
             return False
         if self._episode is not None:
-            self._leave_to_rows(rows, self._episode, over)
+            self._start_deriving(rows, self._episode, over)
         rows.put_next(writer.next_episode, state)
         writer.next_episode += 1
         self._over = None
-        self.put = rows.put_plain
+        self.put = rows.put
         return True
 
-    def _leave_to_rows(self, rows: SingleRows, episode: StartedEpisode, end: int) -> None:
+    def _start_deriving(self, rows: SingleRows, episode: StartedEpisode, end: int) -> None:
         events = self._writer.events
         if events is not None:
             number, env, first_row = episode[:3]
             length = rows.count - first_row
-            rows.tell(
+            rows.start_deriving(
                 events, EpisodeEnd(number, env, first_row, length, rows.total, end, True, "{}"), episode
             )
             self._episode = None
 
-    def _settle(self) -> None:
-        """Writes what was left for later, so that everything is as if it had been written at once."""
+    def _write_pending(self) -> None:
+        """Writes the ends and starts that were put off, so that all is as if each had been written when it happened."""
         writer, rows = self._writer, self._rows
         if rows is None or writer.closed:
             return
@@ -159,14 +159,12 @@ class SingleRecorder:
         if self._episode is not None:
             if over is not None:
                 self.end(over)
-        elif rows.tells:
-            self._episode = rows.settle(over=over is not None)
+        elif rows.derives:
+            self._episode = rows.stop_deriving(over=over is not None)
             if self._episode is None and over is None:  # begun, and no step yet
                 writer.next_episode -= 1
                 facts = ResetFacts(None, None, "", "{}", time.time_ns())
                 self._episode = writer.start_episode(0, rows.count, facts)
-            if over is None:
-                self.put = rows.put
 
     def _keep_start_for(self, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""
@@ -179,7 +177,7 @@ class SingleRecorder:
     def end(self, end: int, *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
         if self._over is not None or self._episode is None:
-            self._settle()
+            self._write_pending()
         episode, writer = self._episode, self._writer
         metadata, self.metadata = self.metadata, "{}"
         rows = writer.rows
@@ -239,7 +237,7 @@ class SingleRecorder:
         writer.begin(layout, 1, vector=False, info_schema=schema)
         self._reset = None
         rows = writer.rows
-        if self.leaves_to_rows and isinstance(rows, SingleRows) and rows.can_tell and not writer.images:
+        if self.derives_episodes and isinstance(rows, SingleRows) and rows.can_derive and not writer.images:
             self._rows = rows
         self._start_earlier()
         self.reset(first, facts)
@@ -257,7 +255,7 @@ class SingleRecorder:
 
     def _continue(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """A step after an end, without a reset: another episode, which starts at the last one's final state."""
-        self._settle()
+        self._write_pending()
         if self.resets_itself:
             self.reset(state, ResetFacts(None, None, "", "{}", time.time_ns()))
             return
@@ -273,7 +271,7 @@ class SingleRecorder:
     def go_on_from(self, before: SingleRecorder, state: Any) -> None:
         """Takes over from the recorder of the file before, between episodes, with the environment at `state`: a step
         without a reset begins an episode there."""
-        before._settle()
+        before._write_pending()
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = {0}
         if self.resets_itself and before._episode is None:

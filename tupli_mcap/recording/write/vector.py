@@ -45,11 +45,10 @@ class VectorRecorder:
         autoreset: Autoreset,
         infos: InfoRecorder | None,
         *,
-        leaves_to_rows: bool = False,
+        derives_episodes: bool = False,
     ) -> None:
-        # plain episodes
-        self.leaves_to_rows = leaves_to_rows and autoreset.mode == "NextStep" and not autoreset.is_assumed
-        self._told = False  # rows tell of all episodes
+        self.derives_episodes = derives_episodes and autoreset.mode == "NextStep" and not autoreset.is_assumed
+        self._derives = False  # no start or end is logged now
         self._writer = writer
         self._spaces = spaces
         self._n = num_envs
@@ -94,7 +93,7 @@ class VectorRecorder:
         """
         if self._writer.closed:
             raise self._writer.why_stopped()
-        self._settle()
+        self._write_pending()
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
         ended = self._ended.copy()
         self._end([(int(i), INTERRUPTED) for i in chosen])
@@ -175,7 +174,7 @@ class VectorRecorder:
         self, rewards: Array, ended: Array, active: Array | None, infos: Any, *, any_done: bool
     ) -> None:
         """What the batch just written leaves for the next one to know."""
-        if not self._told:
+        if not self._derives:
             totals = (
                 rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1, dtype=np.float64)
             )
@@ -189,8 +188,8 @@ class VectorRecorder:
             return
         self._lengths += active
         self._any_ended = any_done and bool(np.count_nonzero(ended))
-        if self._told:
-            self._begin_told(~active, infos)
+        if self._derives:
+            self._begin_derived(~active, infos)
         else:
             self._note_resets(~active, infos)
 
@@ -238,7 +237,7 @@ class VectorRecorder:
 
     def finish(self, terminals: Any, infos: Mapping[str, Any]) -> None:
         """Ends the episodes that ended in the batch just put; `infos` are that batch's."""
-        if not self._any_ended or self._told:
+        if not self._any_ended or self._derives:
             return
         same_step = self._autoreset.mode == "SameStep"
         ended = self._ended.nonzero()[0].tolist()
@@ -314,8 +313,8 @@ class VectorRecorder:
                 self._encode_final(state) != self._encode_final(after[i]) for i, state in found.items()
             )
             if resets.resets_already(changed=changed):
-                self.leaves_to_rows = False
-                self._settle()
+                self.derives_episodes = False
+                self._write_pending()
         if resets.mode != "SameStep":
             resets.note_ends(known=True)
             return {}
@@ -360,43 +359,43 @@ class VectorRecorder:
         self._totals[waiting] = 0.0
         self._waiting.difference_update(waiting)
         self._fresh = bool(self._waiting)
-        self._leave_to_rows()
+        self._start_deriving()
 
-    # ---- episodes told by rows
+    # ---- episodes derived from rows
 
-    def _leave_to_rows(self) -> None:
-        """From here on rows tell of all episodes, if they can; where none is running, the next row is a hole."""
+    def _start_deriving(self) -> None:
+        """From here on episodes are derived, if that is possible; where none is running, the next row is a hole."""
         store, events = self._writer.vector, self._writer.events
-        if not self.leaves_to_rows or events is None or self._writer.images or self._told:
+        if not self.derives_episodes or events is None or self._writer.images or self._derives:
             return
-        if not isinstance(store, VectorRows) or not store.can_tell or self._lengths.any():
+        if not isinstance(store, VectorRows) or not store.can_derive or self._lengths.any():
             return
-        store.tell(events, self._episodes)
+        store.start_deriving(events, self._episodes)
         self._episodes = [None] * self._n
         self._waiting.clear()
-        self._told, self._fresh = True, False
+        self._derives, self._fresh = True, False
 
-    def _begin_told(self, holes: Array, infos: Mapping[str, Any]) -> None:
+    def _begin_derived(self, holes: Array, infos: Mapping[str, Any]) -> None:
         """The episodes that begin with the batch just put, which was a reset to these sub-environments."""
         begun, writer = holes.nonzero()[0], self._writer
         first, writer.next_episode = writer.next_episode, writer.next_episode + len(begun)
         self._episode_numbers[begun] = np.arange(first, writer.next_episode)
         self._lengths[begun] = 0
         if infos and any(info_of(infos, i, self._n) for i in begun.tolist()):
-            self.leaves_to_rows = False
-            self._settle()
+            self.derives_episodes = False
+            self._write_pending()
             self._note_resets(holes, infos)
 
-    def _settle(self) -> None:
-        """Writes what was left for later, so that everything is as if it had been written at once."""
+    def _write_pending(self) -> None:
+        """Writes the ends and starts that were put off, so that all is as if each had been written when it happened."""
         late, self._late = self._late, []
         self._end(late)
         store, events = self._writer.vector, self._writer.events
-        if not self._told or not isinstance(store, VectorRows) or events is None:
+        if not self._derives or not isinstance(store, VectorRows) or events is None:
             return
-        self._told = False
+        self._derives = False
         now = time.time_ns()
-        for i, (number, total) in enumerate(zip(*store.settle(self._ended), strict=True)):
+        for i, (number, total) in enumerate(zip(*store.stop_deriving(self._ended), strict=True)):
             if number >= 0:
                 self._episodes[i], self._totals[i] = events.take_back(number), total
                 continue
@@ -462,14 +461,14 @@ class VectorRecorder:
     @property
     def is_running(self) -> bool:
         """True if a sub-environment is within an episode."""
-        if self._told:
+        if self._derives:
             return bool((self._lengths > 0).any() and not self._ended.all())
         return any(episode is not None for episode in self._episodes)
 
     def go_on_from(self, before: VectorRecorder, states: Any) -> None:
         """Takes over from the recorder of the file before, between episodes, with the sub-environments at `states`."""
-        before._settle()
-        self.leaves_to_rows = before.leaves_to_rows
+        before._write_pending()
+        self.derives_episodes = before.derives_episodes
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = set(range(self._n))
         self._facts, self._earlier = before._facts, before._earlier
@@ -484,14 +483,14 @@ class VectorRecorder:
         self._final_rows.clear()
         self._writer.lost_streams.update(range(self._n))
         if not self._writer.closed:
-            self._settle()
+            self._write_pending()
             self._end([(i, INTERRUPTED) for i in range(self._n) if self._lengths[i]])
 
     def close(self) -> None:
         """Ends the running episodes as interrupted and closes the recording."""
         if self._writer.closed:
             return
-        self._settle()
+        self._write_pending()
         self._end([(i, INTERRUPTED) for i in range(self._n)])
         self._refused = True
         self._writer.close()

@@ -63,7 +63,7 @@ class StepStore(Protocol):
 
     Attributes:
         count: rows of the channel so far, those of earlier sessions included.
-        total: the running episode's return so far; 0 while rows tell of it.
+        total: the running episode's return so far.
     """
 
     @property

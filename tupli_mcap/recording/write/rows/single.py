@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.journal.derive import EpisodeRows, StartedEpisode
+from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import Sink
 from tupli_mcap.journal.rows import RowDeriver, even_rows
@@ -62,14 +62,13 @@ class SingleRows:
             layout, buffer, channel, first, images, self._switch, self._seal if sealed else None
         )
         self.put = encoder.put
-        self.put_plain = encoder.put_plain  # while rows tell
         self.put_state = encoder.put_state
         self.put_next = encoder.put_next
         self._offset = encoder.offset
-        # what rows tell of their episodes goes there; None while they tell nothing
+        # where derived episodes go; None while none are derived
         self._events: EpisodeLog | None = None
-        self._told = 0  # rows of the running half that have told it
-        self._episodes = EpisodeRows(1, encoder.state_end)
+        self._derived = 0  # rows of the running half that episodes were derived from
+        self._episodes = EpisodeDeriver(1, encoder.state_end)
         self._state_end = encoder.state_end
         self._go_to(0)
         self.begin_episode(0)
@@ -81,66 +80,66 @@ class SingleRows:
 
     @property
     def total(self) -> Any:
-        """The running episode's return so far; 0 while rows tell of it."""
+        """The running episode's return so far."""
         return self._encoder.total()
 
     def begin_episode(self, episode: int) -> None:
         """The rows that follow belong to `episode`."""
         start, prefix = self._offset(), self._prefix(episode)
-        self._encoder.begin(prefix, 0.0)
+        self._encoder.begin(prefix)
         self._buffer[start : start + len(prefix)] = prefix
 
     def _prefix(self, episode: int) -> bytes:
         return self._header + EPISODE_AND_STEP.pack(episode, 0)
 
-    # ---- episodes told by rows
+    # ---- episodes derived from rows
 
     @property
-    def can_tell(self) -> bool:
+    def can_derive(self) -> bool:
         """True if rows hold all that an episode is."""
         layout = self._layout
         return not self._sealed and layout.reward_space is None and self._state_end > STATE
 
     @property
-    def tells(self) -> bool:
-        """True while rows tell of their episodes."""
+    def derives(self) -> bool:
+        """True while episodes are derived."""
         return self._events is not None
 
-    def tell(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
-        """The rows from here on will tell `events` of their episodes, and of the final state of the one that has
-        ended just now."""
+    def start_deriving(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
+        """From here on episodes are derived and go to `events`, with the final state of the one that has just ended."""
         self._events = events
-        self._told = (self._offset() - self._half * self._area.half) // self._area.row_size
+        self._derived = (self._offset() - self._half * self._area.half) // self._area.row_size
         self._episodes.begin([None])
         self._episodes.wait_for(ended, time.time_ns())
-        events.leave_to_rows(started)
+        events.expect_end(started)
 
-    def settle(self, *, over: bool) -> StartedEpisode | None:
-        """Rows tell what they have to tell, and from here on nothing; returns the running episode, if it has a row.
+    def stop_deriving(self, *, over: bool) -> StartedEpisode | None:
+        """Derives what is pending, and from here on nothing.
 
-        `over`: the last row has ended its episode, and the running one has its final state.
+        Args:
+            over: the last row has ended its episode, and the running one has its final state.
+
+        Returns:
+            The running episode; None before its first step.
         """
         events = self._events
         if events is None:
             return None
         half = self._half * self._area.half
         row = (self._offset() - half) // self._area.row_size
-        self._tell(half, row, {0: self.pending_state()} if over else None)
+        self._derive(half, row, {0: self.pending_state()} if over else None)
         self._events = None
         number = int(self._episodes.running[0])
-        if number < 0:
-            return None
-        self._encoder.begin(self._prefix(number), self._episodes.totals.item(0))  # `put_plain` did not count
-        return events.take_back(number)
+        return None if number < 0 else events.take_back(number)
 
-    def _tell(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
-        """What the rows of a half before `end` tell, and have not told yet."""
+    def _derive(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
+        """Derives episodes from the rows of a half before `end`, as far as that is not done yet."""
         if self._events is None:
             return
-        size, told = self._area.row_size, self._told
-        self._told = end
-        rows = np.frombuffer(self._buffer[half + told * size : half + end * size], self._dtype)
-        self._events.extend(self._episodes.take(rows[None], pending))
+        size, begin = self._area.row_size, self._derived
+        self._derived = end
+        rows = np.frombuffer(self._buffer[half + begin * size : half + end * size], self._dtype)
+        self._events.extend(self._episodes.derive(rows[None], pending))
 
     def pending_state(self) -> bytes:
         """The CDR bytes of the running row's state, as they follow `episode` and `env` in `/final_state`."""
@@ -155,7 +154,7 @@ class SingleRows:
         """The half is full: go on in the other one, then write this one as a chunk."""
         area, half = self._area, self._half
         # before the other half's last row goes, whose hole may be here
-        self._tell(half * area.half, area.rows)
+        self._derive(half * area.half, area.rows)
         spare = half * area.half + area.rows * area.row_size
         self._half = 1 - half
         # a power loss may leave a part of what is written over these rows, and not the chunk they are in
@@ -164,7 +163,7 @@ class SingleRows:
         self._buffer[start : start + self._state_end] = self._buffer[spare : spare + self._state_end]
         flushed, self._flushed = self._flushed, 0
         self._go_to(self._half)
-        self._told = 0
+        self._derived = 0
         self._emit(half * area.half, flushed, area.rows)
 
     def _go_to(self, half: int) -> None:
@@ -178,7 +177,7 @@ class SingleRows:
         start = self._half * self._area.half
         rows = (self._offset() - start) // self._area.row_size
         flushed, self._flushed = self._flushed, rows
-        self._tell(start, rows)
+        self._derive(start, rows)
         self._emit(start, flushed, rows)
 
     def _emit(self, start: int, begin: int, end: int) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
-from tupli_mcap.journal.derive import EpisodeRows, StartedEpisode
+from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.container import Rows
@@ -84,10 +84,10 @@ class VectorRows:
         self._write_chunks: Callable[[], None] | None = None  # of the half that is not running
         self._make_views()
         self._fill_heads()
-        # what rows tell of their episodes goes there; None while they tell nothing
+        # where derived episodes go; None while none are derived
         self._events: EpisodeLog | None = None
-        self._told = 0  # rows of the running half that have told it
-        self._episodes = EpisodeRows(n, layout.state_end)
+        self._derived = 0  # rows of the running half that episodes were derived from
+        self._episodes = EpisodeDeriver(n, layout.state_end)
         self._state = [self._writer(leaf, 1) for leaf in layout.state if not leaf.apart]
         others = [*((leaf, _ACTION) for leaf in layout.action), *((leaf, _REWARD) for leaf in layout.reward)]
         self._fields = [
@@ -211,37 +211,40 @@ class VectorRows:
         if self._row == self._area.rows:
             self._switch()
 
-    # ---- episodes told by rows
+    # ---- episodes derived from rows
 
     @property
-    def can_tell(self) -> bool:
+    def can_derive(self) -> bool:
         """True if rows hold all that an episode is."""
         return not self._sealed and self._layout.reward_space is None and self._state_end > STATE
 
-    def tell(self, events: EpisodeLog, running: Sequence[StartedEpisode | None]) -> None:
-        """The rows from here on will tell `events` of their episodes. `running` are those that have been started, by
+    def start_deriving(self, events: EpisodeLog, running: Sequence[StartedEpisode | None]) -> None:
+        """From here on episodes are derived, and go to `events`. `running` are those that have been started, by
         sub-environment, and have no row yet."""
-        self._events, self._told = events, self._row
+        self._events, self._derived = events, self._row
         self._episodes.begin(running)
         for started in running:
             if started is not None:
-                events.leave_to_rows(started)
+                events.expect_end(started)
 
-    def settle(self, over: Array) -> tuple[list[int], list[float]]:
-        """Rows tell what they have to tell, and from here on nothing; returns the numbers of the running episodes (-1:
-        none), and their returns so far.
+    def stop_deriving(self, over: Array) -> tuple[list[int], list[float]]:
+        """Derives what is pending, and from here on nothing.
 
-        `over`: where the last row has ended its episode, and the running one has its final state.
+        Args:
+            over: where the last row has ended its episode, and the running one has its final state: bool (num_envs,).
+
+        Returns:
+            The numbers of the running episodes (-1: none), and their returns so far.
         """
-        self._tell(self._half, self._row, {i: self.pending_state(i) for i in np.flatnonzero(over).tolist()})
+        self._derive(self._half, self._row, {i: self.pending_state(i) for i in np.flatnonzero(over).tolist()})
         self._events = None
         return self._episodes.running.tolist(), self._episodes.totals.tolist()
 
-    def _tell(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
-        """What the rows of a half before `end` tell, and have not told yet."""
+    def _derive(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
+        """Derives episodes from the rows of a half before `end`, as far as that is not done yet."""
         if self._events is not None:
-            told, self._told = self._told, end
-            self._events.extend(self._episodes.take(self._rows[half, :, told:end], pending))
+            begin, self._derived = self._derived, end
+            self._events.extend(self._episodes.derive(self._rows[half, :, begin:end], pending))
 
     def pending_state(self, i: int) -> bytes:
         """As `BatchStore.pending_state`."""
@@ -259,12 +262,12 @@ class VectorRows:
     def _switch(self) -> None:
         self._finish_chunks()  # a half is used again only when its chunks are in the file
         half, rows, flushed = self._half, self._area.rows, self._flushed
-        self._tell(half, rows)  # see SingleRows
+        self._derive(half, rows)  # see SingleRows
         self._half = 1 - half
         self._sequence[self._half] = HOLE  # see SingleRows
         end = self._state_end
         self._state_bytes[self._half, :, 0, BODY:end] = self._state_bytes[half, :, rows, BODY:end]
-        self._row = self._flushed = self._told = 0
+        self._row = self._flushed = self._derived = 0
         self._write_chunks = self._start_chunks(self._chunks(half, flushed, rows))
         if self._durable:
             self._finish_chunks()
@@ -273,7 +276,7 @@ class VectorRows:
         """Writes the rows that are not in the file yet."""
         self._finish_chunks()
         flushed, self._flushed = self._flushed, self._row
-        self._tell(self._half, self._row)
+        self._derive(self._half, self._row)
         self._write_chunks = self._start_chunks(self._chunks(self._half, flushed, self._row))
         self._finish_chunks()
 
