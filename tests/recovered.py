@@ -22,7 +22,8 @@ def differences(path: Path, directory: Path, *, killed: bool = False) -> list[st
     """What recovery in memory and `recover_recording` find differently in a recording.
 
     Where something is good behind damage or behind missing rows, `recover_recording` finds more: then only the steps
-    are compared that both must have. That cannot be after a kill.
+    are compared that both must have. After a kill there is nothing of the kind: both find the same. (Damage may still
+    be in several places: a chunk that was being written uncompressed holds records that can be told.)
     """
     target = directory / "recovered once.mcap"
     with warnings.catch_warnings():
@@ -36,11 +37,11 @@ def differences(path: Path, directory: Path, *, killed: bool = False) -> list[st
         if report.target is None:
             return [] if recording.num_steps == 0 else [f"{recording.num_steps} steps are not recovered"]
         more = bool(report.cut or report.lost or report.steps_lost or _is_behind_a_gap(path, recording))
-        more = more or any(place.offset + place.size < path.stat().st_size for place in report.damaged)
         if killed and more:
             return [f"after a kill: {report}"]
+        more = more or any(place.offset + place.size < path.stat().st_size for place in report.damaged)
         with Recording(target) as recovered:
-            if more:
+            if more and not killed:
                 return _of_steps(recording, recovered)
             return compared(recording, recovered)
 
