@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tupli_mcap.errors import FilterError, FormatError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain

@@ -17,8 +17,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils import EzPickle
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tupli_mcap import trust
 from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture

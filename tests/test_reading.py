@@ -15,8 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from environments import Sampler, roll, same
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.errors import FormatError

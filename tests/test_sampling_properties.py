@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tupli_mcap import F, TupliDataset
 from tupli_mcap.dataset.items import SamplingError

@@ -20,8 +20,7 @@ import numpy as np
 import pytest
 from environments import Sampler, Scripted, roll, same
 from gymnasium import spaces
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from test_readme import missing, run_python
 from test_sampling_properties import FEW, Library, dataset_of, libraries
 

@@ -12,8 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from sample_spaces import COMPOSITE_SPACES, FUNDAMENTAL_SPACES, SPACES, space_id
 
 from tupli_mcap import jsonvalue

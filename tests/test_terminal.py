@@ -32,8 +32,7 @@ from tupli_mcap import (
     rewrite_recording,
     trust,
 )
-from tupli_mcap.cli import app
-from tupli_mcap.cli import terminal as terminal_module
+from tupli_mcap.cli import app, terminal as terminal_module
 from tupli_mcap.cli.info import print_episodes
 from tupli_mcap.cli.output import print_json
 from tupli_mcap.cli.terminal import one_line, say_json, visible

@@ -22,8 +22,7 @@ import numpy as np
 import pytest
 from environments import same
 from gymnasium import spaces
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from test_readme import run_python
 from test_sampling import SPACES, record
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.spaces import GraphInstance
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap_ros2._dynamic import generate_dynamic
 from sample_spaces import NESTED_GRAPHS, SPACES, space_id

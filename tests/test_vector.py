@@ -19,8 +19,14 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 from mcap.reader import make_reader
 
-from tupli_mcap import RecordEpisodes as RecordSingle
-from tupli_mcap import Recording, RecordingError, SpaceError, StepError, verify_recording
+from tupli_mcap import (
+    RecordEpisodes as RecordSingle,
+    Recording,
+    RecordingError,
+    SpaceError,
+    StepError,
+    verify_recording,
+)
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes

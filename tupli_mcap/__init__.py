@@ -6,154 +6,108 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tupli_mcap.benchmark import TupliEnvWrapper
-    from tupli_mcap.dataset import TupliDataset, filter_recording
+    from tupli_mcap.benchmark import (
+        TupliEnvWrapper as TupliEnvWrapper,
+    )
+    from tupli_mcap.dataset import (
+        Dataset as Dataset,
+        TupliDataset as TupliDataset,
+        filter_recording as filter_recording,
+        open as open,
+    )
     from tupli_mcap.errors import (
-        FilterError,
-        FormatError,
-        MissingExtraError,
-        NotFoundError,
-        RecordingError,
-        SignatureError,
-        SpaceError,
-        StepError,
-        StorageError,
-        TupliError,
-        UntrustedError,
+        FilterError as FilterError,
+        FormatError as FormatError,
+        MissingExtraError as MissingExtraError,
+        NotFoundError as NotFoundError,
+        RecordingError as RecordingError,
+        SignatureError as SignatureError,
+        SpaceError as SpaceError,
+        StepError as StepError,
+        StorageError as StorageError,
+        TupliError as TupliError,
+        UntrustedError as UntrustedError,
     )
     from tupli_mcap.recording import (
-        EpisodeData,
-        Recording,
-        RecoveryReport,
-        Step,
-        VerifyReport,
-        journal_path,
-        merge_recordings,
-        recover_recording,
-        rewrite_recording,
-        split_recording,
-        verify_recording,
-        write_recording,
+        EpisodeData as EpisodeData,
+        Recording as Recording,
+        RecoveryReport as RecoveryReport,
+        Step as Step,
+        VerifyReport as VerifyReport,
+        journal_path as journal_path,
+        merge_recordings as merge_recordings,
+        recover_recording as recover_recording,
+        rewrite_recording as rewrite_recording,
+        split_recording as split_recording,
+        verify_recording as verify_recording,
+        write_recording as write_recording,
     )
     from tupli_mcap.schema import (
-        EpisodeMetadataCallback,
-        F,
-        FilterAND,
-        FilterEQ,
-        FilterGEQ,
-        FilterGT,
-        FilterIN,
-        FilterLEQ,
-        FilterLT,
-        FilterNE,
-        FilterOR,
-        RLTuple,
+        EpisodeMetadataCallback as EpisodeMetadataCallback,
+        F as F,
+        FilterAND as FilterAND,
+        FilterEQ as FilterEQ,
+        FilterGEQ as FilterGEQ,
+        FilterGT as FilterGT,
+        FilterIN as FilterIN,
+        FilterLEQ as FilterLEQ,
+        FilterLT as FilterLT,
+        FilterNE as FilterNE,
+        FilterOR as FilterOR,
+        RLTuple as RLTuple,
     )
-    from tupli_mcap.storage import FileStorage, TupliStorage
-    from tupli_mcap.wrappers import RecordEpisodes
+    from tupli_mcap.storage import (
+        FileStorage as FileStorage,
+        TupliStorage as TupliStorage,
+    )
+    from tupli_mcap.wrappers import (
+        RecordEpisodes as RecordEpisodes,
+    )
 
 # Where each public name lives; imported on first use, so that `import tupli_mcap` stays quick.
 _HOMES = {
-    "benchmark": ["TupliEnvWrapper"],
-    "dataset": ["TupliDataset", "filter_recording"],
-    "errors": [
-        "FilterError",
-        "FormatError",
-        "MissingExtraError",
-        "NotFoundError",
-        "RecordingError",
-        "SignatureError",
-        "SpaceError",
-        "StepError",
-        "StorageError",
-        "TupliError",
-        "UntrustedError",
-    ],
-    "recording": [
-        "EpisodeData",
-        "Recording",
-        "RecoveryReport",
-        "Step",
-        "journal_path",
-        "merge_recordings",
-        "recover_recording",
-        "split_recording",
-        "VerifyReport",
-        "rewrite_recording",
-        "verify_recording",
-        "write_recording",
-    ],
-    "schema": [
-        "EpisodeMetadataCallback",
-        "F",
-        "FilterAND",
-        "FilterEQ",
-        "FilterGEQ",
-        "FilterGT",
-        "FilterIN",
-        "FilterLEQ",
-        "FilterLT",
-        "FilterNE",
-        "FilterOR",
-        "RLTuple",
-    ],
-    "storage": ["FileStorage", "TupliStorage"],
-    "wrappers": ["RecordEpisodes"],
+    "benchmark": "TupliEnvWrapper",
+    "dataset": "Dataset TupliDataset filter_recording open",
+    "errors": (
+        "FilterError FormatError MissingExtraError NotFoundError RecordingError SignatureError "
+        "SpaceError StepError StorageError TupliError UntrustedError"
+    ),
+    "recording": (
+        "EpisodeData Recording RecoveryReport Step VerifyReport journal_path merge_recordings "
+        "recover_recording rewrite_recording split_recording verify_recording write_recording"
+    ),
+    "schema": (
+        "EpisodeMetadataCallback F FilterAND FilterEQ FilterGEQ FilterGT FilterIN FilterLEQ FilterLT "
+        "FilterNE FilterOR RLTuple"
+    ),
+    "storage": "FileStorage TupliStorage",
+    "wrappers": "RecordEpisodes",
 }
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
+_MODULES = (
+    "benchmark", "dataset", "doctor", "errors", "plots", "recording", "replay", "schema", "storage", "torch", "trust",
+    "vector", "viewer",
+)  # fmt: skip
 
-__all__ = [
-    "EpisodeData",
-    "EpisodeMetadataCallback",
-    "F",
-    "FileStorage",
-    "FilterAND",
-    "FilterEQ",
-    "FilterError",
-    "FilterGEQ",
-    "FilterGT",
-    "FilterIN",
-    "FilterLEQ",
-    "FilterLT",
-    "FilterNE",
-    "FilterOR",
-    "FormatError",
-    "MissingExtraError",
-    "NotFoundError",
-    "RLTuple",
-    "RecordEpisodes",
-    "Recording",
-    "RecordingError",
-    "RecoveryReport",
-    "SignatureError",
-    "SpaceError",
-    "Step",
-    "StepError",
-    "StorageError",
-    "TupliDataset",
-    "TupliEnvWrapper",
-    "TupliError",
-    "TupliStorage",
-    "UntrustedError",
-    "VerifyReport",
-    "filter_recording",
-    "journal_path",
-    "merge_recordings",
-    "recover_recording",
-    "rewrite_recording",
-    "split_recording",
-    "verify_recording",
-    "write_recording",
-]
+__all__ = sorted(_HOME_OF)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    if name in _MODULES:
+        return importlib.import_module(f"{__name__}.{name}")
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value: Any = version("tupli-mcap")
+    elif name in _HOME_OF:
+        value = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    else:
+        from tupli_mcap.errors import did_you_mean
+
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{did_you_mean(name, _HOME_OF)}")
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, *_MODULES, "__version__"]

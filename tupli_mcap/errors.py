@@ -6,8 +6,9 @@ Every message is one sentence: what was expected, what was found, where, and wha
 from __future__ import annotations
 
 import contextlib
+import difflib
 import errno
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -95,6 +96,12 @@ class SignatureError(TupliError):
 
 class MissingExtraError(TupliError, ImportError):
     """An optional dependency is not installed; the message names the extra to install."""
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """`; did you mean 'return'?` where one of the known names is like this one, else nothing."""
+    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def missing_extra(what: str, extra: str) -> MissingExtraError:

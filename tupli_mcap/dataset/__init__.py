@@ -23,12 +23,14 @@ if TYPE_CHECKING:
     )
     from tupli_mcap.dataset.curate import FilterReport, filter_recording
     from tupli_mcap.dataset.dataset import TupliDataset
+    from tupli_mcap.dataset.front import Dataset, open
     from tupli_mcap.dataset.saved import SavedColumns, open_columns
     from tupli_mcap.dataset.sources import DatasetError
 
 # Imported on first use: who only reads items, as a worker of a DataLoader does, needs no storage.
 _HOMES = {
     "BaseTupleParser": "convert",
+    "Dataset": "front",
     "DatasetError": "sources",
     "FilterReport": "curate",
     "NumpyTupleParser": "convert",
@@ -37,11 +39,13 @@ _HOMES = {
     "TorchTupleParser": "convert",
     "TupliDataset": "dataset",
     "filter_recording": "curate",
+    "open": "front",
     "open_columns": "saved",
 }
 
 __all__ = [
     "BaseTupleParser",
+    "Dataset",
     "DatasetError",
     "FilterReport",
     "NumpyTupleParser",
@@ -50,6 +54,7 @@ __all__ = [
     "TorchTupleParser",
     "TupliDataset",
     "filter_recording",
+    "open",
     "open_columns",
 ]
 

@@ -11,8 +11,8 @@ import numpy as np
 from tupli_mcap.dataset.items import DeltaWindows, Pad, SamplingError, Steps, Transitions, Unit, Windows
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.dataset.items.windows import FIVE
-from tupli_mcap.errors import FilterError
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate, split_key
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate
+from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
 
 __all__ = ["RandomAccess", "episode_values"]
@@ -112,10 +112,7 @@ def episode_values(headers: Sequence[EpisodeHeader], expression: F | BaseFilter)
         return np.array([float(matches(header)) for header in headers])
     if not isinstance(expression, F):
         raise SamplingError(f"expected an expression, such as F('metadata.score'), found {expression!r:.80}")
-    path = split_key(expression.key)
-    if path[0] not in EpisodeHeader.model_fields:
-        known = ", ".join(sorted(EpisodeHeader.model_fields))
-        raise FilterError(f"unknown key {expression.key!r}; the keys are {known}")
+    path = path_in(expression.key, EpisodeHeader)
     return np.array([_number(look_up(header, path), header, expression) for header in headers])
 
 

@@ -1,17 +1,22 @@
-"""A recording of the episodes that a filter is true of."""
+"""A recording of some episodes: those that a filter is true of, or those of a dataset."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.recording import Recording, rewrite_recording
+from tupli_mcap.recording import Recording, merge_recordings, rewrite_recording
 from tupli_mcap.schema import BaseFilter, parse_filter
 
-__all__ = ["FilterReport", "filter_recording"]
+if TYPE_CHECKING:
+    from tupli_mcap.dataset.front import Dataset
+
+__all__ = ["FilterReport", "filter_recording", "save"]
 
 
 class FilterReport(NamedTuple):
@@ -60,3 +65,26 @@ def filter_recording(
             return report
         rewrite_recording(recording, target, episodes=rows["episode"].tolist(), compression=compression)
     return report._replace(size=target.stat().st_size)
+
+
+def save(dataset: Dataset, target: Path, *, overwrite: bool) -> Path:
+    """See `Dataset.save`."""
+    chosen: dict[str, list[int]] = {}
+    for header in dataset._headers:
+        chosen.setdefault(header.recording, []).append(header.episode)
+    if not chosen:
+        raise DatasetError("expected episodes to save, found none")
+    if target.exists() and not overwrite:
+        raise DatasetError(f"{target} exists; choose another path, or overwrite it")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if len(chosen) == 1:
+        ((name, numbers),) = chosen.items()
+        rewrite_recording(dataset._recordings.get(name), target, episodes=sorted(numbers))
+        return target
+    with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
+        parts = []
+        for i, (name, numbers) in enumerate(chosen.items()):
+            parts.append(Path(folder) / f"{i}.mcap")
+            rewrite_recording(dataset._recordings.get(name), parts[-1], episodes=sorted(numbers))
+        merge_recordings(parts, target, overwrite=overwrite)
+    return target

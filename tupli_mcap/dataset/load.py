@@ -21,6 +21,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
+from tupli_mcap.recording.columns.fields import FIELDS
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
 
 __all__ = [
@@ -32,7 +33,7 @@ __all__ = [
 ]
 
 _BLOCK_BYTES = 64 << 20
-_RECORDED = ("states", "actions", "rewards", "terminals", "timeouts", "next_states")
+_RECORDED = tuple(field for field in FIELDS if field != "infos")
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,12 @@ def _empty_column(field: str) -> Any:
     """The column of no episodes at all, whose spaces nobody knows."""
     if field == "infos":
         return []
-    dtypes: dict[str, Any] = {"terminals": np.bool_, "timeouts": np.bool_, "steps": np.int64}
+    dtypes: dict[str, Any] = {
+        "terminals": np.bool_,
+        "timeouts": np.bool_,
+        "steps": np.int64,
+        "times": np.int64,
+    }
     return np.empty(0, dtypes.get(field, np.float64))
 
 

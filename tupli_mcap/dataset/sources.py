@@ -6,7 +6,9 @@ import contextlib
 import glob
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -29,9 +31,10 @@ from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.sidecar import Notes
 
-__all__ = ["DatasetError", "FilesSource", "Source", "StorageSource", "episode_headers"]
+__all__ = ["DatasetError", "FilesSource", "OpenRecordings", "Source", "StorageSource", "episode_headers"]
 
 _ENDS = ("terminal", "timeout", "interrupted")
+_MOST_OPEN = 64
 _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two blocks share it
 
 
@@ -259,3 +262,24 @@ def _benchmark_header(recording: Recording) -> BenchmarkHeader:
         metadata=metadata,
         environment=environment,
     )
+
+
+class OpenRecordings:
+    """Opens recordings by name. An `Episode` keeps its recording open for as long as it lives. Not thread-safe."""
+
+    def __init__(self, open_recording: Callable[[str], Recording]) -> None:
+        self._open = open_recording
+        self._kept: OrderedDict[str, Recording] = OrderedDict()
+
+    def get(self, name: str) -> Recording:
+        """The recording; RecordingError if it cannot be opened."""
+        if name not in self._kept:
+            self._kept[name] = self._open(name)
+            if len(self._kept) > _MOST_OPEN:
+                self._kept.popitem(last=False)  # closed when nobody holds an episode of it
+        self._kept.move_to_end(name)
+        return self._kept[name]
+
+    def lent(self, name: str) -> AbstractContextManager[Recording]:
+        """The same, for a `with` block that must not close it."""
+        return nullcontext(self.get(name))

@@ -11,6 +11,7 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
+from tupli_mcap.recording.columns.fields import GymnasiumNames
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.columns.read import Columns
@@ -31,7 +32,7 @@ class Step(NamedTuple):
     info: dict[str, Any] | None = None
 
 
-class Episode:
+class Episode(GymnasiumNames):
     """One episode of a recording. Columns are arrays (lists for leaves of variable size), nested as the space is.
 
     Arrays are decoded on access, from the chunks the episode lies in, and kept; they are the caller's own.
@@ -53,6 +54,16 @@ class Episode:
                 f"expected consecutive steps, found a stride of {stride}; slice the columns instead"
             )
         return self._recording.read_steps(self._position, start, max(start, stop))
+
+    @property
+    def id(self) -> str:
+        """The recording's UUID and the episode's number: the same in every storage that holds it."""
+        return f"{self._recording.uuid}-{self.number}"
+
+    @property
+    def recording(self) -> Recording:
+        """The recording it is in."""
+        return self._recording
 
     @property
     def number(self) -> int:

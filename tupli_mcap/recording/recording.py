@@ -23,7 +23,8 @@ from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.columns.read import FIELDS, ColumnReader, Columns, StoredSteps
+from tupli_mcap.recording.columns.fields import FIVE, field_names
+from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
 from tupli_mcap.recording.columns.runs import Runs, runs_of
 from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.episode import Episodes
@@ -451,14 +452,14 @@ class Recording:
 
         Args:
             episodes: positions in `self.episodes`, or a bool for each of them.
-            fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states", "times"; the first
-                five by default.
+            fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states", "times" and "infos";
+                the first five by default. Gymnasium's names (observations, terminations, …) mean the same.
             threads: how many threads decompress; by default as many as there are cores, at most 4.
             images: False reads no image of a state: the columns of image leaves are empty. Not for `next_states`.
 
         Where an episode's final state is not known, `next_states` repeats its last state.
         """
-        fields = FIELDS[:5] if fields is None else [fields] if isinstance(fields, str) else list(fields)
+        fields = FIVE if fields is None else field_names(fields)
         if not images and "next_states" in fields:
             raise RecordingError("expected images=True for next_states, found False; read states instead")
         rows = self.index
@@ -471,7 +472,7 @@ class Recording:
             return columns
         threads = threads or _THREADS
         keep = episodes is not None
-        needed = [field for field in fields if field != "next_states"]
+        needed = [field for field in fields if field not in ("next_states", "infos")]
         if "next_states" in fields and "states" not in needed:
             needed.append("states")
         with memory_for(lambda: f"{self.name}: reading {', '.join(fields)} of {total} steps"):
@@ -482,7 +483,19 @@ class Recording:
         for field in fields:
             if field in found:
                 setattr(columns, field, found[field])
+        if "infos" in fields:
+            positions = np.arange(len(self.index)) if episodes is None else self._positions(episodes)
+            columns.infos = [info for i in positions.tolist() for info in self._infos_of(i)]
         return columns
+
+    def _infos_of(self, i: int) -> list[dict[str, Any]]:
+        """A dict a step of episode `i`; empty where no info was recorded."""
+        infos = self.infos(i)
+        return (
+            [{} for _ in range(int(self.index["length"][i]))]
+            if infos is None
+            else [info or {} for info in infos]
+        )
 
     def _positions(self, episodes: Any) -> Any:
         """Positions in the index, from positions or a mask; RecordingError if they are something else."""
@@ -503,7 +516,7 @@ class Recording:
         return chosen.astype(np.int64)
 
     def read_steps(
-        self, i: int, start: int, stop: int, fields: Sequence[str] = FIELDS[:5], *, images: bool = True
+        self, i: int, start: int, stop: int, fields: Sequence[str] = FIVE, *, images: bool = True
     ) -> Columns:
         """Columns of the steps `start:stop` of episode `i`; the chunks they lie in stay in the cache."""
         row = self.index[i]

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
-from tupli_mcap.errors import FilterError
+from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.schema.filters import (
     COMBINING,
     ORDERING,
@@ -22,16 +22,16 @@ from tupli_mcap.schema.filters import (
     FilterNOT,
     FilterOR,
     FilterType,
-    path_of,
 )
+from tupli_mcap.schema.keys import join_key, split_key
 from tupli_mcap.schema.models import EpisodeHeader
 from tupli_mcap.schema.times import EXPECTED, TimeSpan, span_of
 from tupli_mcap.schema.values import Scalar, classify
 
-__all__ = ["TIME_KEY", "bound", "check_key", "check_keys", "comparisons", "filter_keys"]
+__all__ = ["TIME_KEY", "bound", "check_keys", "comparisons", "filter_keys", "path_in"]
 
 TIME_KEY: Final = "created_at"
-_ENDED: Final = "ended"  # what `created_at` of an episode is, and how tables call it
+_MEANT: Final[Mapping[str, str]] = {"ended": TIME_KEY, "return": "episode_return", "steps": "n_tuples"}
 _ENDS: Final = ("terminal", "timeout", "interrupted", "")
 _KINDS: Final[Mapping[Any, str]] = {
     str: "text",
@@ -50,16 +50,31 @@ _WORDS: Final = {
 
 
 def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
-    """The top-level keys that a filter over items of a model (or with these fields) may name, sorted."""
+    """The top-level keys that a filter over items of a model (or with these fields) may name, sorted.
+
+    An episode's `created_at`, `episode_return` and `n_tuples` go by `ended`, `return` and `steps`; both are understood.
+    """
     if not isinstance(fields, type):
         return sorted(fields)
-    return sorted([*fields.model_fields, *([_ENDED] if issubclass(fields, EpisodeHeader) else [])])
+    if not issubclass(fields, EpisodeHeader):
+        return sorted(fields.model_fields)
+    return sorted({*fields.model_fields, *_MEANT} - {*_MEANT.values()})
 
 
-def check_key(key: str, path: tuple[str, ...], known: Iterable[str]) -> None:
-    """Raises FilterError unless the top-level key of a path is known."""
-    if path[0] not in known:
-        raise FilterError(f"unknown filter key {key!r}; the keys are {', '.join(known)}")
+def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...]:
+    """The path of a key in items of a model, or with these fields.
+
+    Raises:
+        FilterError: there is no such top-level key.
+    """
+    name, *inside = split_key(key)
+    if isinstance(fields, type) and issubclass(fields, EpisodeHeader):
+        name = _MEANT.get(name, name)
+    if name not in (fields.model_fields if isinstance(fields, type) else fields):
+        known = filter_keys(fields)
+        similar = did_you_mean(name, [*known, *_MEANT.values()])
+        raise FilterError(f"unknown filter key {key!r}{similar}; the keys are {', '.join(known)}")
+    return (name, *inside)
 
 
 def check_keys(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> None:
@@ -78,9 +93,8 @@ def bound(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> BaseFi
         raise FilterError(
             f"expected a filter, such as FilterEQ(key=..., value=...) or F(...) > 3, found {filter!r:.80}"
         )
-    known = filter_keys(fields)
     for comparison in comparisons(filter):
-        check_key(comparison.key or "", path_of(comparison), known)
+        path_in(comparison.key or "", fields)
     if not isinstance(fields, type):
         return filter
     return _bound(filter, fields, datetime.datetime.now(datetime.UTC))
@@ -98,15 +112,15 @@ def _bound(filter: BaseFilter, model: type[BaseModel], now: datetime.datetime) -
     if filter.type in COMBINING:
         parts = tuple(_bound(part, model, now) for part in filter.filters)
         return filter.model_copy(update={"filters": parts})
-    name, *inside = path_of(filter)
-    if name in (TIME_KEY, _ENDED) and not inside:
+    name, *inside = path = path_in(filter.key or "", model)
+    if name == TIME_KEY and not inside:
         return _in_time(filter, now)
-    kinds = _kinds_of(model, TIME_KEY if name == _ENDED else name)
+    kinds = _kinds_of(model, name)
     if inside and kinds:
         raise FilterError(f"filter key {filter.key!r}: {name} is {_one_of(kinds)} and has no parts")
     if not inside:
         _check_values(filter, name, kinds)
-    return filter
+    return filter.model_copy(update={"key": join_key(path)})
 
 
 def _check_values(filter: BaseFilter, name: str, kinds: frozenset[str]) -> None:

@@ -5,10 +5,11 @@
     negation    = "not" negation | "(" filter ")" | comparison
     comparison  = key ( "=" | "==" | "!=" | ">" | ">=" | "<" | "<=" ) value
                 | key [ "not" ] "in" "[" [ value { "," value } ] "]"
+                | key
     value       = number | "text" | 'text' | true | false | null | nan | inf | -inf
 
-Words are case-insensitive (`none` is `null`), keys are not; a name in a key that is no word is quoted:
-`metadata."a b"`.
+A key alone stands for `key = true`. Words are case-insensitive (`none` is `null`), keys are not; a name in a key that
+is no word is quoted: `metadata."a b"`.
 
 The order of and, or, not and parentheses is Python's, so Python's parser finds it. It sees a key as `k`, a value as `0`
 and a sign as `<`, nothing else of the text, and nothing is evaluated.
@@ -77,7 +78,7 @@ _SINGLE_ESCAPE: Final = re.compile(r"\\(.)", re.DOTALL)
 _A_VALUE: Final = 'a value (a number, "text", true, false or null)'
 _EXPECTED: Final[Mapping[str, str]] = {
     "key": "a key such as metadata.score",
-    "sign": f"one of {' '.join(_COMPARISON)} in",
+    "sign": f"one of {' '.join(_COMPARISON)} in, and, or, or the end",
     "in": "'in'",
     "list": "'['",
     "item": _A_VALUE,
@@ -87,7 +88,15 @@ _EXPECTED: Final[Mapping[str, str]] = {
 }
 _NEXT: Final[Mapping[str, Mapping[str, str]]] = {
     "key": {"not": "key", "(": "key", "key": "sign"},
-    "sign": {"sign": "value", "in": "list", "not": "in"},
+    "sign": {
+        "sign": "value",
+        "in": "list",
+        "not": "in",
+        "and": "key",
+        "or": "key",
+        ")": "more",
+        "end": "more",
+    },
     "in": {"in": "list"},
     "list": {"[": "item"},
     "item": {"value": "comma", "]": "more"},
@@ -185,10 +194,13 @@ def _filter(node: ast.expr, tokens: Sequence[_Token]) -> BaseFilter:
         return FilterAND(filters=parts) if isinstance(node.op, ast.And) else FilterOR(filters=parts)
     if isinstance(node, ast.UnaryOp):
         return FilterNOT(filters=[_filter(node.operand, tokens)])
-    assert isinstance(node, ast.Compare)
-    first = node.left.col_offset // _WIDTH
-    key, sign, right = tokens[first], tokens[first + 1], node.comparators[0]
+    compared = node.left if isinstance(node, ast.Compare) else node
+    first = compared.col_offset // _WIDTH
+    key, sign = tokens[first], tokens[first + 1]
     try:
+        if not isinstance(node, ast.Compare):
+            return FilterEQ(key=key.text, value=True)
+        right = node.comparators[0]
         if isinstance(right, ast.List):
             values = [tokens[item.col_offset // _WIDTH].value for item in right.elts]
             chosen = FilterIN(key=key.text, value=values)

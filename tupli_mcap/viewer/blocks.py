@@ -9,8 +9,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.recording import Columns, Recording
-from tupli_mcap.recording.blocks import Block as Steps
-from tupli_mcap.recording.blocks import blocks
+from tupli_mcap.recording.blocks import Block as Steps, blocks
 
 __all__ = ["Block", "Finals", "Piece", "blocks_of", "row_counts"]
 

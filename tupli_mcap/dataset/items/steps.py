@@ -10,6 +10,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.columns.fields import FIVE, field_names
 
 __all__ = [
     "FIELDS",
@@ -26,7 +27,7 @@ __all__ = [
     "rows_of_runs",
 ]
 
-FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
+FIELDS = (*FIVE, "next_states", "times")
 _MAX_ITEM = 1 << 30  # bytes of an item of an array
 _BLOCK = 4096  # steps in memory that are close to each other
 _TOGETHER = 1 << 16  # rows that are looked at together
@@ -135,14 +136,7 @@ def checked_fields(fields: Sequence[str], known: Sequence[str] = FIELDS) -> list
     Raises:
         SamplingError: one of them is unknown, or there is something else.
     """
-    try:
-        names = [fields] if isinstance(fields, str) else list(fields)
-    except TypeError as err:
-        raise SamplingError(f"expected fields from {', '.join(known)}, found {fields!r:.80}") from err
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise SamplingError(f"expected fields from {', '.join(known)}, found {', '.join(map(repr, unknown))}")
-    return list(dict.fromkeys(names))
+    return field_names(fields, known, SamplingError)
 
 
 def pick(column: Any, rows: Array | slice) -> Any:

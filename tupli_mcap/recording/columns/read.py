@@ -10,26 +10,25 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.columns.fields import GymnasiumNames
 from tupli_mcap.recording.columns.gather import EPISODE, Files, Plan, Rows, final_rows, image_rows, step_rows
 from tupli_mcap.recording.columns.runs import Runs, final_runs, parts_of
 from tupli_mcap.recording.columns.threads import do_all
 
-__all__ = ["FIELDS", "ColumnReader", "Columns", "StoredSteps"]
-
-FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")
+__all__ = ["ColumnReader", "Columns", "StoredSteps"]
 
 
 @dataclass
-class Columns:
+class Columns(GymnasiumNames):
     """Columns of the asked fields, None for the others.
 
     A constant leaf is an array of shape (steps, *leaf shape), a leaf of variable size a list; both are nested as the
     space is. `episode_lengths` (int64) says where episodes end. `times` (int64, ns) is the wall clock when each step
-    returned.
+    returned. `infos` has a dict a step, which is empty where none was recorded.
     """
 
     episode_lengths: Array
@@ -40,6 +39,7 @@ class Columns:
     timeouts: Any = None
     next_states: Any = None
     times: Any = None
+    infos: Any = None
 
     def __len__(self) -> int:
         return int(self.episode_lengths.sum())
@@ -91,12 +91,7 @@ class ColumnReader:
         return plan.nest(columns)
 
     def _plan(self, fields: Sequence[str]) -> Plan:
-        unknown = [field for field in fields if field not in FIELDS]
-        if unknown:
-            raise RecordingError(
-                f"expected fields from {', '.join(FIELDS)}, found {', '.join(map(repr, unknown))}"
-            )
-        made = Plan.of([field for field in fields if field != "next_states"], self._layout, self._kinds)
+        made = Plan.of(fields, self._layout, self._kinds)
         self._plans[tuple(fields)] = made
         return made
 

@@ -14,8 +14,8 @@ from typing import Any, Final
 from sqlalchemy import Connection, Select, and_, delete, func, insert, select, true
 
 from tupli_mcap.errors import FilterError
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound, filter_keys, split_key
-from tupli_mcap.schema.facts import TIME_KEY, check_key
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound
+from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import bound_predicate
 from tupli_mcap.storage.catalog.database import (
     CatalogDamagedError,
@@ -216,8 +216,7 @@ class Catalog:
         Raises:
             FilterError: There is no such top-level key, or it is that of all metadata.
         """
-        path = _path_of(key)
-        check_key(key, path, filter_keys(EpisodeHeader))
+        path = path_in(key, EpisodeHeader)
         if path == ("metadata",):
             raise FilterError(f"key {key!r} cannot be declared: name one in it, such as metadata.score")
         with self._write() as connection:
@@ -283,13 +282,8 @@ def _headers(
 def _indexed(connection: Connection) -> dict[tuple[str, ...], int]:
     """The paths of declared keys whose values are in `VALUE`, with their numbers there."""
     declared = connection.execute(select(DECLARED.c.key, DECLARED.c.number)).all()
-    paths = {_path_of(unescape_text(key)): number for key, number in declared}
+    paths = {path_in(unescape_text(key), EpisodeHeader): number for key, number in declared}
     return {path: number for path, number in paths.items() if is_indexed(path)}
-
-
-def _path_of(key: str) -> tuple[str, ...]:
-    name, *inside = split_key(key)
-    return (TIME_KEY if name == "ended" else name, *inside)
 
 
 def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[tuple[str, ...], int]) -> None:

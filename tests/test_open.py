@@ -1,0 +1,367 @@
+"""`tupli_mcap.open`: datasets of episodes, narrowed, put in order, read, and handed on."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import tupli_mcap
+from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, RecordingError, TupliError
+from tupli_mcap.recording import Episode
+from tupli_mcap.schema import EpisodeMetadataCallback
+
+
+class Notes(EpisodeMetadataCallback):
+    """Metadata that differ from episode to episode."""
+
+    def __init__(self, side: str) -> None:
+        self.side, self.count = side, -1
+
+    def reset(self) -> None:
+        self.count += 1
+
+    def __call__(self, tuple: Any) -> dict[str, Any]:
+        return {"side": self.side, "count": self.count, "success": self.count % 3 == 0}
+
+
+def record(path: Path, seed: int, episodes: int) -> Path:
+    env = gym.make("CartPole-v1")
+    with tupli_mcap.RecordEpisodes(
+        env, path, metadata_callback=Notes(path.stem), record_info=True
+    ) as recorder:
+        recorder.action_space.seed(seed)
+        for i in range(episodes):
+            recorder.reset(seed=seed + i)
+            over = False
+            while not over:
+                *_, terminal, timeout, _ = recorder.step(recorder.action_space.sample())
+                over = terminal or timeout
+    return path
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    for k, name in enumerate(("a", "b", "c")):
+        record(folder / f"{name}.mcap", 100 * k, 12)
+    return folder
+
+
+@pytest.fixture
+def dataset(runs: Path) -> Dataset:
+    return tupli_mcap.open(runs)
+
+
+def ids(dataset: Dataset) -> list[str]:
+    return [episode.id for episode in dataset]
+
+
+def test_everything_that_can_be_opened(runs: Path, tmp_path: Path) -> None:
+    everything = ids(tupli_mcap.open(runs))
+    assert len(everything) == 36
+    assert ids(tupli_mcap.open(str(runs / "*.mcap"))) == everything
+    assert ids(tupli_mcap.open([runs / "a.mcap", str(runs / "[bc].mcap")])) == everything
+    assert ids(tupli_mcap.open([runs])) == everything
+    assert ids(tupli_mcap.open(FileStorage(runs))) == everything
+    assert ids(tupli_mcap.open(runs / "a.mcap")) == everything[:12]
+    with Recording(runs / "a.mcap") as recording:
+        assert ids(tupli_mcap.open(recording)) == everything[:12]
+        assert ids(tupli_mcap.open([recording, runs / "c.mcap"])) == [*everything[:12], *everything[24:]]
+    dataset = tupli_mcap.open(runs)
+    assert tupli_mcap.open(dataset) is dataset
+    assert len(tupli_mcap.open(tmp_path)) == 0  # a directory without recordings
+    assert list(runs.iterdir()) == [*sorted(runs.glob("*.mcap"))]  # looking writes nothing
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("nowhere.mcap", "there is no file"),
+        ("nowhere*.mcap", "no file matches"),
+        (3, "expected a path, a pattern"),
+        ([3], "expected paths, patterns"),
+        ([], "expected at least one recording"),
+    ],
+)
+def test_what_cannot_be_opened(source: Any, message: str) -> None:
+    with pytest.raises(TupliError, match=message):
+        tupli_mcap.open(source)
+
+
+def test_a_file_object_has_no_place(runs: Path) -> None:
+    with (
+        (runs / "a.mcap").open("rb") as file,
+        Recording(file) as recording,
+        pytest.raises(TupliError, match="opened as a file object"),
+    ):
+        tupli_mcap.open(recording)
+
+
+def test_an_index_gives_an_episode_or_a_dataset(dataset: Dataset) -> None:
+    everything = ids(dataset)
+    assert isinstance(dataset[3], Episode) and dataset[3].id == everything[3]
+    assert dataset[-1].id == everything[-1]
+    assert dataset[np.int64(5)].id == everything[5]
+    assert ids(dataset[-5:]) == everything[-5:]
+    assert ids(dataset[[30, 2, -1]]) == [everything[30], everything[2], everything[-1]]
+    mask = dataset.lengths > 20
+    assert ids(dataset[mask]) == np.array(everything)[mask].tolist()
+    assert ids(dataset[10:20][::-2]) == everything[10:20][::-2]
+    assert len(dataset[[]]) == 0
+    for wrong in (36, -37, [36], [-37]):
+        with pytest.raises(IndexError, match="expected"):
+            dataset[wrong]  # type: ignore[call-overload]
+    for odd in ("first", [True], 1.5, [[1]], None):
+        with pytest.raises(TupliError, match="expected a number, a slice"):
+            dataset[odd]  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize(
+    ("text", "test"),
+    [
+        ("return > 20", lambda e: e.return_ > 20),
+        ("steps > 20 and metadata.success", lambda e: len(e) > 20 and e.metadata["success"]),
+        ("n_tuples > 20 or episode_return < 12", lambda e: len(e) > 20 or e.return_ < 12),
+        ('metadata.side == "b"', lambda e: e.metadata["side"] == "b"),
+        ('metadata.count in [1, 4] and not end == "timeout"', lambda e: e.metadata["count"] in (1, 4)),
+        ("seed >= 200", lambda e: e.seed >= 200),
+    ],
+)
+def test_filters_find_what_a_loop_finds(dataset: Dataset, text: str, test: Callable[[Episode], bool]) -> None:
+    wanted = [episode.id for episode in dataset if test(episode)]
+    assert 0 < len(wanted) < 36
+    assert ids(dataset.filter(text)) == wanted  # listed already
+    assert ids(tupli_mcap.open(dataset._source.storage).filter(text)) == wanted  # type: ignore[attr-defined]
+    assert ids(dataset.filter(test)) == wanted
+    shuffled = dataset.sample(36, seed=1)
+    assert sorted(ids(shuffled.filter(text))) == sorted(wanted)
+
+
+def test_filters_narrow_one_after_the_other(runs: Path) -> None:
+    dataset = tupli_mcap.open(runs)
+    narrow = dataset.filter(F("return") > 15).filter('metadata.side == "b"').filter("metadata.success")
+    assert "not listed yet" in repr(narrow)
+    together = dataset.filter('return > 15 and metadata.side == "b" and metadata.success')
+    assert 0 < len(narrow) < 12 and ids(narrow) == ids(together)
+    assert len(dataset) == 36
+
+
+@pytest.mark.parametrize("wrong", ["retrun > 3", "metdata.success", "n_steps == 3"])
+def test_a_wrong_key_says_what_is_meant(dataset: Dataset, wrong: str) -> None:
+    with pytest.raises(FilterError, match="did you mean"):
+        dataset.filter(wrong)
+    with pytest.raises(FilterError, match="did you mean"):
+        dataset.sort(wrong.split()[0])
+
+
+def test_keys(dataset: Dataset) -> None:
+    keys = dataset.keys
+    assert {"return", "steps", "ended", "end", "seed", "metadata.success", "metadata.side"} <= set(keys)
+    assert not {"episode_return", "n_tuples", "created_at"} & set(keys)
+
+
+def test_sort_keeps_equal_ones_in_order(dataset: Dataset) -> None:
+    for descending in (False, True):
+        found = dataset.sort("metadata.side", descending=descending)
+        sides = [episode.metadata["side"] for episode in found]
+        assert sides == sorted(sides, reverse=descending)
+        assert [e.number for e in found] == [*range(12)] * 3
+    returns = dataset.sort("return", descending=True).returns
+    assert (np.diff(returns) <= 0).all()
+    assert ids(dataset.sort(lambda episode: episode.seed)) == ids(dataset.sort("seed"))
+
+
+def test_what_has_no_value_comes_last(dataset: Dataset) -> None:
+    def value(episode: Episode) -> float | None:
+        return {0: None, 1: float("nan")}.get(episode.number, float(-episode.number))
+
+    for descending in (False, True):
+        numbers = [episode.number for episode in dataset[:12].sort(value, descending=descending)]
+        assert numbers[-2:] == [0, 1]
+        assert numbers[:-2] == sorted(range(2, 12), reverse=not descending)
+    with pytest.raises(TupliError, match="cannot sort"):
+        dataset.sort(lambda episode: episode.number if episode.env else "text" if episode.number else 1)
+
+
+def test_head_and_sample(dataset: Dataset) -> None:
+    assert ids(dataset.head(3)) == ids(dataset)[:3]
+    assert len(dataset.head(100)) == 36
+    one, same, other = dataset.sample(9, seed=1), dataset.sample(9, seed=1), dataset.sample(9, seed=2)
+    assert ids(one) == ids(same) != ids(other)
+    assert len(set(ids(one))) == 9
+    for wrong in (-1, 1.5, True, "3"):
+        with pytest.raises(TupliError, match="expected a number of episodes"):
+            dataset.head(wrong)  # type: ignore[arg-type]
+
+
+def test_a_split_stays_when_episodes_are_added(runs: Path, dataset: Dataset) -> None:
+    train, test = dataset.split(0.7, seed=3)
+    assert sorted(ids(train) + ids(test)) == sorted(ids(dataset))
+    assert 15 < len(train) < 34
+    few, others = tupli_mcap.open([runs / "a.mcap", runs / "c.mcap"]).split(0.7, seed=3)
+    assert set(ids(few)) <= set(ids(train)) and set(ids(others)) <= set(ids(test))
+    assert ids(dataset.split(0.7, seed=4)[0]) != ids(train)
+    assert len(dataset.split(1.0)[1]) == len(dataset.split(0.0)[0]) == 0
+    with pytest.raises(TupliError, match="expected a fraction"):
+        dataset.split(1.5)
+
+
+@pytest.mark.parametrize("by", ["run", "metadata.side", "metadata.count"])
+def test_a_split_keeps_together_what_belongs_together(dataset: Dataset, by: str) -> None:
+    def value(episode: Episode) -> Any:
+        return episode.recording.uuid if by == "run" else episode.metadata[by.partition(".")[2]]
+
+    sides = [{value(episode) for episode in part} for part in dataset.split(0.5, seed=1, by=by)]
+    assert not sides[0] & sides[1]
+    assert len(sides[0] | sides[1]) == (12 if by == "metadata.count" else 3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_reading_gives_the_episodes_in_their_order(dataset: Dataset, seed: int) -> None:
+    found = dataset.sample(10, seed=seed)
+    columns = found.read(
+        ["states", "actions", "rewards", "terminals", "timeouts", "next_states", "times", "infos"]
+    )
+    assert columns.episode_lengths.tolist() == [len(episode) for episode in found]
+    first = 0
+    for episode in found:
+        steps = slice(first, first + len(episode))
+        for field in ("states", "actions", "rewards", "terminals", "timeouts", "next_states"):
+            assert np.array_equal(getattr(columns, field)[steps], getattr(episode, field))
+        assert (np.diff(columns.times[steps]) >= 0).all()
+        assert columns.infos[steps] == [info or {} for info in episode.infos or []]
+        first += len(episode)
+    assert found.n_steps == first == len(columns)
+
+
+def test_no_episode_has_no_steps(dataset: Dataset) -> None:
+    none = dataset.filter("steps > 100000")
+    assert len(none) == none.n_steps == len(none.read()) == 0
+    assert none.to_pandas("episodes").empty and none.to_pandas().empty
+
+
+def test_gymnasiums_names(dataset: Dataset) -> None:
+    columns = dataset[:3].read(["observations", "terminations", "truncations", "next_observations"])
+    episode = dataset[0]
+    n = len(episode)
+    assert np.array_equal(columns.observations[:n], episode.observations)
+    assert np.array_equal(columns.terminations[:n], episode.terminations)
+    assert np.array_equal(columns.truncations[:n], episode.truncations)
+    assert np.array_equal(columns.next_observations[:n], episode.next_observations)
+    assert episode.observations is episode.states and columns.actions is None
+    windows = dataset.windows(4, fields=["observations", "reward"])
+    assert windows[0].states.shape == (4, 4)
+    for wrong in ("rewrads", "observatoins", "x"):
+        with pytest.raises(TupliError, match="expected fields from"):
+            dataset.read(wrong)
+        with pytest.raises(TupliError, match="expected fields from"):
+            episode.recording.read(fields=[wrong])
+        with pytest.raises(TupliError, match="expected fields from"):
+            dataset.windows(4, fields=[wrong])
+    with pytest.raises(RecordingError, match="did you mean 'rewards'"):
+        dataset.read("rewrads")
+
+
+def test_windows_and_transitions_stay_within_episodes(dataset: Dataset) -> None:
+    found = dataset.filter("steps > 12").sample(6, seed=2)
+    windows, columns = found.windows(8), found.read()
+    ends = np.cumsum(columns.episode_lengths)
+    starts = [
+        s for end, n in zip(ends, columns.episode_lengths, strict=True) for s in range(end - n, end - 7)
+    ]
+    assert len(windows) == len(starts)
+    for i, start in enumerate(starts):
+        assert np.array_equal(windows[i].states, columns.states[start : start + 8])
+    assert len(found.transitions()) == found.n_steps
+
+
+def test_a_loader_in_one_call(dataset: Dataset) -> None:
+    pytest.importorskip("torch")
+    loader = dataset.loader(8, batch_size=16, fields=["states", "actions"], seed=1)
+    first, again = next(iter(loader)), next(iter(dataset.loader(8, batch_size=16, fields=["states"], seed=1)))
+    assert first["states"].shape == (16, 8, 4) and first["actions"].shape == (16, 8)
+    assert (first["states"] == again["states"]).all()
+    in_order = next(iter(dataset.loader(batch_size=5, shuffle=False)))
+    assert np.array_equal(in_order["states"].numpy(), dataset[0].states[:5])
+
+
+def test_statistics_are_those_of_numpy(dataset: Dataset) -> None:
+    states = dataset.read(["states"]).states.astype(np.float64)
+    found = dataset.stats()
+    assert set(found) == {"state", "action", "reward"}
+    state = found["state"]
+    assert state.count.tolist() == [len(states)] * 4
+    np.testing.assert_allclose(state.mean, states.mean(axis=0), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(state.std, states.std(axis=0), rtol=1e-6)
+    assert np.array_equal(state.min, states.min(axis=0)) and np.array_equal(state.max, states.max(axis=0))
+    for q, values in state.quantiles.items():
+        np.testing.assert_allclose(values, np.quantile(states, q, axis=0), rtol=1e-6, atol=1e-9)
+    assert found["reward"].mean.shape == ()
+    assert set(dataset.stats(["observations"])) == {"state"}
+    with pytest.raises(TupliError, match="found none"):
+        dataset.head(0).stats()
+
+
+def test_pandas(dataset: Dataset) -> None:
+    pytest.importorskip("pandas")
+    found = dataset.sample(5, seed=1)
+    steps, episodes, columns = found.to_pandas(), found.to_pandas("episodes"), found.read()
+    assert len(steps) == found.n_steps and len(episodes) == 5
+    names = [name for name in steps if str(name).startswith("state")]
+    assert len(names) == 4
+    assert np.array_equal(steps[names].to_numpy(), columns.states)
+    assert np.array_equal(steps["reward"], columns.rewards)
+    assert steps.groupby("episode")["reward"].sum().tolist() == episodes["return"].tolist()
+    assert steps.groupby("episode")["step"].max().tolist() == (episodes["steps"] - 1).tolist()
+    assert episodes["id"].tolist() == ids(found)
+    assert episodes["metadata.side"].tolist() == [episode.metadata["side"] for episode in found]
+    assert set(steps["id"]) == set(ids(found))
+    with pytest.raises(TupliError, match="expected the level"):
+        found.to_pandas("rows")  # type: ignore[arg-type]
+
+
+def test_arrow(dataset: Dataset) -> None:
+    pytest.importorskip("pyarrow")
+    table = dataset.head(2).to_arrow("episodes")
+    assert table.column("steps").to_pylist() == dataset.head(2).lengths.tolist()
+
+
+@pytest.mark.parametrize("which", ["return > 20", 'metadata.side == "a"'])
+def test_saving_keeps_what_belongs_to_the_episodes(dataset: Dataset, which: str, tmp_path: Path) -> None:
+    chosen = dataset.filter(which)
+    target = chosen.save(tmp_path / "sub" / "good.mcap")
+    saved = tupli_mcap.open(target)
+    assert len(saved) == len(chosen) and saved.n_steps == chosen.n_steps
+    by_seed = {episode.seed: episode for episode in chosen}
+    for episode in saved:
+        source = by_seed[episode.seed]
+        assert np.array_equal(episode.states, source.states)
+        assert episode.metadata == source.metadata and episode.infos == source.infos
+    with pytest.raises(TupliError, match="exists"):
+        chosen.save(target)
+    assert len(tupli_mcap.open(chosen.head(1).save(target, overwrite=True))) == 1
+    assert sorted(path.name for path in target.parent.iterdir()) == ["good.mcap"]
+    with pytest.raises(TupliError, match="found none"):
+        chosen.head(0).save(tmp_path / "none.mcap")
+
+
+def test_a_pickled_copy_reads_the_same(dataset: Dataset) -> None:
+    found = dataset.sample(4, seed=1)
+    assert np.array_equal(found.steps.read(["rewards"], np.arange(3))["rewards"], found.read().rewards[:3])
+    copy = pickle.loads(pickle.dumps(found))
+    assert ids(copy) == ids(found)
+    assert np.array_equal(copy.read().states, found.read().states)
+    assert np.array_equal(copy.steps.read(["rewards"], np.arange(9))["rewards"], found.read().rewards[:9])
+
+
+def test_what_is_shown_is_short(runs: Path) -> None:
+    dataset = tupli_mcap.open(runs)
+    assert len(repr(dataset)) < 200 and "not listed yet" in repr(dataset)
+    assert "36 episodes" in dataset._repr_html_()
+    assert "36 episodes" in repr(dataset)

@@ -1,0 +1,409 @@
+"""`Dataset`: episodes, wherever they lie, narrowed, put in order, read and handed on; and `open`, which gives one."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.dataset import curate, display, tables
+from tupli_mcap.dataset.access import RandomAccess
+from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
+from tupli_mcap.dataset.items.steps import pick
+from tupli_mcap.dataset.load import read_columns
+from tupli_mcap.dataset.sources import DatasetError, FilesSource, OpenRecordings, Source, StorageSource
+from tupli_mcap.dataset.statistics import FieldStatistics, statistics_of
+from tupli_mcap.recording import Episode, Recording
+from tupli_mcap.recording.columns.fields import FIVE, field_names
+from tupli_mcap.recording.columns.read import Columns
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter
+from tupli_mcap.schema.facts import filter_keys, path_in
+from tupli_mcap.schema.predicate import MISSING, look_up
+from tupli_mcap.storage import FileStorage, TupliStorage
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+    from tupli_mcap.dataset.tables import Level
+
+__all__ = ["Dataset", "open"]
+
+Test: TypeAlias = "str | BaseFilter | Callable[[Episode], bool]"
+Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Dataset"
+
+
+def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as in gzip.open
+    """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a URL, a recording, or a list of them.
+
+    An episode that is in two of the files counts once, with a warning. One that is still being recorded is there as
+    far as it has come, and ends as interrupted.
+
+        ds = tupli_mcap.open("runs/")
+        best = ds.filter("return > 100").sort("return", descending=True).head(10)
+
+    Raises:
+        RecordingError: there is no such file, it is none of these, or it cannot be opened.
+        StorageError: the directory may not be looked at.
+    """
+    if isinstance(source, Dataset):
+        return source
+    if isinstance(source, TupliStorage):
+        return Dataset(StorageSource(source))
+    if isinstance(source, Recording):
+        return Dataset(FilesSource([_place_of(source)]))
+    if isinstance(source, str | os.PathLike):
+        name = os.fspath(source)
+        if "://" not in name and Path(name).expanduser().is_dir():
+            return Dataset(StorageSource(FileStorage(Path(name).expanduser())))
+        return Dataset(FilesSource(source))
+    if not isinstance(source, Iterable):
+        raise DatasetError(
+            f"expected a path, a pattern, a URL, a storage, or a list of those, found {source!r:.80}"
+        )
+    return Dataset(FilesSource([name for item in source for name in _files_in(item)]))
+
+
+def _place_of(recording: Recording) -> str:
+    if recording.path is None and "://" not in recording.name:
+        raise DatasetError(f"{recording.name} was opened as a file object; open it by its path or URL")
+    return os.fspath(recording.path or recording.name)
+
+
+def _files_in(source: Openable) -> Sequence[str]:
+    """The recordings of one item of a list."""
+    from tupli_mcap.storage.listing import find_recordings
+
+    if isinstance(source, Recording):
+        return [_place_of(source)]
+    if isinstance(source, str | os.PathLike):
+        name = os.fspath(source)
+        if "://" not in name and Path(name).expanduser().is_dir():
+            return [str(path) for path in find_recordings(Path(name).expanduser())]
+        return FilesSource(source).names
+    raise DatasetError(
+        f"expected paths, patterns, URLs and recordings in a list, found {source!r:.80}; open a storage by itself"
+    )
+
+
+class Dataset(RandomAccess):
+    """Episodes, wherever they lie, in an order.
+
+    It reads when it is asked for something, and only what it is asked for. The episodes are listed once. Verbs that
+    narrow (`filter`, `sort`, `head`, `sample`, `split`, an index) give another dataset and change nothing in this one.
+    Iteration gives episodes, and `len` counts them. Not thread-safe; a pickled copy opens the files itself.
+
+    Use `tupli_mcap.open` to make one.
+    """
+
+    def __init__(self, source: Source, headers: Sequence[EpisodeHeader] | None = None) -> None:
+        self._source = source
+        self._filter: BaseFilter | None = None
+        self._listed = None if headers is None else list(headers)
+        self._recordings = OpenRecordings(source.open)
+        self._steps: RecordedSteps | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_recordings": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._recordings = OpenRecordings(self._source.open)
+
+    # ---- episodes
+
+    @property
+    def _headers(self) -> Sequence[EpisodeHeader]:
+        if self._listed is None:
+            self._listed = self._source.episodes(None, self._filter)
+        return self._listed
+
+    def __len__(self) -> int:
+        """The number of episodes."""
+        return len(self._headers)
+
+    @property
+    def n_steps(self) -> int:
+        """The number of steps of all episodes."""
+        return sum(header.n_tuples for header in self._headers)
+
+    @property
+    def lengths(self) -> Array:
+        """Steps of each episode: int64 (episodes,)."""
+        return np.array([header.n_tuples for header in self._headers], np.int64)
+
+    @property
+    def returns(self) -> Array:
+        """The sum of each episode's rewards: float64 (episodes,), NaN where the rewards are no numbers."""
+        return np.array(
+            [np.nan if header.episode_return is None else header.episode_return for header in self._headers]
+        )
+
+    @overload
+    def __getitem__(self, chosen: int) -> Episode: ...
+    @overload
+    def __getitem__(self, chosen: slice | Sequence[int] | Array) -> Dataset: ...
+    def __getitem__(self, chosen: int | slice | Sequence[int] | Array) -> Episode | Dataset:
+        """`ds[3]` is an episode; `ds[-5:]`, `ds[[4, 2]]` and `ds[mask]` are datasets.
+
+        Raises:
+            IndexError: there is no such episode.
+            DatasetError: it is no number, slice, list of numbers or mask.
+        """
+        headers = self._headers
+        if isinstance(chosen, int | np.integer) and not isinstance(chosen, bool):
+            try:
+                return self._episode(headers[chosen])
+            except IndexError as err:
+                raise IndexError(f"expected an episode from 0 to {len(headers) - 1}, found {chosen}") from err
+        if isinstance(chosen, slice):
+            return self._of(headers[chosen])
+        return self._of([headers[i] for i in _places(chosen, len(headers))])
+
+    def __iter__(self) -> Iterator[Episode]:
+        for header in self._headers:
+            yield self._episode(header)
+
+    def _episode(self, header: EpisodeHeader) -> Episode:
+        recording = self._recordings.get(header.recording)
+        position = int(np.searchsorted(recording.index["episode"], header.episode))
+        episode = recording.episodes[position]
+        if episode.number != header.episode:
+            raise DatasetError(f"{header.recording} has no episode {header.episode} any more; open it again")
+        return episode
+
+    def _of(self, headers: Sequence[EpisodeHeader]) -> Dataset:
+        made = Dataset(self._source, headers)
+        made._recordings = self._recordings
+        return made
+
+    # ---- narrowing
+
+    def filter(self, test: Test) -> Dataset:
+        """The episodes that a test is true of, in their order.
+
+        Args:
+            test: a text ("metadata.success and return > 100"), an expression (`F("return") > 100`), or a function of an
+                `Episode`. Keys are those of `Dataset.keys`.
+
+        Raises:
+            FilterError: the test names an unknown key, compares it with what it can never be, or is none of these.
+        """
+        if callable(test) and not isinstance(test, BaseFilter):
+            return self._of([header for header in self._headers if test(self._episode(header))])
+        wanted = parse_filter(test) if isinstance(test, str) else test
+        check_keys(wanted, EpisodeHeader)
+        if self._listed is None:
+            made = self._of([])
+            made._listed = None
+            made._filter = wanted if self._filter is None else self._filter & wanted
+            return made
+        matches = compile_predicate(wanted, EpisodeHeader)
+        return self._of([header for header in self._listed if matches(header)])
+
+    def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
+        """The episodes in the order of a key ("return", "steps", "metadata.score"), or of a function of an `Episode`.
+
+        Equal ones stay in their order; those that have no such value come last.
+
+        Raises:
+            FilterError: an unknown key, or values that have no order among each other.
+        """
+        if callable(key):
+            values = [key(self._episode(header)) for header in self._headers]
+        else:
+            values = [self._value(header, key) for header in self._headers]
+        places = [i for i, value in enumerate(values) if value is not None and value == value]
+        try:
+            ordered = sorted(places, key=lambda i: values[i], reverse=descending)
+        except TypeError as err:
+            raise DatasetError(f"cannot sort by {key!r}: {err}") from err
+        if descending:  # `sorted` keeps equal ones in their order both ways
+            ordered = sorted(places, key=lambda i: values[i], reverse=True)
+        rest = sorted(set(range(len(values))) - set(places))
+        return self._of([self._headers[i] for i in [*ordered, *rest]])
+
+    def head(self, n: int) -> Dataset:
+        """The first `n` episodes, or as many as there are."""
+        return self._of(self._headers[: _count(n)])
+
+    def sample(self, n: int, *, seed: int | None = None) -> Dataset:
+        """`n` different episodes (or as many as there are), drawn at random, in the order in which they were drawn."""
+        drawn = np.random.default_rng(seed).permutation(len(self))[: _count(n)]
+        return self[drawn]
+
+    def split(self, fraction: float, *, seed: int = 0, by: str | None = None) -> tuple[Dataset, Dataset]:
+        """Two datasets: about `fraction` of the episodes, and the others. No episode is in both.
+
+        Which side an episode is on depends on its id and the seed alone: it stays there when others are added.
+
+        Args:
+            by: a key ("run", "metadata.task", "seed"): episodes with the same value stay together.
+
+        Raises:
+            DatasetError: the fraction is not between 0 and 1.
+            FilterError: an unknown key.
+        """
+        if not 0 <= fraction <= 1:
+            raise DatasetError(f"expected a fraction from 0 to 1, found {fraction!r:.80}")
+        parts: tuple[list[EpisodeHeader], list[EpisodeHeader]] = ([], [])
+        for header in self._headers:
+            name = header.id if by is None else repr(self._value(header, by))
+            digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
+            parts[int.from_bytes(digest[:8], "big") >= fraction * 2**64].append(header)
+        return self._of(parts[0]), self._of(parts[1])
+
+    @property
+    def keys(self) -> list[str]:
+        """What filters, `sort` and `split` may name: the facts about episodes, and the metadata that some have."""
+        own = {"metadata." + key for header in self._headers for key in header.metadata}
+        return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own)
+
+    def _value(self, header: EpisodeHeader, key: str) -> Any:
+        if key == "run":
+            return header.id.partition("-")[0]
+        value = look_up(header, path_in(key, EpisodeHeader))
+        return None if value is MISSING else value
+
+    # ---- reading
+
+    def read(self, fields: Sequence[str] = FIVE) -> Columns:
+        """Columns of all steps, episode after episode; `episode_lengths` says where each ends.
+
+        Args:
+            fields: of states, actions, rewards, terminals, timeouts, next_states, times, infos; Gymnasium's names
+                (observations, terminations, truncations) mean the same.
+
+        Raises:
+            DatasetError: an unknown field.
+            SpaceError: the steps of two recordings do not fit into one array; the message says which.
+        """
+        wanted = field_names(fields)
+        names = list(dict.fromkeys(header.recording for header in self._headers))
+        place = {name: i for i, name in enumerate(names)}
+        order = np.argsort([place[header.recording] for header in self._headers], kind="stable")
+        headers = [self._headers[i] for i in order]
+        columns, selected, _ = read_columns(self._source, headers, wanted)
+        if (np.diff(order) < 0).any():
+            ends = np.cumsum(selected.lengths)
+            starts = ends - selected.lengths
+            back = np.argsort(order)
+            rows = np.concatenate([np.arange(starts[i], ends[i]) for i in back.tolist()])
+            columns = {field: pick(column, rows) for field, column in columns.items()}
+        return Columns(self.lengths, **columns)
+
+    @property
+    def steps(self) -> Steps:
+        if self._steps is None:
+            groups = itertools.groupby(self._headers, key=lambda header: header.recording)
+            self._steps = RecordedSteps(
+                (ListedEpisodes.of(name, group) for name, group in groups), self._recordings.lent
+            )
+        return self._steps
+
+    def _step_seconds(self) -> float | None:
+        names = dict.fromkeys(header.recording for header in self._headers)
+        known = {self._recordings.get(name).labels.step_seconds for name in names}
+        return known.pop() if len(known) == 1 else None
+
+    def loader(
+        self,
+        length: int | None = None,
+        *,
+        batch_size: int = 64,
+        shuffle: bool = True,
+        num_workers: int = 0,
+        fields: Sequence[str] | None = None,
+        seed: int | None = None,
+    ) -> Any:
+        """A PyTorch `DataLoader` of batches of tensors.
+
+        Args:
+            length: of windows of steps that follow each other within an episode; without it, single transitions.
+            fields: as for `windows`, or for `transitions`.
+            seed: of the order; drawn if it is None.
+
+        Raises:
+            MissingExtraError: PyTorch is not installed.
+            SamplingError: no episode has so many steps.
+        """
+        from tupli_mcap.torch.loader import loader
+
+        chosen: dict[str, Any] = {} if fields is None else {"fields": fields}
+        items = self.transitions(**chosen) if length is None else self.windows(length, **chosen)
+        return loader(items, batch_size=batch_size, shuffle=shuffle, num_workers=num_workers, seed=seed)
+
+    def stats(
+        self, fields: Sequence[str] = ("states", "actions", "rewards")
+    ) -> Mapping[str, FieldStatistics]:
+        """Count, mean, std, min, max and quantiles of each leaf (`state`, `state['arm']`, `action`, `reward`).
+
+        Steps are read a block at a time; what was found is kept.
+
+        Raises:
+            DatasetError: an unknown field, or there is no step.
+        """
+        return statistics_of(self, field_names(fields))
+
+    # ---- out
+
+    def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
+        """A row a step, or a row an episode; a column a dimension, with its name where the recording knows it.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        return tables.dataframe(self, level)
+
+    def to_arrow(self, level: Level = "steps") -> pa.Table:
+        """The same as an Arrow table.
+
+        Raises:
+            MissingExtraError: pandas or pyarrow is not installed.
+        """
+        return tables.arrow(self, level)
+
+    def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+        """Writes the episodes to a new recording, with all that belongs to them, in the order of their times.
+
+        Raises:
+            RecordingError: there is no episode, the target exists (and not `overwrite`) or cannot be written.
+            SpaceError: two recordings have different spaces.
+        """
+        return curate.save(self, Path(target), overwrite=overwrite)
+
+    # ---- looking
+
+    def __repr__(self) -> str:
+        if self._listed is None:
+            return f"<Dataset of {self._source!r}: not listed yet>"
+        return f"<Dataset of {self._source!r}: {len(self):,} episodes, {self.n_steps:,} steps>"
+
+    def _repr_html_(self) -> str:
+        return display.html("Dataset", display.Facts(repr(self._source), self._headers, None, {}))
+
+
+def _places(chosen: object, count: int) -> list[int]:
+    """The places that a mask or a list of numbers names."""
+    array = np.asarray(chosen)
+    if array.ndim == 1 and array.dtype == np.bool_ and len(array) == count:
+        return np.flatnonzero(array).tolist()
+    if array.ndim != 1 or (len(array) and array.dtype.kind not in "iu"):
+        raise DatasetError(
+            f"expected a number, a slice, a list of numbers or a mask of {count} episodes, found {chosen!r:.80}"
+        )
+    if len(array) and not -count <= array.min() <= array.max() < count:
+        raise IndexError(f"expected episodes from 0 to {count - 1}, found {chosen!r:.80}")
+    return [int(i) % count for i in array]
+
+
+def _count(n: int) -> int:
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 0:
+        raise DatasetError(f"expected a number of episodes from 0, found {n!r:.80}")
+    return int(n)

@@ -1,0 +1,112 @@
+"""Datasets as tables of pandas or Arrow: a row a step, or a row an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+
+from tupli_mcap.dataset.convert import import_pandas
+from tupli_mcap.dataset.sources import DatasetError
+from tupli_mcap.errors import missing_extra
+from tupli_mcap.recording.columns.fields import FIVE
+from tupli_mcap.spaces.element_names import element_names
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+    from tupli_mcap.dataset.front import Dataset
+    from tupli_mcap.messages.step import StepLayout
+    from tupli_mcap.spaces.labels import Labels
+
+__all__ = ["Level", "arrow", "dataframe"]
+
+Level: TypeAlias = Literal["steps", "episodes"]
+
+
+def dataframe(dataset: Dataset, level: Level) -> pd.DataFrame:
+    """See `Dataset.to_pandas`."""
+    pandas = import_pandas()
+    if level == "episodes":
+        return pandas.DataFrame(_episode_columns(dataset))
+    if level != "steps":
+        raise DatasetError(f"expected the level 'steps' or 'episodes', found {level!r:.80}")
+    return pandas.DataFrame(_step_columns(dataset, pandas))
+
+
+def arrow(dataset: Dataset, level: Level) -> pa.Table:
+    """See `Dataset.to_arrow`."""
+    frame = dataframe(dataset, level)
+    try:
+        import pyarrow
+    except ImportError as err:
+        raise missing_extra("an Arrow table needs pyarrow", "arrow") from err
+    return pyarrow.Table.from_pandas(frame, preserve_index=False)
+
+
+def _episode_columns(dataset: Dataset) -> dict[str, Any]:
+    headers = dataset._headers
+    columns: dict[str, Any] = {
+        "id": [header.id for header in headers],
+        "recording": [header.recording for header in headers],
+        "episode": np.array([header.episode for header in headers], np.int64),
+        "env": np.array([header.env for header in headers], np.int64),
+        "steps": dataset.lengths,
+        "return": dataset.returns,
+        "end": [header.end for header in headers],
+        "seed": [header.seed for header in headers],
+        "ended": np.array([header.created_at.removesuffix("+00:00") for header in headers], "datetime64[ns]"),
+        "benchmark_id": [header.benchmark_id for header in headers],
+    }
+    return columns | _metadata_columns([header.metadata for header in headers])
+
+
+def _metadata_columns(items: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    """A column for each key that one of the episodes has, None where another one has it not."""
+    keys = dict.fromkeys(key for item in items for key in item)
+    return {f"metadata.{key}": [item.get(key) for item in items] for key in keys}
+
+
+def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
+    found = dataset.read((*FIVE, "times"))
+    lengths = found.episode_lengths
+    of_episode = np.repeat(np.arange(len(lengths)), lengths)
+    starts = np.repeat(np.cumsum(lengths) - lengths, lengths)
+    episodes = _episode_columns(dataset)
+    columns: dict[str, Any] = {
+        "episode": of_episode,
+        "step": np.arange(len(of_episode)) - starts,
+        "time": found.times.astype("datetime64[ns]"),
+    }
+    if len(dataset):
+        recording = dataset[0].recording
+        columns |= _named(found.states, recording.layout, recording.labels, "state")
+        columns |= _named(found.actions, recording.layout, recording.labels, "action")
+        columns |= _named(found.rewards, recording.layout, recording.labels, "reward")
+    columns |= {"terminal": found.terminals, "timeout": found.timeouts}
+    repeated = {"id", "seed", *(key for key in episodes if key.startswith("metadata."))}
+    for key in episodes:
+        if key in repeated:
+            values = pandas.Series(episodes[key])
+            columns[key] = values.iloc[of_episode].reset_index(drop=True)
+    return columns
+
+
+def _named(column: Any, layout: StepLayout, labels: Labels, root: str) -> Mapping[str, Any]:
+    """A column for each element of each leaf; one of objects for a leaf of variable size."""
+    columns: dict[str, Any] = {}
+    for leaf in {"state": layout.state, "action": layout.action, "reward": layout.reward}[root]:
+        values = leaf.get(column)
+        if isinstance(values, list):
+            columns[leaf.path] = values
+            continue
+        if leaf.apart:  # an image a cell
+            columns[leaf.path] = list(values)
+            continue
+        flat = values.reshape(len(values), leaf.size)
+        own = element_names(leaf, labels)
+        names = [name if name.startswith(root) else f"{root}.{name}" for name in own]
+        columns |= {name: flat[:, i] for i, name in enumerate(names)}
+    return columns

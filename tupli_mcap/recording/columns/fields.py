@@ -1,0 +1,80 @@
+"""The columns of steps that can be asked for by name, and the names they have elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import Any
+
+from tupli_mcap.errors import RecordingError, did_you_mean
+
+__all__ = ["FIELDS", "FIVE", "GymnasiumNames", "field_names"]
+
+FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
+FIELDS = (*FIVE, "next_states", "times", "infos")
+_OTHER_NAMES = MappingProxyType(
+    {
+        "observations": "states",
+        "next_observations": "next_states",
+        "terminations": "terminals",
+        "truncations": "timeouts",
+        "observation": "states",
+        "state": "states",
+        "action": "actions",
+        "reward": "rewards",
+        "terminal": "terminals",
+        "timeout": "timeouts",
+        "info": "infos",
+        "time": "times",
+    }
+)
+
+
+def field_names(
+    fields: str | Sequence[str], known: Sequence[str] = FIELDS, error: type[Exception] = RecordingError
+) -> list[str]:
+    """The fields under our names, each once; Gymnasium's names, and singulars, mean the same.
+
+    Raises:
+        error: one of them is unknown, or they are no names.
+    """
+    try:
+        given = [fields] if isinstance(fields, str) else list(fields)
+        names = [_OTHER_NAMES.get(name, name) for name in given]
+    except TypeError as err:
+        raise error(f"expected fields from {', '.join(known)}, found {fields!r:.80}") from err
+    for name in names:
+        if name not in known:
+            raise error(
+                f"expected fields from {', '.join(known)}, found {name!r:.80}{did_you_mean(name, known)}"
+            )
+    return list(dict.fromkeys(names))
+
+
+class GymnasiumNames:
+    """Columns of steps under Gymnasium's names."""
+
+    states: Any
+    next_states: Any
+    terminals: Any
+    timeouts: Any
+
+    @property
+    def observations(self) -> Any:
+        """`states`."""
+        return self.states
+
+    @property
+    def next_observations(self) -> Any:
+        """`next_states`."""
+        return self.next_states
+
+    @property
+    def terminations(self) -> Any:
+        """`terminals`."""
+        return self.terminals
+
+    @property
+    def truncations(self) -> Any:
+        """`timeouts`."""
+        return self.timeouts

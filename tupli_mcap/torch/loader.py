@@ -1,0 +1,30 @@
+"""A DataLoader of windows or transitions in one call."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Generator
+from torch.utils.data import DataLoader
+
+from tupli_mcap.dataset.items import Items
+from tupli_mcap.torch.mapped import MapDataset
+from tupli_mcap.torch.tensors import collate
+
+__all__ = ["loader"]
+
+
+def loader(
+    items: Items[Any], *, batch_size: int, shuffle: bool, num_workers: int, seed: int | None
+) -> DataLoader[Any]:
+    """See `Dataset.loader`."""
+    generator = None if seed is None else Generator().manual_seed(seed)
+    return DataLoader(
+        MapDataset(items),
+        batch_size,
+        shuffle,
+        num_workers=num_workers,
+        collate_fn=collate,
+        generator=generator,
+        persistent_workers=num_workers > 0,
+    )
