@@ -297,8 +297,6 @@ class TestRecord:
             line
             == "file/a.mcap cannot be recorded to: Not a directory; choose a path whose directories are directories"
         )
-        line = fails("record", "CartPole-v1", "-o", "none/a.mcap")
-        assert line == "none/a.mcap cannot be recorded to: its directory does not exist; make it"
         line = fails("record", "CartPole-v1", "-o", "/proc/a.mcap")
         assert line.startswith("/proc/a.mcap cannot be recorded to: ")
 

@@ -625,8 +625,57 @@ def test_appending_makes_a_missing_file(tmp_path: Path, vector: bool, limits: di
             env.step(steps)
     assert len(Recording(path)) == (4 if vector else 2)
     assert Recording(path).benchmark.make_env().spec.id == "CartPole-v1"
-    with pytest.raises(RecordingError, match="its directory does not exist; make it"):
-        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "none" / "r.mcap", mode="a")
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_a_directory_gets_a_new_file_each_time(tmp_path: Path, vector: bool) -> None:
+    """As a cell of a notebook is run twice, or ten workers start in the same second."""
+    paths = []
+    for folder in (tmp_path / "runs", f"{tmp_path}/new/runs/"):
+        if isinstance(folder, Path):
+            folder.mkdir()
+        for mode in ("x", "x", "w", "a"):
+            envs: Any = gym.make_vec("CartPole-v1", 2, "sync") if vector else gym.make("CartPole-v1")
+            wrap: Any = RecordVectorEpisodes if vector else RecordEpisodes
+            with wrap(envs, folder, mode=mode) as env:
+                env.reset(seed=1)
+                env.step(env.action_space.sample())
+                paths.append(env.path)
+        assert {path.parent for path in paths[-4:]} == {Path(folder)}
+    assert len(set(paths)) == 8
+    for path in paths:
+        assert re.fullmatch(r"CartPole-v1_\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d(-\d)?\.mcap", path.name)
+        assert len(Recording(path)) == (2 if vector else 1)
+
+
+def test_workers_that_start_at_once_get_files_of_their_own(tmp_path: Path) -> None:
+    code = (
+        "import gymnasium as gym, sys, tupli_mcap\n"
+        "with tupli_mcap.RecordEpisodes(gym.make('CartPole-v1'), sys.argv[1]) as env:\n"
+        "    env.reset(seed=1); env.step(0); sys.stdin.read()"
+    )
+    workers = [
+        subprocess.Popen([sys.executable, "-c", code, tmp_path], stdin=subprocess.PIPE) for _ in range(4)
+    ]
+    for worker in workers:
+        worker.communicate(b"", timeout=120)
+    assert [worker.returncode for worker in workers] == [0] * 4
+    assert len([Recording(path) for path in tmp_path.glob("*.mcap")]) == 4
+
+
+def test_names_of_environments_become_names_of_files(tmp_path: Path) -> None:
+    env = gym.make("CartPole-v1")
+    env.unwrapped.spec.id = "ALE/Pong v5"  # type: ignore[union-attr]
+    with RecordEpisodes(env, tmp_path) as recorder:
+        assert recorder.path.name.startswith("ALE_Pong_v5_")
+
+
+def test_missing_directories_are_made(tmp_path: Path) -> None:
+    for mode in ("x", "w", "a"):
+        path = tmp_path / mode / "deep" / "r.mcap"
+        with RecordEpisodes(gym.make("CartPole-v1"), path, mode=mode) as env:  # type: ignore[arg-type]
+            roll(env, 1)
+        assert len(Recording(path)) == 1
 
 
 def test_existing_files_and_bad_places_are_refused(tmp_path: Path) -> None:
@@ -637,8 +686,6 @@ def test_existing_files_and_bad_places_are_refused(tmp_path: Path) -> None:
         RecordingError, match='exists and is not overwritten; choose another path, or mode="a"'
     ):
         RecordEpisodes(gym.make("CartPole-v1"), path)
-    with pytest.raises(RecordingError, match="its directory does not exist"):
-        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "no" / "r.mcap")
     with pytest.raises(RecordingError, match="cannot be recorded to"):
         RecordEpisodes(gym.make("CartPole-v1"), "/proc/r.mcap")
     with pytest.raises(RecordingError, match="mode: expected"):

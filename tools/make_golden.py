@@ -27,8 +27,7 @@ import zstandard
 from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation, TransformObservation
 
-from tupli_mcap import RecordEpisodes, jsonvalue
-from tupli_mcap import vector as recorded_vector
+from tupli_mcap import RecordEpisodes, jsonvalue, vector as recorded_vector
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.recording import EpisodeData, Recording, journal_path, rewrite_recording, write_recording
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple

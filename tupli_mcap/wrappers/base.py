@@ -69,7 +69,8 @@ class EpisodeWrapper:
         self._spaces = spaces = with_stacks(env, spaces, options.stack_size)
         spaces.to_metadata()
         options = replace(options, attachments=with_labels(captured, env, spaces, options.labels))
-        self.rotation = Rotation(path, options, format_version(spaces, options.image_format))
+        name = type(env.unwrapped).__name__ if env.spec is None else env.spec.id
+        self.rotation = Rotation(path, options, format_version(spaces, options.image_format), name)
         self._plain = options.is_plain
         self._work = work = Work()
         writer: RecordingWriter | None = None

@@ -39,7 +39,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: any environment whose spaces are Gymnasium's own.
-        path: the recording; `mode` "x" refuses to overwrite, "w" replaces, "a" continues it, or makes it.
+        path: the recording, or a directory: it gets a new file named by environment and time. Directories that are
+            missing are made. `mode` "x" refuses to overwrite, "w" replaces, "a" continues it, or makes it.
         metadata_callback: called with every step (an RLTuple), returns the episode's metadata (a dict); reset after
             it, and before the first one.
         record_info: False, True (everything), a list of names, or a function from info to what is recorded.

@@ -1,5 +1,6 @@
-"""A rollout in several files: what the next one is called, and when it is time for it.
+"""A rollout in one file or several: what they are called, and when it is time for the next one.
 
+A directory gets a new file, `CartPole-v1_2026-11-23_16-55-03.mcap`; what the path lacks of directories is made.
 `run.mcap` is followed by `run_0001.mcap`, `run_0002.mcap`, …, an order that sorting by name keeps. Each is a recording
 of its own, with its benchmark and attachments.
 """
@@ -7,14 +8,16 @@ of its own, with its benchmark and attachments.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
+import re
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.index import INDEX_NAME
@@ -36,8 +39,10 @@ class Rotation:
     With limits, mode "a" goes on in the last file of a series, and finishes one before it that a killed process left.
 
     Args:
+        path: of the first file, or a directory.
         options: how each of the files is written; `mode` is that of the first one.
         format_version: the least one that has what is recorded.
+        name: what a new file in a directory is called, before the time.
 
     Attributes:
         beginning: a context in which the next file is made.
@@ -48,22 +53,38 @@ class Rotation:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], options: RecordOptions, format_version: str = "1"
+        self,
+        path: str | os.PathLike[str],
+        options: RecordOptions,
+        format_version: str = "1",
+        name: str = "run",
     ) -> None:
         check_place(path)
+        self._name = re.sub(r"[^\w.+-]+", "_", name)
+        is_folder = Path(path).is_dir() or os.fspath(path).endswith(os.sep)
+        self._folder = Path(path) if is_folder else None
         self._options, self._format_version = options, format_version
         self._limited, self._max_bytes, self._max_seconds = (
             options.has_limits,
             options.max_bytes,
             options.max_seconds,
         )
-        self._paths = [Path(path)]
-        if self._limited:
+        self._paths = [Path(path) if self._folder is None else self._new_in(self._folder)]
+        if self._limited and self._folder is None:
             self._join(options.mode)
         self._opened = 0.0
         self._head = 0  # bytes of attachments
         self.beginning: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
         self.finished: Callable[[Path], object] = lambda path: None
+
+    def _new_in(self, folder: Path) -> Path:
+        """A path in a directory at which nothing is."""
+        stem = f"{self._name}_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
+        for k in itertools.count(1):
+            path = folder / f"{stem}{'' if k == 1 else f'-{k}'}.mcap"
+            if not os.path.lexists(path):
+                break
+        return path
 
     def _join(self, mode: Mode) -> None:
         path = self._paths[0]
@@ -101,8 +122,17 @@ class Rotation:
         Raises:
             RecordingError: as `RecordingWriter`.
         """
-        path, mode = self._paths[0], self._options.mode
-        return self._open(path, "x" if mode == "a" and not os.path.lexists(path) else mode)
+        while True:
+            path, mode = self._paths[0], self._options.mode
+            is_new = not os.path.lexists(path)
+            if is_new:
+                _make_folder(path)
+            try:
+                return self._open(path, "x" if self._folder is not None or (mode == "a" and is_new) else mode)
+            except RecordingError:
+                if self._folder is None or not os.path.lexists(path):
+                    raise
+            self._paths = [self._new_in(self._folder)]  # another process has made a file of this name
 
     def _open(self, path: Path, mode: Mode) -> RecordingWriter:
         options = replace(self._options, mode=mode)
@@ -140,3 +170,13 @@ class Rotation:
             writer = self._open(path, "x")
         self._paths.append(path)
         return writer
+
+
+def _make_folder(path: Path) -> None:
+    """Makes the directories that a file is to be in."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        pass  # opening the file says what is in the way
+    except OSError as err:
+        raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
