@@ -128,9 +128,7 @@ def _named(recording: Recording, among: Positions, item: str, text: str, why: st
     if item in ("first", "last"):
         return [int(among[0 if item == "first" else -1])]
     if item in ("best", "worst"):
-        # a return that is not a number is neither
-        returns = np.nan_to_num(recording.index["return"][among], nan=-np.inf if item == "best" else np.inf)
-        return [int(among[returns.argmax() if item == "best" else returns.argmin()])]
+        return [int(among[_extreme(item, recording.index["return"][among])])]
     if not item.isdecimal() or len(item) > _MAX_DIGITS:
         raise FilterError(
             f"expected numbers of episodes such as '3,7,9', or {', '.join(WORDS[:-1])} or {WORDS[-1]}, "
@@ -141,6 +139,13 @@ def _named(recording: Recording, among: Positions, item: str, text: str, why: st
     if not len(found):
         raise RecordingError(f"{recording.name} has no episode {item}{why}; choose from {_range(numbers)}")
     return [int(found[0])]
+
+
+def _extreme(word: str, returns: Any) -> int:
+    """Where the best or worst of some returns is; one that is no number is neither, unless there is no other."""
+    if word == "best":
+        return int(np.nan_to_num(returns, nan=-np.inf).argmax())
+    return int(np.nan_to_num(returns, nan=np.inf).argmin())
 
 
 def _range(numbers: Any) -> str:
@@ -328,4 +333,4 @@ def _files_of(item: str, returns: dict[str, float]) -> list[str]:
         return files
     if item in ("first", "last"):
         return [files[0 if item == "first" else -1]]
-    return [(max if item == "best" else min)(files, key=returns.__getitem__)]
+    return [files[_extreme(item, list(returns.values()))]]
