@@ -335,9 +335,11 @@ def _write_episodes(
 
 
 def _carried(recording: Recording) -> Attachments:
+    """What a recording carries, without its signature, which is of its own episodes only."""
     return {
         name: (info.media_type, recording.read_attachment(name))
         for name, info in recording.attachments.items()
+        if name != SIGNATURE_NAME
     }
 
 
