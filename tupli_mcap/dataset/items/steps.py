@@ -96,7 +96,7 @@ class MemorySteps:
         return len(self._rest)
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
-        checked_fields(fields)
+        fields = checked_fields(fields)
         missing = [field for field in fields if field not in self._columns]
         found = self._rest.read(missing, rows) if missing else {}
         where = following(rows, len(self))
@@ -105,7 +105,7 @@ class MemorySteps:
         }
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
-        checked_fields(fields)
+        fields = checked_fields(fields)
         missing = [field for field in fields if field not in self._columns]
         found = self._rest.read_runs(missing, starts, length) if missing else {}
         return {
