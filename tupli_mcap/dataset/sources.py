@@ -247,10 +247,10 @@ def _benchmark_header(recording: Recording) -> BenchmarkHeader:
     if "benchmark.json" in recording.attachments:
         record = recording.benchmark.record
         metadata, environment = BenchmarkMetadata(name=record.name), record.name
-        told = (record.benchmark or {}).get("metadata")
-        if isinstance(told, dict):
+        entry = (record.benchmark or {}).get("metadata")
+        if isinstance(entry, dict):
             with contextlib.suppress(ValidationError, FormatError):  # somebody else's words
-                metadata = BenchmarkMetadata.model_validate(restored(told))
+                metadata = BenchmarkMetadata.model_validate(restored(entry))
     return BenchmarkHeader(
         id=recording.benchmark_id,
         created_by="",

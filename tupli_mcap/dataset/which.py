@@ -135,10 +135,10 @@ def _named(recording: Recording, among: Positions, item: str, text: str, why: st
             f"found {item[:40]!r} in {text[:80]!r}"
         )
     numbers = recording.index["episode"][among]
-    found = among[numbers == int(item)]
-    if not len(found):
+    matching = among[numbers == int(item)]
+    if not len(matching):
         raise RecordingError(f"{recording.name} has no episode {item}{why}; choose from {_range(numbers)}")
-    return [int(found[0])]
+    return [int(matching[0])]
 
 
 def _extreme(word: str, returns: Any) -> int:

@@ -194,10 +194,10 @@ def _plain_spec(spec: Any) -> dict[str, Any]:
     """Raises ValueError or TypeError where JSON has no form for it."""
     names = [field.name for field in dataclasses.fields(spec) if field.init]
     names.remove("vector_entry_point")  # how others are made, and changing with gymnasium's versions
-    told = {name: getattr(spec, name) for name in names}
-    told["entry_point"] = entry_point_name(spec.entry_point)
-    told["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]
-    plain: dict[str, Any] = json.loads(canonical_json(told))
+    fields = {name: getattr(spec, name) for name in names}
+    fields["entry_point"] = entry_point_name(spec.entry_point)
+    fields["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]
+    plain: dict[str, Any] = json.loads(canonical_json(fields))
     return plain
 
 
@@ -210,8 +210,10 @@ def _is_as_made(env: gym.Env[Any, Any], spec: Mapping[str, Any]) -> bool:
         return False
     if [_class_name(wrapper) for wrapper in reversed(wrappers)] != _wrappers_of(spec):
         return False
-    told = [wrapper._has_reset for wrapper in wrappers if isinstance(wrapper, gym.wrappers.OrderEnforcing)]
-    if any(told) or (not told and getattr(base, "_np_random", None) is not None):
+    has_reset = [
+        wrapper._has_reset for wrapper in wrappers if isinstance(wrapper, gym.wrappers.OrderEnforcing)
+    ]
+    if any(has_reset) or (not has_reset and getattr(base, "_np_random", None) is not None):
         return False  # it has been reset
     if is_changed(base, base.spec.kwargs):
         return False

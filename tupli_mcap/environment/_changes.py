@@ -67,18 +67,18 @@ def _bound(cls: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
 @functools.lru_cache(maxsize=256)
 def _assigned(cls: type) -> Mapping[str, list[Any]]:
     """What the code of a class and its bases gives to each attribute it assigns."""
-    found: dict[str, list[Any]] = {}
+    sources: dict[str, list[Any]] = {}
     for base in cls.__mro__:
         for name, member in vars(base).items():
             if isinstance(member, functools.cached_property):
-                found.setdefault(name, []).append(_COMPUTED)
+                sources.setdefault(name, []).append(_COMPUTED)
             for function in _functions(member):
                 own = function is cls.__init__  # type: ignore[misc]
                 for code in _codes(function.__code__):
                     for attribute, source in _stores(code):
                         usable = own or not isinstance(source, _Argument)
-                        found.setdefault(attribute, []).append(source if usable else _COMPUTED)
-    return found
+                        sources.setdefault(attribute, []).append(source if usable else _COMPUTED)
+    return sources
 
 
 def _functions(member: Any) -> Iterator[Callable[..., Any]]:

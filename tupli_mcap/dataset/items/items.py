@@ -157,10 +157,10 @@ class Items(ABC, Generic[T]):
         starts, blocks = [], []
         for first in range(0, len(self), _MANY):
             items = np.arange(first, min(first + _MANY, len(self)))
-            found = self.source.blocks(self.steps_of(items))
-            cuts = np.flatnonzero(np.diff(found, prepend=-1))
+            block_of = self.source.blocks(self.steps_of(items))
+            cuts = np.flatnonzero(np.diff(block_of, prepend=-1))
             starts.append(items[cuts])
-            blocks.append(found[cuts])
+            blocks.append(block_of[cuts])
         begin = np.concatenate(starts)
         return begin, np.diff(begin, append=len(self)), np.concatenate(blocks)
 

@@ -224,13 +224,13 @@ def checked_numbers(value: Any, what: str) -> Array:
         SamplingError: it is something else.
     """
     try:
-        found = np.asarray(value)
+        numbers = np.asarray(value)
     except (TypeError, ValueError, OverflowError):  # lists of different lengths, for example
-        found = np.empty(())
-    if found.ndim != 1 or (found.dtype.kind not in "iu" and len(found)):
+        numbers = np.empty(())
+    if numbers.ndim != 1 or (numbers.dtype.kind not in "iu" and len(numbers)):
         raise SamplingError(f"expected {what} in one dimension, found {value!r:.80}")
-    if found.dtype == np.uint64:
-        found = np.minimum(
-            found, np.uint64(_MOST)
+    if numbers.dtype == np.uint64:
+        numbers = np.minimum(
+            numbers, np.uint64(_MOST)
         )  # which is beyond everything, and does not become negative
-    return found.astype(np.int64)
+    return numbers.astype(np.int64)

@@ -132,13 +132,13 @@ def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], 
         if part.type in COMBINING:
             parts.append(_narrow(part, indexed, negated))
             continue
-        found = _compared(part)
+        narrow = _compared(part)
         if negated:
-            found = Narrowed(not_(found.condition), exact=True) if found.exact else _ALL
+            narrow = Narrowed(not_(narrow.condition), exact=True) if narrow.exact else _ALL
         elif path_of(part) in indexed and part.type is not FilterType.NE and not few:
             near = _near(part, VALUE.c.number, VALUE.c.text)
             values.setdefault(indexed[path_of(part)], []).append(near)
-        parts.append(found)
+        parts.append(narrow)
     held = (select(VALUE.c.episode_id).where(VALUE.c.key == key, *values[key]) for key in values)
     conditions = [*(part.condition for part in parts), *(EPISODE.c.id.in_(ids) for ids in held)]
     return Narrowed(and_(true(), *conditions), all(part.exact for part in parts))
