@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError, TupliError
+from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import (
     BaseFilter,
@@ -31,7 +32,6 @@ from tupli_mcap.storage.sidecar import Notes
 
 __all__ = ["DatasetError", "FilesSource", "Source", "StorageSource", "episode_headers"]
 
-_ENDS = ("terminal", "timeout", "interrupted")
 _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two blocks share it
 
 
@@ -222,9 +222,9 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
                 "benchmark_id": benchmark_id,
                 "metadata": {} if metadata == "{}" else _metadata(metadata, name, number),
                 "n_tuples": length,
-                "terminated": _ENDS[end] == "terminal",
-                "timeout": _ENDS[end] == "timeout",
-                "end": _ENDS[end],
+                "terminated": END_NAMES[end] == "terminal",
+                "timeout": END_NAMES[end] == "timeout",
+                "end": END_NAMES[end],
                 "episode_return": total,
                 "seed": seed if has_seed else None,
                 "env": env,

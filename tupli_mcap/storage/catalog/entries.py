@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED
 from tupli_mcap.recording import Recording
 from tupli_mcap.storage.base import LOCAL_USER
 from tupli_mcap.storage.catalog.rows import EpisodeRow
@@ -32,7 +33,6 @@ from tupli_mcap.storage.sidecar import Notes, Sidecar
 
 __all__ = ["Entry", "entry_of", "read_ahead"]
 
-_ENDS = ("terminal", "timeout", "interrupted")
 _MOST_EPISODES = 50_000  # of a recording that another process reads: its rows are in memory twice
 _TRIAL = 1.0  # seconds of reading here before it is known whether more processes are worth their start
 _WORTH = 3.0  # seconds that must be left then
@@ -155,7 +155,7 @@ def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[Epi
             episode=number,
             env=env,
             n_tuples=length,
-            end=_ENDS[end],
+            end=END_NAMES[end],
             episode_return=total,
             seed=seed,
             created_at=created_at,
@@ -169,4 +169,4 @@ def _running(envs: Sequence[int], ends: Sequence[int]) -> set[int]:
     """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no
     end."""
     last = {env: i for i, env in enumerate(envs)}
-    return {i for i in last.values() if _ENDS[ends[i]] == "interrupted"}
+    return {i for i in last.values() if ends[i] == INTERRUPTED}

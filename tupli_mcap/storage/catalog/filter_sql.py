@@ -20,6 +20,7 @@ from typing import Any, Final, NamedTuple
 from sqlalchemy import and_, false, func, not_, or_, select, true, union_all
 from sqlalchemy.sql.elements import ColumnElement
 
+from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.schema import BaseFilter, FilterIN, FilterType
 from tupli_mcap.schema.facts import comparisons
 from tupli_mcap.schema.filters import COMBINING, ORDERING, path_of
@@ -59,7 +60,7 @@ _TEXTS: Final = {
 _INTEGERS: Final = {name: EPISODE.c[name] for name in ("created_at", "n_tuples", "env", "episode")}
 _NUMBERS: Final = {name: EPISODE.c[name] for name in ("episode_return", "seed")}
 _CHOICES: Final[Mapping[str, Mapping[Scalar, Condition]]] = {
-    "end": {Scalar("text", end): EPISODE.c.end == end for end in ("terminal", "timeout", "interrupted")},
+    "end": {Scalar("text", end): EPISODE.c.end == end for end in END_NAMES},
     "terminated": {
         Scalar("bool", True): EPISODE.c.end == "terminal",
         Scalar("bool", False): EPISODE.c.end != "terminal",
