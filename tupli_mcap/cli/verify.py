@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import textwrap
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ import typer
 
 from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
-from tupli_mcap.cli.terminal import fail, say, step_progress, terminal_width, visible
+from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import TupliError
 
 if TYPE_CHECKING:
@@ -167,7 +166,9 @@ class _Replays:
             return
         self._found.append((path, found, ""))
         if not quiet:
-            _print_lines(f"{path}: {_outcome(found)}", _lines(found, seconds))
+            say(f"{path}: {_outcome(found)}")
+            for line in _lines(found, seconds):
+                print_wrapped(line, "  ", "    ")
 
     def to_json(self) -> list[dict[str, Any]]:
         return [
@@ -175,15 +176,6 @@ class _Replays:
             | ({"error": error} if found is None else {"agrees": found.agrees, **found.model_dump()})
             for path, found, error in self._found
         ]
-
-
-def _print_lines(head: str, lines: Sequence[str]) -> None:
-    width = terminal_width()
-    say(head)
-    for line in map(visible, lines):
-        parts = [line] if width is None else textwrap.wrap(line, max(40, width - 4), break_on_hyphens=False)
-        for i, part in enumerate(parts):
-            say(f"{'  ' if i == 0 else '    '}{part}")
 
 
 def _outcome(c: Certificate) -> str:
