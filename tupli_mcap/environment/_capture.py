@@ -170,9 +170,8 @@ def _told(env: gym.Env[Any, Any]) -> tuple[str | None, dict[str, Any] | None]:
         return name, None
     finally:
         for wrapper, cached in zip(wrappers, before, strict=True):
-            wrapper._cached_spec = (
-                cached  # that somebody has read the spec is no part of an environment's state
-            )
+            # that somebody has read the spec is no part of an environment's state
+            wrapper._cached_spec = cached
 
 
 def _told_of_many(envs: Any) -> tuple[str | None, dict[str, Any] | None]:

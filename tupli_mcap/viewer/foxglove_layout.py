@@ -22,12 +22,12 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names
+from tupli_mcap.viewer.scene import MOST_LINES
 from tupli_mcap.viewer.targets import check_new
 
 __all__ = ["foxglove_layout", "write_layout"]
 
 _WIDEST = 64  # elements of a leaf that is plotted
-_MOST_LINES = 12  # in a plot
 _PLOT = {
     "isSynced": True,
     "legendDisplay": "floating",
@@ -126,7 +126,7 @@ def _paths(recording: Recording, topics: Topics, leaf: Leaf) -> list[dict[str, A
     field = f"{topics.step}.{leaf.name}"
     if leaf.shape == ():
         return [_path(field, names[0])]
-    return [_path(f"{field}[{i}]", name) for i, name in enumerate(names[:_MOST_LINES])]
+    return [_path(f"{field}[{i}]", name) for i, name in enumerate(names[:MOST_LINES])]
 
 
 def _path(value: str, label: str) -> dict[str, Any]:

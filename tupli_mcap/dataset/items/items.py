@@ -147,10 +147,8 @@ class Items(ABC, Generic[T]):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            **self.__dict__,
-            "_values_of": None,
-        }  # a copy elsewhere reads items; it needs no list of episodes
+        # a copy elsewhere reads items; it needs no list of episodes
+        return {**self.__dict__, "_values_of": None}
 
     def block_runs(self) -> tuple[Array, Array, Array]:
         """Runs of items that lie in one block of the storage: the first item and the length of each, and its block."""

@@ -135,9 +135,8 @@ class RecordedSteps:
     def room(self) -> int:
         """How many steps are in the chunks that fit into half the cache."""
         stored = sum(int(store.table["uncompressed"].sum()) for store in self._index.stores)
-        images = (
-            sum(leaf.size for leaf in self.layout.images) if self.layout else 0
-        )  # stored smaller, some of them
+        # images may be stored smaller than they are
+        images = sum(leaf.size for leaf in self.layout.images) if self.layout else 0
         return int(self.cache_bytes / 2 / max(1, stored / max(1, len(self)), images))
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:

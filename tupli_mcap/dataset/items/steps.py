@@ -230,7 +230,6 @@ def checked_numbers(value: Any, what: str) -> Array:
     if numbers.ndim != 1 or (numbers.dtype.kind not in "iu" and len(numbers)):
         raise SamplingError(f"expected {what} in one dimension, found {value!r:.80}")
     if numbers.dtype == np.uint64:
-        numbers = np.minimum(
-            numbers, np.uint64(_MOST)
-        )  # which is beyond everything, and does not become negative
+        # which is beyond everything, and does not become negative
+        numbers = np.minimum(numbers, np.uint64(_MOST))
     return numbers.astype(np.int64)
