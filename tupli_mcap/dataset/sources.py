@@ -52,7 +52,7 @@ class Source(Protocol):
     ) -> list[EpisodeHeader]:
         """The episodes both filters are true of; those of one recording follow each other.
 
-        What has been opened for it is put into `seen` by name, closed again: it still says where its steps lie.
+        `seen` is given the recordings that were opened, by name; they are closed, but still say where their steps lie.
         """
         ...
 

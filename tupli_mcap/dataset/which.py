@@ -90,7 +90,7 @@ def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positi
 
 
 def _may_be_noted(path: Path) -> bool:
-    """Whether a storage may have noted of a recording what is deleted."""
+    """Whether a storage may have noted deleted episodes of a recording."""
     folders = list(path.absolute().parents)[:3]
     return path.with_name(f"{path.name}.json").exists() or any(
         (folder / "deleting.json").exists() for folder in folders
@@ -327,7 +327,7 @@ def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: Exi
 
 
 def _files_of(item: str, returns: dict[str, float]) -> list[str]:
-    """Of the files that have what an item names, and its return in each, those that are meant."""
+    """The files that an item means, of those that have such an episode; `returns` are its returns in them."""
     files = list(returns)
     if not files or item not in ("best", "worst", "first", "last"):
         return files

@@ -17,7 +17,9 @@ _LARGEST: Final = 1 << 20
 
 
 def more_than_data(value: object) -> str:
-    """What in a value from a file some code may take for more than data, and for what; empty if there is nothing.
+    """Why a value from a file needs trust: the part of it that some code may take for more than data, and for what.
+
+    Empty if it is data only.
 
     Some environments hand texts to `open` or `gymnasium.make`, and allocate as many things as a number says. Flags,
     plain words, fractions and whole numbers up to 2^20 are data; several of those may still cost much memory.

@@ -34,9 +34,9 @@ _OF_MAKE_VEC = ("num_envs", "vectorization_mode", "vector_kwargs", "wrappers")  
 def note(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> EnvironmentRecord:
     """What an environment says of itself: its EnvSpec, where JSON has a form for it, and the names of its classes.
 
-    Whether the spec rebuilds it as it is now is not asked. Of a vector environment it is the first sub-environment if
-    that lives in this process; of others it is the spec they were made from by `gymnasium.make_vec`, if
-    `gymnasium.make` takes it, and else the id.
+    The spec may not rebuild the environment as it is now. Of a vector environment, the first sub-environment is noted
+    if it lives in this process; else the spec that `gymnasium.make_vec` was given, if `gymnasium.make` takes it, or the
+    id.
     """
     if not isinstance(env, gym.vector.VectorEnv):
         return _noted(env, *_told(env))

@@ -24,7 +24,7 @@ _MOST = 10_000  # names
 
 
 def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> Labels:
-    """What the environment says of itself: tables and lists with a number for each dimension or value.
+    """Labels from the tables and lists in an environment's documentation that number its dimensions or values.
 
     Gymnasium documents its environments this way: https://gymnasium.farama.org/environments/classic_control/cart_pole.
     """
@@ -98,7 +98,7 @@ def _names(section: str, count: int) -> tuple[str, ...]:
 
 
 def _meanings(env: Any, count: int) -> tuple[str, ...]:
-    """What the Arcade Learning Environment says of its actions."""
+    """The names that the Arcade Learning Environment gives its actions; empty for other environments."""
     with contextlib.suppress(Exception):  # whatever it does
         names = tuple(_plain(str(name)) for name in env.get_action_meanings())
         return names if len(names) == count and all(names) else ()

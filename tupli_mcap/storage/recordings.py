@@ -88,7 +88,7 @@ class RecordingFiles:
         return self._settled(lambda: self._catalog.count(filter))
 
     def _settled(self, ask: Callable[[], _T]) -> _T:
-        """What a catalog says that is up to date, and that nobody has put another in the place of since."""
+        """Asks a catalog that is up to date, again if somebody has replaced it meanwhile."""
 
         def settle() -> _T:
             for _ in range(_ATTEMPTS):
@@ -208,15 +208,17 @@ class RecordingFiles:
         return self._opened
 
     def _declare_keys(self) -> None:
-        """After the catalog was opened or made anew, perhaps by another process: once there is something in it, for an
-        index is made more quickly than it is added to."""
+        """Declares the keys in a catalog that was opened or made anew, perhaps by another process.
+
+        Done once its rows are in it: making an index of them is quicker than adding each to one.
+        """
         if self._undeclared:
             for key in self._declared_keys:
                 self._catalog.declare_key(key)
             self._undeclared = False
 
     def reindex(self) -> None:
-        """Forget the catalog and fill it from the files."""
+        """Empty the catalog and fill it from the files."""
 
         def make() -> None:
             with self._catalog.alone():  # nobody sees half of it

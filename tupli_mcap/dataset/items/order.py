@@ -209,7 +209,7 @@ def seeded(seed: int, stream: int, number: int) -> np.random.Generator:
 
 
 def _digest(runs: tuple[Array, Array, Array]) -> str:
-    """Of which items lie in which block."""
+    """A digest (SHA-256, hex) of which items lie in which block."""
     return hashlib.sha256(b"".join(part.tobytes() for part in runs)).hexdigest()
 
 
