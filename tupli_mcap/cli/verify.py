@@ -59,23 +59,25 @@ def verify(
         raise typer.BadParameter("--trust and --episodes go with --replay")
     from tupli_mcap.storage.verify import StorageReport, verify_paths
 
-    found = StorageReport()
+    storage_report = StorageReport()
     for report in verify_paths(paths):
-        found.files.append(report)
+        storage_report.files.append(report)
         if not as_json:
             _print_verified(report)
         if replays is not None and report.kind == "recording" and report.ok:
             replays.add(Path(report.path), quiet=as_json)
     if as_json:
-        print_json({**found.to_json(), **({} if replays is None else {"replays": replays.to_json()})})
-    elif not found.files:
+        print_json(
+            {**storage_report.to_json(), **({} if replays is None else {"replays": replays.to_json()})}
+        )
+    elif not storage_report.files:
         fail("there is nothing to verify; give recordings (.mcap) or directories of them")
         raise typer.Exit(1)
-    elif len(found.files) > 1:
-        say(f"{number(len(found.files))} verified, {number(len(found.damaged))} damaged")
+    elif len(storage_report.files) > 1:
+        say(f"{number(len(storage_report.files))} verified, {number(len(storage_report.damaged))} damaged")
     if replays is not None and not replays.tried and not as_json:
         fail("nothing was replayed: there is no undamaged recording; recover one first")
-    if not found.ok or (replays is not None and not replays.ok):
+    if not storage_report.ok or (replays is not None and not replays.ok):
         raise typer.Exit(1)
 
 
@@ -157,17 +159,19 @@ class _Replays:
         began = time.perf_counter()
         try:
             with Recording(path) as recording, step_progress(recording.num_steps, "replaying") as progress:
-                found = certify(recording, trust=self._trust, episodes=self._episodes, progress=progress)
+                certificate = certify(
+                    recording, trust=self._trust, episodes=self._episodes, progress=progress
+                )
             seconds = time.perf_counter() - began
         except TupliError as err:
             self._found.append((path, None, str(err)))
             if not quiet:
                 fail(str(err))
             return
-        self._found.append((path, found, ""))
+        self._found.append((path, certificate, ""))
         if not quiet:
-            say(f"{path}: {_outcome(found)}")
-            for line in _lines(found, seconds):
+            say(f"{path}: {_outcome(certificate)}")
+            for line in _lines(certificate, seconds):
                 print_wrapped(line, "  ", "    ")
 
     def to_json(self) -> list[dict[str, Any]]:

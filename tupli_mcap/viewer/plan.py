@@ -157,8 +157,8 @@ def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
             number = item.recording.episodes[position].number
             name = f"episode {number} · {Path(item.recording.name).stem}"  # the viewer's list shows only the beginning
             part = Part(Chosen(item.recording, [position]), scene)
-            told = _episode_told(item.recording, position)
-            yield Plan(name, f"{item.recording.uuid}-{number}", [part], told, listed=several)
+            text = _episode_told(item.recording, position)
+            yield Plan(name, f"{item.recording.uuid}-{number}", [part], text, listed=several)
 
 
 def _joined(chosen: Sequence[Chosen]) -> Plan:
@@ -171,11 +171,11 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
     total = sum(len(item.positions) for item in chosen)
     name = Path(chosen[0].recording.name).stem
     if total == 1:
-        told = _episode_told(chosen[0].recording, chosen[0].positions[0])
+        text = _episode_told(chosen[0].recording, chosen[0].positions[0])
     else:
-        told = f"{total:,} episodes, {sum(part.steps for part in parts):,} steps, on one timeline"
+        text = f"{total:,} episodes, {sum(part.steps for part in parts):,} steps, on one timeline"
     scene.rows = first
-    return Plan(name, chosen[0].recording.uuid, parts, told)
+    return Plan(name, chosen[0].recording.uuid, parts, text)
 
 
 def _episode_told(recording: Recording, position: int) -> str:

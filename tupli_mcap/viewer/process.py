@@ -51,15 +51,15 @@ def viewer_program() -> Path:
         program = Path(folder) / "rerun"
         if program.is_file():
             return program
-    found = shutil.which("rerun")
-    if found is None:
+    on_path = shutil.which("rerun")
+    if on_path is None:
         raise ViewerError(f"there is no viewer: expected the program 'rerun' of rerun-sdk {sdk}; {again}")
-    told = run_quietly(Path(found), "--version")
-    if version_of(told) != version_of(sdk):
+    version = run_quietly(Path(on_path), "--version")
+    if version_of(version) != version_of(sdk):
         raise ViewerError(
-            f"expected the viewer {found} to be of version {sdk}, as rerun-sdk is, found {told.strip()[:80]!r}; {again}"
+            f"expected the viewer {on_path} to be of version {sdk}, as rerun-sdk is, found {version.strip()[:80]!r}; {again}"
         )
-    return Path(found)
+    return Path(on_path)
 
 
 def run_quietly(program: Path, *arguments: str) -> str:

@@ -181,15 +181,15 @@ def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Pan
     names = dimension_names(leaf, material.labels.dimensions.get(leaf.path))
     groups = _by_scale(_magnitudes(material.values(leaf, column)), _RATIO, most)
     stepped = column == "actions" or (leaf.dtype is not None and leaf.dtype.kind in "iub")
-    found: list[Panel] = []
+    panels: list[Panel] = []
     for dims in groups:
-        told = [names[i] for i in dims]
+        names_here = [names[i] for i in dims]
         alone = len(groups) == 1
         entity = entity_of(leaf)
         path = entity if alone else f"{entity}/dims_{'_'.join(map(str, dims))}"
-        title = title_of(leaf) if alone else f"{title_of(leaf)}: {_some(told)}"
-        found.append(Series(leaf, column, path, title, dims, told, stepped))
-    return found
+        title = title_of(leaf) if alone else f"{title_of(leaf)}: {_some(names_here)}"
+        panels.append(Series(leaf, column, path, title, dims, names_here, stepped))
+    return panels
 
 
 def _magnitudes(values: Array) -> list[float]:
