@@ -129,7 +129,7 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
         write_layout(source, target)
     write_layout(source, target, force=True)
     assert json.loads(target.read_text(encoding="utf-8"))["layout"]["direction"] == "row"
-    with pytest.raises(RecordingError, match="found the recording"):
+    with pytest.raises(RecordingError, match="is the recording, which is never written over"):
         write_layout(source, source, force=True)
     with pytest.raises(RecordingError, match="there is no directory"):
         write_layout(source, tmp_path / "no" / "layout.json")

@@ -50,22 +50,21 @@ def write_layout(
         force: replace a file that exists.
 
     Raises:
-        RecordingError: it is not one recording, the recording has no step, or the file exists, has the ending of a
-            recording, or cannot be written.
+        RecordingError: it is not one recording, the recording has no step, or the file exists, is the recording itself,
+            or cannot be written.
         FormatError: the recording is damaged.
     """
     path = Path(target)
-    if path.suffix == ".mcap":
-        raise RecordingError(
-            f"expected a name for a layout, such as layout.json, found the recording {str(path)!r}"
-        )
     check_new(path, force=force)
     with chosen_from(sources, None, None) as chosen:
         if len(chosen) != 1:
             raise RecordingError(
                 f"expected one recording to lay out, found {len(chosen)}; give them one by one"
             )
-        layout = foxglove_layout(chosen[0].recording)
+        recording = chosen[0].recording
+        if recording.path is not None and path.exists() and path.samefile(recording.path):
+            raise RecordingError(f"{path} is the recording, which is never written over; give another name")
+        layout = foxglove_layout(recording)
     text = json.dumps(layout, indent=2, ensure_ascii=False) + "\n"
     with replacing(path) as (_, temporary):
         temporary.write_text(text, encoding="utf-8")

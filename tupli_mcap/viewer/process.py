@@ -57,7 +57,8 @@ def viewer_program() -> Path:
     version = run_quietly(Path(on_path), "--version")
     if version_of(version) != version_of(sdk):
         raise ViewerError(
-            f"expected the viewer {on_path} to be of version {sdk}, as rerun-sdk is, found {version.strip()[:80]!r}; {again}"
+            f"expected the viewer {on_path} to be of version {sdk}, as rerun-sdk is, found {version.strip()[:80]!r}; "
+            f"{again}"
         )
     return Path(on_path)
 
