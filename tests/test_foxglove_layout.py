@@ -95,6 +95,13 @@ def test_what_has_no_number_in_a_message_is_not_plotted(tmp_path: Path) -> None:
     assert "Plot!state['on']" in panels
 
 
+def test_keys_that_utf_8_lacks(tmp_path: Path) -> None:
+    source = record(tmp_path / "r.mcap", spaces.Dict({"\ud800": spaces.Box(-1, 1, ())}))
+    layout = json.loads(write_layout(source, tmp_path / "layout.json").read_text(encoding="utf-8"))
+    (path,) = layout["configById"]["Plot!state['\\ud800']"]["paths"]
+    assert (path["value"], path["label"]) == ("/step.state", "?")
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_golden_recording_has_a_layout(name: str, tmp_path: Path) -> None:
     with Recording(place(name, tmp_path)) as recording:

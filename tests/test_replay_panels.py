@@ -225,6 +225,13 @@ def test_names_that_are_no_entity_paths(tmp_path: Path) -> None:
     assert "\N{ESCAPE}" not in "".join(entities)
 
 
+def test_keys_that_utf_8_lacks(tmp_path: Path) -> None:
+    parts = [("\ud800", Box(0, 1, ())), ("\udfff", spaces.Discrete(2)), ("\ud900", spaces.Text(3))]
+    space = spaces.Dict(parts)
+    found = replayed(tmp_path, Sampled(space))  # the SDK warns of a name that it cannot take
+    assert len([entity for entity in found.entities() if entity.startswith("/state")]) == 3
+
+
 def test_keys_that_would_be_one_entity_stay_apart(tmp_path: Path) -> None:
     long = "x" * 100
     space = spaces.Dict([(long + "a", Box(0, 1, (2,))), (long + "b", Box(0, 1, (2,)))])

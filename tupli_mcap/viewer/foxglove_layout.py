@@ -65,7 +65,7 @@ def write_layout(
         if recording.path is not None and path.exists() and path.samefile(recording.path):
             raise RecordingError(f"{path} is the recording, which is never written over; give another name")
         layout = foxglove_layout(recording)
-    text = json.dumps(layout, indent=2, ensure_ascii=False) + "\n"
+    text = json.dumps(layout, indent=2) + "\n"  # in ASCII: keys of a space may hold lone surrogates
     with replacing(path) as (_, temporary):
         temporary.write_text(text, encoding="utf-8")
     return path
