@@ -35,7 +35,8 @@ __all__ = [
 ]
 
 LOCAL = "127.0.0.1"
-_PATIENCE = 30.0  # seconds for a viewer to answer
+_PATIENCE = 30.0  # seconds for a viewer to start
+_ANSWER = 0.25  # seconds for one that listens to answer
 
 
 def viewer_program() -> Path:
@@ -95,10 +96,10 @@ def free_port() -> int:
         return int(found.getsockname()[1])
 
 
-def answers(host: str, port: int, seconds: float = 0.25) -> bool:
+def answers(host: str, port: int) -> bool:
     """Whether something listens there."""
     try:
-        socket.create_connection((host, port), seconds).close()
+        socket.create_connection((host, port), _ANSWER).close()
     except OSError:
         return False
     return True

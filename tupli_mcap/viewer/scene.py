@@ -39,6 +39,7 @@ _LINES_SMALL: Final = 6
 _MOST_LANES: Final = 12  # values of a Discrete leaf that get a colour each
 _MOST_LANE_ROWS: Final = 20_000  # the state timeline draws every change, however narrow
 _MOST_INFOS: Final = 12
+_TITLED: Final = 4  # dimensions that a title names
 _MOST_FRAMES: Final = 16  # of a stack that is not declared as one
 _LEAST_FRAME: Final = 16  # pixels of each of its sides
 _RATIO: Final = 30.0  # magnitudes further apart than this do not share an axis
@@ -216,9 +217,9 @@ def _by_scale(sizes: Sequence[float], ratio: float, most: int) -> list[list[int]
     return sorted(sorted(group) for group in groups)
 
 
-def _some(names: Sequence[str], most: int = 4) -> str:
+def _some(names: Sequence[str]) -> str:
     """The first names, as a title has room for."""
-    return ", ".join(names[:most]) + ("" if len(names) <= most else ", …")
+    return ", ".join(names[:_TITLED]) + ("" if len(names) <= _TITLED else ", …")
 
 
 def _many(scene: Scene, leaf: Leaf, column: str, material: _Material) -> list[Panel]:
