@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from tupli_mcap.dataset.which import choose_episodes
+from tupli_mcap.dataset.which import choose_episodes, chosen_from
 from tupli_mcap.errors import FilterError, RecordingError
 from tupli_mcap.recording import EpisodeData, Recording, write_recording
 from tupli_mcap.schema import F, parse_filter
@@ -18,9 +18,7 @@ from tupli_mcap.storage.sidecar import Sidecar
 RETURNS = [3.0, 9.0, -2.0, 9.0, float("nan"), -2.0]
 
 
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    path = tmp_path / "returns.mcap"
+def write(path: Path, returns: list[float]) -> Path:
     episodes = [
         EpisodeData(
             states=np.zeros((2, 1), np.float32),
@@ -30,11 +28,16 @@ def file(tmp_path: Path) -> Path:
             timeouts=np.zeros(2, np.bool_),
             metadata={"odd": bool(i % 2)},
         )
-        for i, value in enumerate(RETURNS)
+        for i, value in enumerate(returns)
     ]
     space = gym.spaces.Box(-1.0, 1.0, (1,))
     write_recording(path, episodes, observation_space=space, action_space=gym.spaces.Discrete(2))
     return path
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return write(tmp_path / "returns.mcap", RETURNS)
 
 
 @pytest.mark.parametrize(
@@ -101,3 +104,14 @@ def test_other_words_are_refused(file: Path, text: str) -> None:
         pytest.raises(FilterError, match=re.escape("'3,7,9', or best, worst, first, last or all, found")),
     ):
         choose_episodes(recording, text)
+
+
+@pytest.mark.parametrize(("word", "wanted"), [("best", 5.0), ("worst", -5.0)])
+def test_a_return_that_is_no_number_is_neither_best_nor_worst_of_a_directory(
+    tmp_path: Path, word: str, wanted: float
+) -> None:
+    nan = float("nan")
+    for name, returns in (("a", [nan, nan]), ("b", [nan, 5.0, -5.0]), ("c", [1.0])):
+        write(tmp_path / f"{name}.mcap", returns)
+    with chosen_from(tmp_path, word, None) as ((recording, (position,)),):
+        assert recording.index["return"][position] == wanted

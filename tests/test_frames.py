@@ -525,15 +525,6 @@ class TestStorages:
         assert found["episodes"] == plain["episodes"] == 8
         assert [f["check"] for f in found["findings"]] == [f["check"] for f in plain["findings"]]
 
-    def test_copies_for_stock_viewers(self, tmp_path: Path) -> None:
-        record(tmp_path / "r.mcap", [6, 3])
-        result = CliRunner().invoke(
-            app, ["replay", str(tmp_path / "r.mcap"), "--to-mcap", str(tmp_path / "new.mcap")]
-        )
-        assert result.exit_code == 0, result.output
-        assert check(tmp_path / "new.mcap") == 7 + 4
-        assert [p for p in problems(tmp_path / "new.mcap") if p.severity == "error"] == []
-
     def test_the_record_command(self, tmp_path: Path) -> None:
         path = str(tmp_path / "r.mcap")
         arguments = ["record", "CartPole-v1", "-o", path, "--steps", "30", "--frames"]

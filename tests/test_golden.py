@@ -26,6 +26,8 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import PROFILE
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.check.verify import verify_recording
+from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -160,6 +162,19 @@ def test_finishing_an_unfinished_one_loses_nothing(name: str, tmp_path: Path) ->
     with Recording(finished(name, tmp_path)) as recording:
         assert recording.complete
         assert_same(list(as_read(recording)), expected(name))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rewriting_one_keeps_everything(name: str, tmp_path: Path) -> None:
+    """Of a vector recording too, whose episodes end in another order than they begin in."""
+    with Recording(place(name, tmp_path)) as recording:
+        rewrite_recording(recording, tmp_path / "new.mcap")
+        uuid = recording.uuid
+    report = verify_recording(tmp_path / "new.mcap")
+    assert (report.kind, report.problems) == ("recording", [])
+    with Recording(tmp_path / "new.mcap") as rewritten:
+        assert_same(list(as_read(rewritten)), expected(name))
+        assert (rewritten.uuid, rewritten.complete) == (uuid, True)
 
 
 @pytest.mark.parametrize("name", NAMES)

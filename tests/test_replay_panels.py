@@ -87,6 +87,14 @@ def test_dimensions_of_other_scales_are_other_entities(tmp_path: Path) -> None:
     assert np.array_equal(groups["/state/dims_0_2"], np.outer(steps, [1.0, 2.0]))
 
 
+def test_images_leave_enough_steps_to_tell_scales_by(tmp_path: Path) -> None:
+    image, number = np.zeros((200, 200, 3), np.uint8), Box(-np.inf, np.inf, (2,), np.float64)
+    space = spaces.Dict({"camera": Box(0, 255, image.shape, np.uint8), "x": number})
+    state = Sampled(space, lambda t: {"camera": image, "x": np.array([1.0, 0.0 if t == 4 else 500.0])})
+    found = replayed(tmp_path, state)
+    assert {"/state/x/dims_0", "/state/x/dims_1"} <= set(found.entities())
+
+
 def test_more_than_twelve_dimensions_are_a_heat_map_an_episode(tmp_path: Path) -> None:
     found = replayed(
         tmp_path, Sampled(Box(-1, 1, (13,), np.float64), lambda t: np.sin(t / 9 + np.arange(13)))
@@ -215,6 +223,13 @@ def test_names_that_are_no_entity_paths(tmp_path: Path) -> None:
     assert len(entities) == len(names)
     assert all(found.scalars(entity).shape == (22, 2) for entity in entities)
     assert "\N{ESCAPE}" not in "".join(entities)
+
+
+def test_keys_that_utf_8_lacks(tmp_path: Path) -> None:
+    parts = [("\ud800", Box(0, 1, ())), ("\udfff", spaces.Discrete(2)), ("\ud900", spaces.Text(3))]
+    space = spaces.Dict(parts)
+    found = replayed(tmp_path, Sampled(space))  # the SDK warns of a name that it cannot take
+    assert len([entity for entity in found.entities() if entity.startswith("/state")]) == 3
 
 
 def test_keys_that_would_be_one_entity_stay_apart(tmp_path: Path) -> None:

@@ -175,6 +175,18 @@ def test_many_files_keep_few_open(tmp_path: Path) -> None:
     assert np.array_equal(found, np.tile(one, (200, 1))[rows])
 
 
+def test_one_field_may_be_given_as_a_text(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(Sampler(spaces.Box(0, 1, (3,)), spaces.Discrete(3)), path) as env:
+        roll(env, 40)
+    dataset = TupliDataset.from_files(path)
+    rows = np.array([0, 5])
+    recorded = dataset.steps.read("rewards", rows)
+    dataset.load()
+    assert list(recorded) == ["rewards"]
+    assert np.array_equal(dataset.steps.read("rewards", rows)["rewards"], recorded["rewards"])
+
+
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     directory = tmp_path_factory.mktemp("library")

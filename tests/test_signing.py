@@ -51,7 +51,7 @@ from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
-from tupli_mcap.schema import ArtifactMetadata, FilterEQ
+from tupli_mcap.schema import ArtifactMetadata, Episode, FilterEQ
 
 
 def write_key(path: Path, *, format: str = "ssh", passphrase: str | None = None) -> signing.SigningKey:
@@ -276,6 +276,18 @@ def test_rewriting_drops_a_signature_that_would_not_fit(bundle: Path, tmp_path: 
             rewrite_recording(recording, tmp_path / "other.mcap", **change)
         with pytest.raises(SignatureError, match="is not signed"):
             verified(tmp_path / "other.mcap")
+
+
+def test_exporting_several_recordings_drops_the_signature_of_the_first(bundle: Path, tmp_path: Path) -> None:
+    with FileStorage(tmp_path / "lab") as lab:
+        benchmark = lab.import_bundle(bundle)
+        (item, *_) = lab.list_episodes(include_tuples=True)
+        lab.record_episode(Episode(benchmark_id=benchmark, metadata={}, tuples=item.tuples))
+        lab.export(tmp_path / "all.mcap")
+    assert verify_recording(tmp_path / "all.mcap").problems == []
+    with Recording(tmp_path / "all.mcap") as recording:
+        assert len(recording) == 4
+        assert SIGNATURE_NAME not in recording.attachments
 
 
 def tampered(bundle: Path, target: Path, **changes: Any) -> Path:

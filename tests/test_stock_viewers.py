@@ -26,7 +26,6 @@ from test_golden import NAMES, finished
 
 from tupli_mcap.recording import Recording
 from tupli_mcap.spaces.leaves import Leaf
-from tupli_mcap.viewer.companion_channels import write_companions
 
 DECODERS = Path(__file__).parent / "foxglove"
 
@@ -75,21 +74,14 @@ def from_json(value: Any) -> Any:
     return {name: from_json(item) for name, item in value["fields"].items()}
 
 
-def copied(name: str, directory: Path) -> Path:
-    """A golden recording with the channels that stock viewers plot."""
-    with Recording(finished(name, directory)) as recording:
-        return write_companions(recording, directory / f"{name}-copy.mcap")
-
-
 @pytest.fixture(scope="module")
 def by_foxglove(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Message]]:
-    """Every message of every golden recording and of its copy, decoded by Foxglove's packages in one run of node."""
+    """Every message of every golden recording, decoded by Foxglove's packages in one run of node."""
     node = shutil.which("node")
     if node is None or not (DECODERS / "node_modules").is_dir():
         pytest.skip("Foxglove's decoders are not installed: node or tests/foxglove/node_modules is missing")
     directory = tmp_path_factory.mktemp("foxglove")
     paths = {str(finished(name, directory)): name for name in NAMES}
-    paths.update((str(copied(name, directory)), f"{name}-copy") for name in NAMES)
     done = subprocess.run(
         [node, str(DECODERS / "decode.mjs"), *paths], capture_output=True, text=True, timeout=120, check=False
     )
@@ -225,30 +217,6 @@ def test_foxgloves_decoders_say_what_our_reader_says(
     name: str, by_foxglove: dict[str, list[Message]], tmp_path: Path
 ) -> None:
     assert_told(finished(name, tmp_path), by_foxglove[name])
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_foxgloves_decoders_read_what_a_copy_plots(
-    name: str, by_foxglove: dict[str, list[Message]], tmp_path: Path
-) -> None:
-    path = copied(name, tmp_path)
-    followed = {message.topic for message in by_foxglove[name]}
-    one, other = (
-        [message for message in messages if message.topic not in followed]
-        for messages in (by_ros2(path), by_foxglove[f"{name}-copy"])
-    )
-    assert any("/plot/" in message.topic for message in one)
-    one.sort(key=_place)
-    other.sort(key=_place)
-    for wanted, found in zip(one, other, strict=True):
-        assert found[:3] == wanted[:3]
-        assert found.fields.keys() == wanted.fields.keys()
-        values = wanted.fields["data"], found.fields["data"]
-        assert np.array_equal(*values, equal_nan=not isinstance(values[0], str)), wanted.topic
-
-
-def _place(message: Message) -> tuple[str, int]:
-    return message.topic, message.sequence
 
 
 def test_the_comparison_can_fail(tmp_path: Path) -> None:

@@ -179,7 +179,7 @@ def test_names_and_texts_of_a_recording(recording: Path, tmp_path: Path) -> None
         ("episodes", recording, "--filter", f"metadata.{HOSTILE} = 1"),
         ("plot", recording, "-o", tmp_path / "p.png"),
         ("replay", recording, "--save", tmp_path / "r.rrd"),
-        ("replay", recording, "--to-mcap", tmp_path / "c.mcap"),
+        ("replay", recording, "--layout", tmp_path / "l.json"),
         ("verify", recording, "--replay"),
         ("recover", recording, "-o", tmp_path / "new.mcap"),
     ):

@@ -48,7 +48,7 @@ from tupli_mcap.recording.description import describe
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.sign.carried_code import carried_code
 from tupli_mcap.replay import certify, render
-from tupli_mcap.viewer.companion_channels import write_companions
+from tupli_mcap.viewer.foxglove_layout import write_layout
 
 # Starting programs, networks, native code, other processes: never, whatever the arguments are.
 FORBIDDEN = (
@@ -204,10 +204,7 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
     yield "view", lambda: viewer.save(path, work / f"{name}.rrd", force=True)
     yield "plot", lambda: plots.report(path)
     yield "render", lambda: render(path, work / f"rendered_{name}", overwrite=True)
-    yield (
-        "companions",
-        lambda: _with(path, lambda r: write_companions(r, work / f"companions_{name}", force=True)),
-    )
+    yield "layout", lambda: write_layout(path, work / f"{name}.json", force=True)
     for command in ("info", "ls", "episodes", "verify", "doctor"):
         yield f"tupli-mcap {command}", _cli(command, str(path))
     yield "tupli-mcap info --json", _cli("info", str(path), "--json")

@@ -98,14 +98,14 @@ def shown(value: Any) -> str:
         return f"<{type(value).__module__}.{type(value).__qualname__}>"
 
 
-def dumps_plain(value: Any, *, fallback: Fallback | None = None, max_depth: int = MAX_DEPTH) -> str:
+def dumps_plain(value: Any, *, max_depth: int = MAX_DEPTH) -> str:
     """Return JSON text that a filter can look into: NumPy scalars are numbers, arrays and tuples are lists.
 
     What JSON has no form for (NaN, infinities, bytes, sets, complex numbers, dates) is tagged as by `dumps`.
     Keys that are numbers, booleans or None become strings as the standard library's `json` makes them, unless
     two keys then meet. `max_depth` is for what is printed: `loads` reads `MAX_DEPTH` levels. Raises as `dumps` does.
     """
-    return _text(_Encoder(fallback, plain=True, max_depth=max_depth), value)
+    return _text(_Encoder(None, plain=True, max_depth=max_depth), value)
 
 
 def loads(text: str | bytes) -> Any:

@@ -85,14 +85,14 @@ def read_public_key(text: str, where: str = "the key") -> trust.TrustedKey:
     Raises:
         SignatureError: it is something else.
     """
-    found = _SSH_LINE.match(text.strip())
-    if found is not None:
+    line = _SSH_LINE.match(text.strip())
+    if line is not None:
         try:
-            blob = base64.b64decode(found[1], validate=True)
+            blob = base64.b64decode(line[1], validate=True)
         except binascii.Error:
             blob = b""
         if blob.startswith(_SSH_HEAD) and len(blob) == len(_SSH_HEAD) + 32:
-            return trust.TrustedKey(blob[len(_SSH_HEAD) :].hex(), (found[2] or "").strip())
+            return trust.TrustedKey(blob[len(_SSH_HEAD) :].hex(), (line[2] or "").strip())
     elif "-----BEGIN PUBLIC KEY-----" in text:
         library = _cryptography()
         try:

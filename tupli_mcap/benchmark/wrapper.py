@@ -114,9 +114,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         self._recording = True
         self._recorder: RecordEpisodes | None = None
         self._path: Path | None = None
-        self._pending: list[
-            PendingReset
-        ] = []  # resets that no step followed, each going on from the one before
+        # resets that no step followed, each going on from the one before
+        self._pending: list[PendingReset] = []
 
     @property
     def storage(self) -> TupliStorage:

@@ -58,10 +58,10 @@ def ls(
     from tupli_mcap.recording.description import nan_text
     from tupli_mcap.storage.listing import list_recordings
 
-    found = list(list_recordings(paths or [Path()]))
-    good = [item for item in found if item.error is None]
+    listed = list(list_recordings(paths or [Path()]))
+    good = [item for item in listed if item.error is None]
     if as_json:
-        print_json([item._asdict() for item in found])
+        print_json([item._asdict() for item in listed])
     else:
         columns = (
             Column("RECORDING", shrink="start"),
@@ -75,9 +75,9 @@ def ls(
             (short_ids(r.path), number(r.episodes), number(r.steps), mean, bytes_of(r.size), r.state, note)
             for r, mean, note in zip(good, means, notes, strict=True)
         ]
-        if good or not found:
+        if good or not listed:
             print_table(columns, rows, empty="no recordings")
-    bad = [item for item in found if item.error is not None]
+    bad = [item for item in listed if item.error is not None]
     for item in bad:
         fail(item.error or "")
     if bad:
@@ -277,23 +277,23 @@ def _print_series(recording: Recording) -> None:
     from tupli_mcap.recording.series import sketch
 
     room = (terminal_width() or _WIDEST + _OTHERS) - _OTHERS
-    found = sketch(recording, max(_NARROWEST, min(_WIDEST, room)))
-    if not found.courses:
+    summary = sketch(recording, max(_NARROWEST, min(_WIDEST, room)))
+    if not summary.courses:
         return
     say("")
-    _print_sparklines("EPISODES", "FIRST TO LAST", found.courses, zero_based=False)
-    if found.distributions:
+    _print_sparklines("EPISODES", "FIRST TO LAST", summary.courses, zero_based=False)
+    if summary.distributions:
         say("")
-        _print_sparklines("STEPS", "LEAST TO MOST", found.distributions, zero_based=True)
-        told = "" if found.sampled == recording.num_steps else f"{number(found.sampled)} steps sampled"
-        hidden = f"{number(found.hidden)} more dimensions" if found.hidden else ""
+        _print_sparklines("STEPS", "LEAST TO MOST", summary.distributions, zero_based=True)
+        told = "" if summary.sampled == recording.num_steps else f"{number(summary.sampled)} steps sampled"
+        hidden = f"{number(summary.hidden)} more dimensions" if summary.hidden else ""
         if told or hidden:
             say(", ".join(filter(None, (hidden, told))))
-        odd = [f"{number(one.odd)} of {one.name}" for one in found.distributions if one.odd]
+        odd = [f"{number(one.odd)} of {one.name}" for one in summary.distributions if one.odd]
         if odd:
             print_wrapped(f"not finite, left out: {', '.join(odd)}", "", "")
-    if found.error:
-        say(f"no step is shown: {found.error}")
+    if summary.error:
+        say(f"no step is shown: {summary.error}")
 
 
 def _print_sparklines(title: str, spark: str, series: Sequence[Series], *, zero_based: bool) -> None:

@@ -75,9 +75,8 @@ def render(
     """
     from tupli_mcap.replay import render
 
-    os.environ.setdefault(
-        "SDL_VIDEODRIVER", "dummy"
-    )  # no window is opened: pygame need not look for a screen
+    # no window is opened: pygame need not look for a screen
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     with (
         _chosen(source, episodes, filter_of(filter_text)) as (recording, chosen),
         step_progress(sum(map(len, chosen)), "rendering") as progress,

@@ -1,10 +1,9 @@
-"""The command replay: recordings in the Rerun viewer."""
+"""The command replay: recordings in the Rerun viewer, and a layout for Foxglove."""
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -39,16 +38,10 @@ _Connect = Annotated[
     ),
 ]
 _Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
-_ToMcap = Annotated[
-    Path | None,
-    typer.Option(
-        "--to-mcap", metavar="FILE.mcap", help="Write a copy that Rerun and Foxglove plot as it is instead."
-    ),
-]
 _Layout = Annotated[
     Path | None,
     typer.Option(
-        "--layout", metavar="FILE.json", help="Where --to-mcap puts the layout for Foxglove; beside the copy."
+        "--layout", metavar="FILE.json", help="Write a layout for Foxglove, which plots the recording."
     ),
 ]
 
@@ -63,7 +56,6 @@ def replay(
     web: _Web = False,
     connect: _Connect = None,
     force: _Force = False,
-    to_mcap: _ToMcap = None,
     layout: _Layout = None,
 ) -> None:
     """Look at recordings in the Rerun viewer.
@@ -72,15 +64,11 @@ def replay(
     Timelines: step, episode_time (where the recording knows how long a step takes), and wall clock.
     """
     goals = sum([web, save is not None, connect is not None])
-    if to_mcap is not None:
-        if compare or split or goals:
-            raise typer.BadParameter(
-                "--to-mcap writes a recording, and goes with --episode, --filter and --layout"
-            )
-        _copy(sources, to_mcap, episode, filter_of(filter_text), layout, force=force)
-        return
     if layout is not None:
-        raise typer.BadParameter("--layout goes with --to-mcap")
+        if episode or filter_text or compare or split or goals:
+            raise typer.BadParameter("--layout is of a whole recording, and goes with --force only")
+        _write_layout(sources, layout, force=force)
+        return
     if compare and split:
         raise typer.BadParameter("--compare overlays episodes, --split shows them apart; give one of them")
     if goals > 1:
@@ -112,12 +100,8 @@ def _tell(url: str) -> None:
     flush()
 
 
-def _copy(
-    sources: list[str], target: Path, episode: str | None, wanted: Any, layout: Path | None, *, force: bool
-) -> None:
-    from tupli_mcap.viewer.to_mcap import to_mcap
+def _write_layout(sources: list[str], target: Path, *, force: bool) -> None:
+    from tupli_mcap.viewer.foxglove_layout import write_layout
 
-    made = to_mcap(sources, target, episode, filter=wanted, layout=layout, force=force)
-    size = bytes_of(made.recording.stat().st_size)
-    say(f"{made.recording}: {size}; open it with: rerun {shlex.quote(str(made.recording))}")
-    say(f"{made.layout}: for Foxglove: open the copy, then import this as a layout")
+    path = write_layout(sources, target, force=force)
+    say(f"{path}: for Foxglove: open the recording, then import this as a layout")

@@ -122,24 +122,24 @@ def compact(
     from tupli_mcap.storage.listing import compactable
 
     with open_storage(storage_path) as storage:
-        found = compactable(storage_path)
+        recordings = compactable(storage_path)
         left = [str(path) for path in left_below(storage_path)]
         freed = 0 if dry_run else storage.compact()
     if as_json:
-        told = [item._asdict() for item in found]
+        told = [item._asdict() for item in recordings]
         print_json({"dry_run": dry_run, "recordings": told, "left_over": left, "bytes_freed": freed})
         return
     if dry_run:
         columns = (Column("RECORDING", shrink="start"), Column("DELETED", "right"), Column("SIZE", "right"))
-        rows = [(short_ids(i.recording), number(i.deleted), bytes_of(i.size)) for i in found]
-        if found or not left:
+        rows = [(short_ids(i.recording), number(i.deleted), bytes_of(i.size)) for i in recordings]
+        if recordings or not left:
             print_table(columns, rows, empty="nothing to compact")
         if left:
             say(f"would remove {counted(len(left), 'temporary file')} of killed processes")
         return
     say(
-        f"rewrote {counted(len(found), 'recording')}, freed {bytes_of(freed)}"
-        if found or left
+        f"rewrote {counted(len(recordings), 'recording')}, freed {bytes_of(freed)}"
+        if recordings or left
         else "nothing to compact"
     )
 

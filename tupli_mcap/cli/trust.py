@@ -97,9 +97,9 @@ def untrust(
     if (what is None) == (key is None):
         raise typer.BadParameter("expected either a FILE or DIGEST, or --key")
     if key is not None:
-        found = find_key(key)
-        label, shown = "fingerprint", fingerprint(found.public_key)
-        was_trusted = trust.untrust_key(found.public_key)
+        trusted_key = find_key(key)
+        label, shown = "fingerprint", fingerprint(trusted_key.public_key)
+        was_trusted = trust.untrust_key(trusted_key.public_key)
     else:
         label = "digest"
         shown, was_trusted = untrust(what or "")

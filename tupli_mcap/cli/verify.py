@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import textwrap
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ import typer
 
 from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
-from tupli_mcap.cli.terminal import fail, say, step_progress, terminal_width, visible
+from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import TupliError
 
 if TYPE_CHECKING:
@@ -60,23 +59,25 @@ def verify(
         raise typer.BadParameter("--trust and --episodes go with --replay")
     from tupli_mcap.storage.verify import StorageReport, verify_paths
 
-    found = StorageReport()
+    storage_report = StorageReport()
     for report in verify_paths(paths):
-        found.files.append(report)
+        storage_report.files.append(report)
         if not as_json:
             _print_verified(report)
         if replays is not None and report.kind == "recording" and report.ok:
             replays.add(Path(report.path), quiet=as_json)
     if as_json:
-        print_json({**found.to_json(), **({} if replays is None else {"replays": replays.to_json()})})
-    elif not found.files:
+        print_json(
+            {**storage_report.to_json(), **({} if replays is None else {"replays": replays.to_json()})}
+        )
+    elif not storage_report.files:
         fail("there is nothing to verify; give recordings (.mcap) or directories of them")
         raise typer.Exit(1)
-    elif len(found.files) > 1:
-        say(f"{number(len(found.files))} verified, {number(len(found.damaged))} damaged")
+    elif len(storage_report.files) > 1:
+        say(f"{number(len(storage_report.files))} verified, {number(len(storage_report.damaged))} damaged")
     if replays is not None and not replays.tried and not as_json:
         fail("nothing was replayed: there is no undamaged recording; recover one first")
-    if not found.ok or (replays is not None and not replays.ok):
+    if not storage_report.ok or (replays is not None and not replays.ok):
         raise typer.Exit(1)
 
 
@@ -158,16 +159,20 @@ class _Replays:
         began = time.perf_counter()
         try:
             with Recording(path) as recording, step_progress(recording.num_steps, "replaying") as progress:
-                found = certify(recording, trust=self._trust, episodes=self._episodes, progress=progress)
+                certificate = certify(
+                    recording, trust=self._trust, episodes=self._episodes, progress=progress
+                )
             seconds = time.perf_counter() - began
         except TupliError as err:
             self._found.append((path, None, str(err)))
             if not quiet:
                 fail(str(err))
             return
-        self._found.append((path, found, ""))
+        self._found.append((path, certificate, ""))
         if not quiet:
-            _print_lines(f"{path}: {_outcome(found)}", _lines(found, seconds))
+            say(f"{path}: {_outcome(certificate)}")
+            for line in _lines(certificate, seconds):
+                print_wrapped(line, "  ", "    ")
 
     def to_json(self) -> list[dict[str, Any]]:
         return [
@@ -175,15 +180,6 @@ class _Replays:
             | ({"error": error} if found is None else {"agrees": found.agrees, **found.model_dump()})
             for path, found, error in self._found
         ]
-
-
-def _print_lines(head: str, lines: Sequence[str]) -> None:
-    width = terminal_width()
-    say(head)
-    for line in map(visible, lines):
-        parts = [line] if width is None else textwrap.wrap(line, max(40, width - 4), break_on_hyphens=False)
-        for i, part in enumerate(parts):
-            say(f"{'  ' if i == 0 else '    '}{part}")
 
 
 def _outcome(c: Certificate) -> str:

@@ -122,13 +122,13 @@ class _Reader:
             bar.advance(steps)
 
     def _keep(self, columns: dict[str, Any], steps: int, layout: StepLayout) -> Array | None:
-        here = slice(self._done, self._done + steps)
+        block = slice(self._done, self._done + steps)
         if self._known is not None:
-            return None if self._known.mask is None else self._known.mask[here]
+            return None if self._known.mask is None else self._known.mask[block]
         if self._selector is None or self._mask is None:
             return None
-        self._mask[here] = self._selector.mask(columns, layout)
-        return self._mask[here]
+        self._mask[block] = self._selector.mask(columns, layout)
+        return self._mask[block]
 
     def finish(self, headers: Sequence[EpisodeHeader]) -> tuple[dict[str, Any], Selected, StepLayout | None]:
         selected = self._known

@@ -21,7 +21,7 @@ __all__ = ["Query"]
 
 
 class Query:
-    """What a dataset asks for. The filters never change; what has been read always belongs to `headers`.
+    """Three filters over a source, and what was read through them. The filters never change; columns are of `headers`.
 
     `layout` is that of the steps read last, None before.
     """

@@ -121,8 +121,8 @@ def _layout_of(steps: Steps) -> StepLayout:
             f"expected values of a fixed size, found {varying[0]}, which no array holds; read such steps from their "
             "recordings"
         )
-    found = {name: array.dtype for name, array in _arrays(steps, layout, np.empty(0, np.int64))}
-    dtypes = {name: found[name] for name in layout.dtypes}
+    dtype_of = {name: array.dtype for name, array in _arrays(steps, layout, np.empty(0, np.int64))}
+    dtypes = {name: dtype_of[name] for name in layout.dtypes}
     return StepLayout(layout.observation_space, layout.action_space, layout.reward_space, dtypes)
 
 
@@ -161,10 +161,10 @@ def _write(directory: Path, steps: Steps, layout: StepLayout, manifest: _Manifes
 
 def _arrays(steps: Steps, layout: StepLayout, rows: Array) -> Iterator[tuple[str, Array]]:
     """The arrays of some steps that follow each other, by the names of their files."""
-    found = steps.read([field for field in FIELDS if field != "next_states"], rows)
+    columns = steps.read([field for field in FIELDS if field != "next_states"], rows)
     ends = steps.breaks[slice(*steps.breaks.searchsorted([rows[0], rows[-1] + 1]))] if len(rows) else rows
-    found |= steps.read(["next_states"], ends)
-    for field, column in found.items():
+    columns |= steps.read(["next_states"], ends)
+    for field, column in columns.items():
         leaves = field_leaves(field, layout)
         prefix = "next_" if field == "next_states" else ""
         if leaves is None:
@@ -321,18 +321,18 @@ def _mapped(path: Path, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
     if not path.is_file():
         raise _defect(path, "a file", "none")
     try:
-        found = np.lib.format.open_memmap(path, mode="r")  # never unpickles, unlike np.load
+        array = np.lib.format.open_memmap(path, mode="r")  # never unpickles, unlike np.load
     except _BROKEN as err:
         raise _defect(path, f"a .npy file of {dtype.name} of shape {shape}", str(err)) from err
     size = path.stat().st_size
     expected = (dtype, shape, True, math.prod(shape) * dtype.itemsize)
-    if (found.dtype, found.shape, found.flags.c_contiguous, size - found.offset) != expected:
+    if (array.dtype, array.shape, array.flags.c_contiguous, size - array.offset) != expected:
         raise _defect(
             path,
             f"{dtype.name} of shape {shape} in C order, and nothing after it",
-            f"{found.dtype} of shape {found.shape} in a file of {size} bytes",
+            f"{array.dtype} of shape {array.shape} in a file of {size} bytes",
         )
-    return np.asarray(found)
+    return np.asarray(array)
 
 
 def _check_episodes(directory: Path, arrays: Mapping[str, Array], steps: int) -> None:

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError, TupliError
+from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import (
     BaseFilter,
@@ -33,7 +34,6 @@ from tupli_mcap.storage.sidecar import Notes
 
 __all__ = ["DatasetError", "FilesSource", "OpenRecordings", "Source", "StorageSource", "episode_headers"]
 
-_ENDS = ("terminal", "timeout", "interrupted")
 _MOST_OPEN = 64
 _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two blocks share it
 
@@ -55,7 +55,7 @@ class Source(Protocol):
     ) -> list[EpisodeHeader]:
         """The episodes both filters are true of; those of one recording follow each other.
 
-        What has been opened for it is put into `seen` by name, closed again: it still says where its steps lie.
+        `seen` is given the recordings that were opened, by name; they are closed, but still say where their steps lie.
         """
         ...
 
@@ -225,9 +225,9 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
                 "benchmark_id": benchmark_id,
                 "metadata": {} if metadata == "{}" else _metadata(metadata, name, number),
                 "n_tuples": length,
-                "terminated": _ENDS[end] == "terminal",
-                "timeout": _ENDS[end] == "timeout",
-                "end": _ENDS[end],
+                "terminated": END_NAMES[end] == "terminal",
+                "timeout": END_NAMES[end] == "timeout",
+                "end": END_NAMES[end],
                 "episode_return": total,
                 "seed": seed if has_seed else None,
                 "env": env,
@@ -250,10 +250,10 @@ def _benchmark_header(recording: Recording) -> BenchmarkHeader:
     if "benchmark.json" in recording.attachments:
         record = recording.benchmark.record
         metadata, environment = BenchmarkMetadata(name=record.name), record.name
-        told = (record.benchmark or {}).get("metadata")
-        if isinstance(told, dict):
+        entry = (record.benchmark or {}).get("metadata")
+        if isinstance(entry, dict):
             with contextlib.suppress(ValidationError, FormatError):  # somebody else's words
-                metadata = BenchmarkMetadata.model_validate(restored(told))
+                metadata = BenchmarkMetadata.model_validate(restored(entry))
     return BenchmarkHeader(
         id=recording.benchmark_id,
         created_by="",

@@ -90,7 +90,7 @@ def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positi
 
 
 def _may_be_noted(path: Path) -> bool:
-    """Whether a storage may have noted of a recording what is deleted."""
+    """Whether a storage may have noted deleted episodes of a recording."""
     folders = list(path.absolute().parents)[:3]
     return path.with_name(f"{path.name}.json").exists() or any(
         (folder / "deleting.json").exists() for folder in folders
@@ -128,19 +128,24 @@ def _named(recording: Recording, among: Positions, item: str, text: str, why: st
     if item in ("first", "last"):
         return [int(among[0 if item == "first" else -1])]
     if item in ("best", "worst"):
-        # a return that is not a number is neither
-        returns = np.nan_to_num(recording.index["return"][among], nan=-np.inf if item == "best" else np.inf)
-        return [int(among[returns.argmax() if item == "best" else returns.argmin()])]
+        return [int(among[_extreme(item, recording.index["return"][among])])]
     if not item.isdecimal() or len(item) > _MAX_DIGITS:
         raise FilterError(
             f"expected numbers of episodes such as '3,7,9', or {', '.join(WORDS[:-1])} or {WORDS[-1]}, "
             f"found {item[:40]!r} in {text[:80]!r}"
         )
     numbers = recording.index["episode"][among]
-    found = among[numbers == int(item)]
-    if not len(found):
+    matching = among[numbers == int(item)]
+    if not len(matching):
         raise RecordingError(f"{recording.name} has no episode {item}{why}; choose from {_range(numbers)}")
-    return [int(found[0])]
+    return [int(matching[0])]
+
+
+def _extreme(word: str, returns: Any) -> int:
+    """Where the best or worst of some returns is; one that is no number is neither, unless there is no other."""
+    if word == "best":
+        return int(np.nan_to_num(returns, nan=-np.inf).argmax())
+    return int(np.nan_to_num(returns, nan=np.inf).argmin())
 
 
 def _range(numbers: Any) -> str:
@@ -322,10 +327,10 @@ def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: Exi
 
 
 def _files_of(item: str, returns: dict[str, float]) -> list[str]:
-    """Of the files that have what an item names, and its return in each, those that are meant."""
+    """The files that an item means, of those that have such an episode; `returns` are its returns in them."""
     files = list(returns)
     if not files or item not in ("best", "worst", "first", "last"):
         return files
     if item in ("first", "last"):
         return [files[0 if item == "first" else -1]]
-    return [(max if item == "best" else min)(files, key=returns.__getitem__)]
+    return [files[_extreme(item, list(returns.values()))]]

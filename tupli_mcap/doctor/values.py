@@ -107,13 +107,13 @@ class _ArrayValues(LeafValues):
         self.seen += len(values)
         if not self.leaf.size:
             return
-        found, columns = self.of_elements, columns_of(values)
-        before = found.finite.sum() - found.seen * self.leaf.size
-        found.add(columns)
-        if found.finite.sum() - found.seen * self.leaf.size != before:
+        elements, columns = self.of_elements, columns_of(values)
+        before = elements.finite.sum() - elements.seen * self.leaf.size
+        elements.add(columns)
+        if elements.finite.sum() - elements.seen * self.leaf.size != before:
             self._note("nan", np.isnan(columns), locate)
             self._note("infinite", np.isinf(columns), locate)
-        if (found.least < found.low).any() or (found.most > found.high).any():
+        if (elements.least < elements.low).any() or (elements.most > elements.high).any():
             with np.errstate(invalid="ignore"):  # signalling NaN
                 outside = (columns < self._lowest[:, None]) | (columns > self._highest[:, None])
             outside &= np.isfinite(columns)
@@ -193,11 +193,13 @@ def outside_space(measured: Measurements) -> Iterator[Finding]:
         leaf, mask = values.leaf, values.counts["outside"] > 0
         if not mask.any():
             continue
-        what, found = f"outside of {leaf.space!r:.80}", values.of_elements
-        if found is not None:
+        what, elements = f"outside of {leaf.space!r:.80}", values.of_elements
+        if elements is not None:
+            least, most = elements.least[mask].min(), elements.most[mask].max()
+            low, high = elements.low[mask].min(), elements.high[mask].max()
             what = (
-                f"outside the space{dimension_text(leaf, mask)}: they reach from {found.least[mask].min():g} to "
-                f"{found.most[mask].max():g}, the space from {found.low[mask].min():g} to {found.high[mask].max():g}"
+                f"outside the space{dimension_text(leaf, mask)}: they reach from {least:g} to {most:g}, "
+                f"the space from {low:g} to {high:g}"
             )
         severity = Severity.WARNING
         if not isinstance(leaf.space, spaces.Box):
@@ -237,7 +239,7 @@ def constant_dimension(measured: Measurements, *, min_steps: int = 100) -> Itera
     if measured.steps < min_steps:
         return
     for values in measured.statistics(LeafValues):
-        leaf, mask, found = values.leaf, values.constant, values.of_elements
+        leaf, mask, elements = values.leaf, values.constant, values.of_elements
         count, whole = int(mask.sum()), bool(mask.all())
         of_choices = values.role == "action" and not isinstance(leaf.space, spaces.Box)
         if values.role == "reward" or of_choices or not count or (leaf.apart and not whole):
@@ -246,10 +248,12 @@ def constant_dimension(measured: Measurements, *, min_steps: int = 100) -> Itera
             message = f"all {values.seen:,} {'frames' if leaf.apart else 'values'} are the same"
             advice = "look whether this sensor, camera or actuator works; leave it out when training"
         else:
-            what = "never change" if found is None or count > 1 else f"is always {found.least[mask][0]:g}"
+            what = (
+                "never change" if elements is None or count > 1 else f"is always {elements.least[mask][0]:g}"
+            )
             message = f"{dimensions(leaf, mask)} {what} in {values.seen:,} values"
             advice = "guard against a standard deviation of 0 when normalising, or leave it out"
-        floats = found is not None and found.dtype.kind == "f"
+        floats = elements is not None and elements.dtype.kind == "f"
         severity = Severity.WARNING if whole or floats else Severity.INFO
         yield measured.finding(
             "constant-dimension", severity, message, advice, count, leaf.size, (), leaf, mask
@@ -262,15 +266,15 @@ def unused_action(measured: Measurements, *, steps_each: int = 20) -> Iterator[F
     Judged from `steps_each` steps a choice on: a uniform policy then misses one with a probability below e^-20.
     """
     for values in measured.statistics(LeafValues):
-        found = values.of_elements
-        if found is None or values.role != "action":
+        elements = values.of_elements
+        if elements is None or values.role != "action":
             continue
-        for i, counts in enumerate(found.choices):
+        for i, counts in enumerate(elements.choices):
             unused = np.flatnonzero(counts == 0)
             if not len(unused) or values.seen < steps_each * len(counts):
                 continue
             leaf, element = values.leaf, np.arange(values.leaf.size) == i
-            names = ", ".join(str(int(found.low[i]) + int(choice)) for choice in unused[:_NAMED])
+            names = ", ".join(str(int(elements.low[i]) + int(choice)) for choice in unused[:_NAMED])
             count, total = len(unused), len(counts)
             message = (
                 f"{count:,} of {total:,} choices{dimension_text(leaf, element)} never "

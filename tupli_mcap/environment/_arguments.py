@@ -17,7 +17,9 @@ _LARGEST: Final = 1 << 20
 
 
 def more_than_data(value: object) -> str:
-    """What in a value from a file some code may take for more than data, and for what; empty if there is nothing.
+    """Why a value from a file needs trust: the part of it that some code may take for more than data, and for what.
+
+    Empty if it is data only.
 
     Some environments hand texts to `open` or `gymnasium.make`, and allocate as many things as a number says. Flags,
     plain words, fractions and whole numbers up to 2^20 are data; several of those may still cost much memory.
@@ -34,26 +36,26 @@ def more_than_data(value: object) -> str:
 
 def foreign_arguments(spec: Mapping[str, Any]) -> list[str]:
     """Arguments in a spec that are `more_than_data`, such as `xml_file="../x.xml"`, unless they are registered so."""
-    told = spec.get("kwargs", {})
-    known = gym.registry.get(str(spec.get("id")))
-    usual = {} if known is None else known.kwargs
+    kwargs = spec.get("kwargs", {})
+    registered = gym.registry.get(str(spec.get("id")))
+    usual = {} if registered is None else registered.kwargs
     wrappers = spec.get("additional_wrappers")
-    given = [("", told)]
+    given = [("", kwargs)]
     given += [
         (f" of the wrapper {str(wrapper.get('name'))[:60]!r}", wrapper.get("kwargs"))
         for wrapper in (wrappers if isinstance(wrappers, list) else ())
         if isinstance(wrapper, dict)
     ]
-    found = []
-    for of, arguments in given:
+    reasons = []
+    for where, arguments in given:
         items = arguments.items() if isinstance(arguments, dict) else [("kwargs", arguments)]
         for name, value in items:
-            if not of and name in usual and _same(usual[name], value):
+            if not where and name in usual and _same(usual[name], value):
                 continue
             why = more_than_data(value)
             if why:
-                found.append(f"the argument {name[:60]!r}{of}, which holds {why}")
-    return found
+                reasons.append(f"the argument {name[:60]!r}{where}, which holds {why}")
+    return reasons
 
 
 def _same(usual: object, value: object) -> bool:

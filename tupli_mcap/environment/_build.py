@@ -94,14 +94,14 @@ def _render_modes(env: gym.Env[Any, Any]) -> list[Any]:
 
 def make_from_spec(spec: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
     """`gymnasium.make` of a spec given as JSON-able object; runs its entry points."""
-    told = copy.deepcopy(dict(spec))
-    known = gym.registry.get(told["id"])
+    fields = copy.deepcopy(dict(spec))
+    known = gym.registry.get(fields["id"])
     # Of no account to a single environment: this machine's own.
-    told["vector_entry_point"] = None if known is None else known.vector_entry_point
-    if known is not None and told.get("entry_point") == entry_point_name(known.entry_point):
-        told["entry_point"] = known.entry_point
-    wrappers = tuple(WrapperSpec(**wrapper) for wrapper in told.pop("additional_wrappers", ()))
-    made = EnvSpec(**told, additional_wrappers=wrappers)
+    fields["vector_entry_point"] = None if known is None else known.vector_entry_point
+    if known is not None and fields.get("entry_point") == entry_point_name(known.entry_point):
+        fields["entry_point"] = known.entry_point
+    wrappers = tuple(WrapperSpec(**wrapper) for wrapper in fields.pop("additional_wrappers", ()))
+    made = EnvSpec(**fields, additional_wrappers=wrappers)
     return gym.make(made) if render_mode is None else gym.make(made, render_mode=render_mode)
 
 
@@ -126,14 +126,14 @@ def foreign_code(spec: Mapping[str, Any]) -> list[str]:
         )
         return [reason]
     reasons = []
-    here = entry_point_name(known.entry_point)
-    if spec.get("entry_point") != here:
-        found = str(spec.get("entry_point"))[:200]
-        reasons.append(f"the entry point {found!r} of {name!r}, registered here as {str(here)[:200]!r}")
+    registered = entry_point_name(known.entry_point)
+    if spec.get("entry_point") != registered:
+        named = str(spec.get("entry_point"))[:200]
+        reasons.append(f"the entry point {named!r} of {name!r}, registered here as {str(registered)[:200]!r}")
     wrappers = spec.get("additional_wrappers", [])
     if not isinstance(wrappers, list):
         return [*reasons, f"additional wrappers of type {type(wrappers).__name__}"]
-    package = _top_level(here)
+    package = _top_level(registered)
     for wrapper in wrappers:
         entry_point = wrapper.get("entry_point") if isinstance(wrapper, dict) else None
         if not _is_known_wrapper(entry_point, package):
@@ -153,12 +153,12 @@ def _is_known_wrapper(entry_point: object, package: str) -> bool:
     ):
         return False
     # Not `getattr`: modules with a `__getattr__` import what they are asked for.
-    found = vars(sys.modules.get(module_name, object)).get(class_name)
+    wrapper = vars(sys.modules.get(module_name, object)).get(class_name)
     return (
-        isinstance(found, type)
-        and issubclass(found, gym.Wrapper)
+        isinstance(wrapper, type)
+        and issubclass(wrapper, gym.Wrapper)
         # These write to the folder they are told, and open a window.
-        and not issubclass(found, gym.wrappers.RecordVideo | gym.wrappers.HumanRendering)
+        and not issubclass(wrapper, gym.wrappers.RecordVideo | gym.wrappers.HumanRendering)
     )
 
 

@@ -34,9 +34,9 @@ _OF_MAKE_VEC = ("num_envs", "vectorization_mode", "vector_kwargs", "wrappers")  
 def note(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> EnvironmentRecord:
     """What an environment says of itself: its EnvSpec, where JSON has a form for it, and the names of its classes.
 
-    Whether the spec rebuilds it as it is now is not asked. Of a vector environment it is the first sub-environment if
-    that lives in this process; of others it is the spec they were made from by `gymnasium.make_vec`, if
-    `gymnasium.make` takes it, and else the id.
+    The spec may not rebuild the environment as it is now. Of a vector environment, the first sub-environment is noted
+    if it lives in this process; else the spec that `gymnasium.make_vec` was given, if `gymnasium.make` takes it, or the
+    id.
     """
     if not isinstance(env, gym.vector.VectorEnv):
         return _noted(env, *_told(env))
@@ -170,9 +170,8 @@ def _told(env: gym.Env[Any, Any]) -> tuple[str | None, dict[str, Any] | None]:
         return name, None
     finally:
         for wrapper, cached in zip(wrappers, before, strict=True):
-            wrapper._cached_spec = (
-                cached  # that somebody has read the spec is no part of an environment's state
-            )
+            # that somebody has read the spec is no part of an environment's state
+            wrapper._cached_spec = cached
 
 
 def _told_of_many(envs: Any) -> tuple[str | None, dict[str, Any] | None]:
@@ -194,10 +193,10 @@ def _plain_spec(spec: Any) -> dict[str, Any]:
     """Raises ValueError or TypeError where JSON has no form for it."""
     names = [field.name for field in dataclasses.fields(spec) if field.init]
     names.remove("vector_entry_point")  # how others are made, and changing with gymnasium's versions
-    told = {name: getattr(spec, name) for name in names}
-    told["entry_point"] = entry_point_name(spec.entry_point)
-    told["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]
-    plain: dict[str, Any] = json.loads(canonical_json(told))
+    fields = {name: getattr(spec, name) for name in names}
+    fields["entry_point"] = entry_point_name(spec.entry_point)
+    fields["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]
+    plain: dict[str, Any] = json.loads(canonical_json(fields))
     return plain
 
 
@@ -210,8 +209,10 @@ def _is_as_made(env: gym.Env[Any, Any], spec: Mapping[str, Any]) -> bool:
         return False
     if [_class_name(wrapper) for wrapper in reversed(wrappers)] != _wrappers_of(spec):
         return False
-    told = [wrapper._has_reset for wrapper in wrappers if isinstance(wrapper, gym.wrappers.OrderEnforcing)]
-    if any(told) or (not told and getattr(base, "_np_random", None) is not None):
+    has_reset = [
+        wrapper._has_reset for wrapper in wrappers if isinstance(wrapper, gym.wrappers.OrderEnforcing)
+    ]
+    if any(has_reset) or (not has_reset and getattr(base, "_np_random", None) is not None):
         return False  # it has been reset
     if is_changed(base, base.spec.kwargs):
         return False

@@ -1,9 +1,8 @@
 """Tells from the code of its classes whether an environment is still as its constructors left it.
 
-No other environment is made to compare it with. What code says of the attributes of an object is this: which
-names it assigns, and that some of them are only ever given constants or arguments of the constructor. Changed is an
-object with another attribute, or with another value under such a name. A value that the constructor computes is
-not judged, nor is what lies inside of an attribute.
+No other environment is made to compare it with. The code of a class says which attributes it assigns, and which of them
+only ever get constants or arguments of the constructor. An object is changed if it has another attribute, or another
+value in one of those. Values that the constructor computes are not judged, nor is what lies inside of an attribute.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ _SET_BY_MAKE = frozenset(("spec",))  # by gymnasium.make
 
 
 class _Argument(NamedTuple):
-    """The value of a name is the constructor's argument of that name."""
+    """An attribute is given the constructor's argument of this name."""
 
     name: str
 
 
 class _Computed:
-    """The value of a name may be any."""
+    """An attribute is given a value that the code does not tell."""
 
 
 _COMPUTED = _Computed()
@@ -67,18 +66,18 @@ def _bound(cls: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
 @functools.lru_cache(maxsize=256)
 def _assigned(cls: type) -> Mapping[str, list[Any]]:
     """What the code of a class and its bases gives to each attribute it assigns."""
-    found: dict[str, list[Any]] = {}
+    sources: dict[str, list[Any]] = {}
     for base in cls.__mro__:
         for name, member in vars(base).items():
             if isinstance(member, functools.cached_property):
-                found.setdefault(name, []).append(_COMPUTED)
+                sources.setdefault(name, []).append(_COMPUTED)
             for function in _functions(member):
                 own = function is cls.__init__  # type: ignore[misc]
                 for code in _codes(function.__code__):
                     for attribute, source in _stores(code):
                         usable = own or not isinstance(source, _Argument)
-                        found.setdefault(attribute, []).append(source if usable else _COMPUTED)
-    return found
+                        sources.setdefault(attribute, []).append(source if usable else _COMPUTED)
+    return sources
 
 
 def _functions(member: Any) -> Iterator[Callable[..., Any]]:

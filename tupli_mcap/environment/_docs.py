@@ -24,25 +24,25 @@ _MOST = 10_000  # names
 
 
 def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> Labels:
-    """What the environment says of itself: tables and lists with a number for each dimension or value.
+    """Labels from the tables and lists in an environment's documentation that number its dimensions or values.
 
     Gymnasium documents its environments this way: https://gymnasium.farama.org/environments/classic_control/cart_pole.
     """
     inner: Any = env.unwrapped
-    told = type(inner).__mro__  # a subclass need not say it again
+    classes = type(inner).__mro__  # a subclass need not say it again
     kind = ""
     if isinstance(env, gym.vector.VectorEnv):
         state, action = env.single_observation_space, env.single_action_space
         envs = getattr(inner, "envs", None)
         if envs and isinstance(envs[0], gym.Env):
             inner = envs[0].unwrapped
-            told = type(inner).__mro__
+            classes = type(inner).__mro__
         else:  # in other processes, or all in one
-            kind, told = "single_", (*told, *_registered(inner))
+            kind, classes = "single_", (*classes, *_registered(inner))
     else:
         state, action = env.observation_space, env.action_space
-    texts = [cls.__doc__ or "" for cls in told]
-    found = Labels({}, {}, _step_seconds(inner))
+    texts = [cls.__doc__ or "" for cls in classes]
+    labels = Labels({}, {}, _step_seconds(inner))
     for name, space, unwrapped in (
         ("state", state, getattr(inner, f"{kind}observation_space", None)),
         ("action", action, getattr(inner, f"{kind}action_space", None)),
@@ -54,12 +54,12 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
         if isinstance(space, spaces.Discrete):
             names = (name == "action" and _meanings(inner, int(space.n))) or _names(section, int(space.n))
             if names:
-                found.values[name] = names
+                labels.values[name] = names
         elif isinstance(space, spaces.Box) and len(space.shape) == 1:
             names = _names(section, space.shape[0])
             if names:
-                found.dimensions[name] = names
-    return found
+                labels.dimensions[name] = names
+    return labels
 
 
 def _registered(envs: Any) -> tuple[type, ...]:
@@ -80,9 +80,9 @@ def _same_dimensions(space: Any, unwrapped: Any) -> bool:
 def _section(text: str, heading: str) -> str:
     """The text below the first heading that is `heading`, up to the next one."""
     headings = list(_HEADING.finditer(text))
-    for i, found in enumerate(headings):
-        if found.group(1).lower().startswith(heading):
-            return text[found.end() : headings[i + 1].start() if i + 1 < len(headings) else len(text)]
+    for i, match in enumerate(headings):
+        if match.group(1).lower().startswith(heading):
+            return text[match.end() : headings[i + 1].start() if i + 1 < len(headings) else len(text)]
     return ""
 
 
@@ -98,7 +98,7 @@ def _names(section: str, count: int) -> tuple[str, ...]:
 
 
 def _meanings(env: Any, count: int) -> tuple[str, ...]:
-    """What the Arcade Learning Environment says of its actions."""
+    """The names that the Arcade Learning Environment gives its actions; empty for other environments."""
     with contextlib.suppress(Exception):  # whatever it does
         names = tuple(_plain(str(name)) for name in env.get_action_meanings())
         return names if len(names) == count and all(names) else ()

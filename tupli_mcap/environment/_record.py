@@ -161,23 +161,23 @@ class EnvironmentRecord:
             benchmark=document.benchmark,
         )
         try:
-            found = record.digest
+            digest = record.digest
         except (ValueError, RecursionError) as err:
             raise FormatError(f"{where}: the environment's spec is no strict JSON: {err}") from err
-        if found != environment.digest:
+        if digest != environment.digest:
             raise FormatError(
-                f"{where}: expected an environment with digest {environment.digest}, found {found}"
+                f"{where}: expected an environment with digest {environment.digest}, found {digest}"
             )
         return record
 
 
-def _check_pickle(said: _Pickle, found: bytes | None, has_spec: bool, where: str) -> None:
+def _check_pickle(said: _Pickle, data: bytes | None, has_spec: bool, where: str) -> None:
     if has_spec:
         raise FormatError(f"{where}: an environment has either a spec or a pickle, found both")
-    if found is None:
+    if data is None:
         raise FormatError(f"{where}: the pickled environment (SHA-256 {said.sha256}) is missing beside it")
-    if len(found) != said.size or sha256(found) != said.sha256:
+    if len(data) != said.size or sha256(data) != said.sha256:
         raise FormatError(
             f"{where}: expected a pickled environment of {said.size} bytes, SHA-256 {said.sha256}, "
-            f"found {len(found)} bytes, SHA-256 {sha256(found)}"
+            f"found {len(data)} bytes, SHA-256 {sha256(data)}"
         )

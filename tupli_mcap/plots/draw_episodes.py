@@ -54,9 +54,10 @@ def _draw_order(measured: Sequence[Measured], column: str, name: str, axes: Any)
         span = f"{spans[0]} to {spans[-1]}" if spans[0] < spans[-1] else str(spans[0])
         axes.set_xlabel(f"episode; lines are means of {span} episodes" if spans[-1] > 1 else "episode")
     low, high = axes.get_xlim()
-    axes.set_xlim(
-        *((low - 1, high + 1) if high - low < 1 else (low, high))
-    )  # of one episode, too, a whole number
+    if high - low < 1:  # of one episode: the axis shows its number, too
+        axes.set_xlim(low - 1, high + 1)
+    else:
+        axes.set_xlim(low, high)
     axes.locator_params(axis="x", integer=True)
     style.legend_above(axes)
 

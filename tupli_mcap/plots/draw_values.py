@@ -199,9 +199,11 @@ def add_coverage(page: Page, states: Sequence[Leaves], names: Sequence[str]) -> 
             points.append(both[np.isfinite(both).all(axis=1)])
         pooled = np.concatenate(points)
         edges = [bin_edges(column, _MAP_BINS)[0] for column in pooled.T]
-        for name, found in zip(names, points, strict=False):
+        for name, of_recording in zip(names, points, strict=False):
             title = f"where the states lie{f': {name}' if len(names) > 1 else ''}"
-            cells.append(Cell(partial(_draw_map, x, y, found, edges, title), _MAP_HEIGHT, 2, right=0.85))
+            cells.append(
+                Cell(partial(_draw_map, x, y, of_recording, edges, title), _MAP_HEIGHT, 2, right=0.85)
+            )
     page.add(cells)
 
 

@@ -59,14 +59,14 @@ class LeafValues:
         self.values = np.empty((0, 0)) if column is None else np.ascontiguousarray(column.T[self.elements])
         if not n:
             return
-        found = ElementStatistics(leaf, self.values.dtype, self.elements)
-        found.add(self.values)
-        self.nan, self.infinite, self.mean, self.std = found.nan, found.infinite, found.mean, found.std
+        stats = ElementStatistics(leaf, self.values.dtype, self.elements)
+        stats.add(self.values)
+        self.nan, self.infinite, self.mean, self.std = stats.nan, stats.infinite, stats.mean, stats.std
         self.least, self.most = (
-            np.where(found.finite, end.astype(np.float64), np.nan) for end in (found.least, found.most)
+            np.where(stats.finite, end.astype(np.float64), np.nan) for end in (stats.least, stats.most)
         )
-        if found.choices:
-            self.kind, self.counts, self.starts = "choices", found.choices, found.low.tolist()
+        if stats.choices:
+            self.kind, self.counts, self.starts = "choices", stats.choices, stats.low.tolist()
 
     def column(self, i: int) -> Array:
         """The values of element `i` that can be drawn (float64)."""

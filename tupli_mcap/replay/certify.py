@@ -154,11 +154,11 @@ class Certifier:
                 if self._withheld(plan):
                     outcome = doubt = "untrusted"
                 else:
-                    found, replayer = self._attempt(plan, recorded, replayer)
-                    if found.agrees:
+                    result, replayer = self._attempt(plan, recorded, replayer)
+                    if result.agrees:
                         doubt = None if doubt == "after_divergence" else doubt
                     else:
-                        outcome = doubt or self._divergence(plan, recorded, found)
+                        outcome = doubt or self._divergence(plan, recorded, result)
                         doubt = doubt or "after_divergence"
                 self._outcomes[plan.position] = outcome
                 self._done += recorded.length

@@ -198,8 +198,10 @@ class Checker:
         differs = np.asarray(_bits(expected) != _bits(array))
         first = tuple(int(i) for i in np.argwhere(differs)[0])
         path = leaf.path + (f"[{', '.join(map(str, first))}]" if first else "")
-        told, seen = _text(expected[first]), _text(array[first])
-        return Difference(step, leaf.name, path, told, seen, _largest(expected[differs], array[differs]))
+        recorded, replayed = _text(expected[first]), _text(array[first])
+        return Difference(
+            step, leaf.name, path, recorded, replayed, _largest(expected[differs], array[differs])
+        )
 
 
 def _bits(array: Any) -> Any:

@@ -154,9 +154,8 @@ def _with(first: Picture, rest: Iterator[Picture]) -> Iterator[Picture]:
 def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, fps: float) -> None:
     stride = max(1, math.ceil(fps / _GIF_FPS))
     shown = math.ceil(count / stride)
-    ends = np.round(
-        np.arange(1, shown + 1) * stride * 100 / fps
-    )  # in hundredths of a second, as GIF has them
+    # in hundredths of a second, as GIF has them
+    ends = np.round(np.arange(1, shown + 1) * stride * 100 / fps)
     durations = (np.diff(ends, prepend=0) * 10).astype(int).tolist()
     durations[-1] += 1000  # a moment to see the end
     indexed = Indexed()

@@ -148,10 +148,10 @@ def _plain(action: Any) -> Any:
     return action.item() if isinstance(action, np.generic) else action
 
 
-def brief(err: BaseException, limit: int = 200) -> str:
+def brief(err: BaseException) -> str:
     """An exception in one line."""
     text = " ".join(str(err).split())
-    return f"{type(err).__name__}: {text[:limit]}" if text else type(err).__name__
+    return f"{type(err).__name__}: {text[:200]}" if text else type(err).__name__
 
 
 def _resets_itself(env: gym.Env[Any, Any]) -> bool:

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.blocks import step_bytes, whole_episodes
 from tupli_mcap.recording.columns.read import Columns
 
 __all__ = ["Block", "RecordedValues", "recorded_values"]
@@ -48,26 +51,16 @@ class RecordedValues:
 
 def recorded_values(recording: Recording, positions: Sequence[int]) -> Iterator[RecordedValues]:
     """The values of the episodes at `positions`, in that order; a few MiB of them are in memory at a time."""
-    steps = max(1, _BLOCK // _row_size(recording))
-    lengths = recording.index["length"]
-    batch: list[int] = []
-    total = 0
-    for position in positions:
-        length = int(lengths[position])
-        if batch and total + length > steps:
-            yield from _together(recording, batch)
-            batch, total = [], 0
-        if length > steps:
-            yield RecordedValues(recording, position, None, steps)
-            continue
-        batch.append(position)
-        total += length
-    yield from _together(recording, batch)
+    limit = max(1, _BLOCK // step_bytes(recording.layout))
+    lengths = recording.index["length"][np.asarray(positions, np.int64)].astype(np.int64)
+    for some in whole_episodes(lengths, limit):
+        if int(lengths[some].sum()) > limit:  # a single one
+            yield RecordedValues(recording, positions[some.start], None, limit)
+        else:
+            yield from _together(recording, positions[some])
 
 
 def _together(recording: Recording, positions: Sequence[int]) -> Iterator[RecordedValues]:
-    if not positions:
-        return
     columns = recording.read(list(positions))
     start = 0
     for position, length in zip(positions, columns.episode_lengths.tolist(), strict=True):
@@ -86,12 +79,3 @@ def _cut(layout: StepLayout, columns: Columns, start: int, stop: int) -> Columns
         columns.terminals[part],
         columns.timeouts[part],
     )
-
-
-def _row_size(recording: Recording) -> int:
-    """About how many bytes a step takes in memory."""
-    layout = recording.layout
-    sizes = [
-        leaf.size * layout.dtypes[leaf.name].itemsize for leaf in layout.leaves if leaf.dtype is not None
-    ]
-    return sum(sizes) + (2 if layout.constant else 4096)

@@ -189,7 +189,7 @@ def published_in(groups: Sequence[str], group: str) -> list[str]:
 
 
 def anew(read: Callable[[], _T]) -> _T:
-    """What a function lists and reads, asked again if what it had listed was deleted before it was read.
+    """Calls a function that lists and reads, again if something that it had listed was deleted before it was read.
 
     Raises:
         NotFoundError: that happened five times.

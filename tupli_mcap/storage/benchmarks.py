@@ -101,9 +101,9 @@ class BenchmarkFiles:
         facts = dict(record.benchmark or {})
         artifacts = artifacts_of(record, str(path))
         serialized = pack(record, artifacts, facts)
-        found = benchmark_hash(unpack(serialized, where=str(path)), header.metadata)
-        if found != uri:
-            raise FormatError(f"{path}: expected the content of benchmark {uri}, found that of {found}")
+        identity = benchmark_hash(unpack(serialized, where=str(path)), header.metadata)
+        if identity != uri:
+            raise FormatError(f"{path}: expected the content of benchmark {uri}, found that of {identity}")
         return serialized
 
     def _read(self, uri: str) -> dict[str, Any]:

@@ -197,16 +197,16 @@ def preview(storage: FileStorage | None, path: Path) -> ImportPreview:
     """
     with Recording(path) as recording:
         record, header, _ = incoming(recording, path)
-        found = artifacts_of(record, str(path))
+        artifacts = artifacts_of(record, str(path))
         _read_artifacts(storage, recording, record, path)
-        known = set() if storage is None else {item.id for item in storage.list_artifacts()}
+        stored = set() if storage is None else {item.id for item in storage.list_artifacts()}
         return ImportPreview(
             benchmark_id=header.id,
             name=header.metadata.name,
             episodes=len(recording),
             new_episodes=len(_missing(storage, recording)),
-            artifacts=len(found),
-            new_artifacts=len(set(found) - known),
+            artifacts=len(artifacts),
+            new_artifacts=len(set(artifacts) - stored),
         )
 
 
@@ -272,7 +272,7 @@ def _attachments(storage: FileStorage, benchmark_id: str) -> Attachments:
     items = {uri: storage.list_artifacts(FilterEQ(key="id", value=uri)) for uri in content.artifacts}
     entry = {
         **(content.record.benchmark or {}),
-        "artifact_metadata": {uri: plain(found[0]) for uri, found in items.items() if found},
+        "artifact_metadata": {uri: plain(listed[0]) for uri, listed in items.items() if listed},
     }
     attachments = {DOCUMENT_NAME: ("application/json", content.record.to_json(entry))}
     if content.record.pickle is not None:
@@ -335,9 +335,11 @@ def _write_episodes(
 
 
 def _carried(recording: Recording) -> Attachments:
+    """What a recording carries, without its signature, which is of its own episodes only."""
     return {
         name: (info.media_type, recording.read_attachment(name))
         for name, info in recording.attachments.items()
+        if name != SIGNATURE_NAME
     }
 
 
@@ -403,7 +405,7 @@ def _read_artifacts(
     """The artifacts a recording carries, checked; what it lacks, the storage must have."""
     said = (record.benchmark or {}).get("artifact_metadata")
     facts = said if isinstance(said, dict) else {}
-    found = []
+    artifacts = []
     for uri in artifacts_of(record, str(path)):
         if ARTIFACT_PREFIX + uri not in recording.attachments:
             if storage is not None and storage.list_artifacts(FilterEQ(key="id", value=uri)):
@@ -413,10 +415,10 @@ def _read_artifacts(
         if sha256(data) != uri:
             raise FormatError(f"{path}: expected artifact {uri}, found bytes with SHA-256 {sha256(data)}")
         try:
-            found.append((data, ArtifactMetadata.model_validate(restored(facts.get(uri, {"name": uri})))))
+            artifacts.append((data, ArtifactMetadata.model_validate(restored(facts.get(uri, {"name": uri})))))
         except ValidationError as err:
             raise FormatError(f"{path}: artifact {uri}: {first_defect(err)}") from err
-    return found
+    return artifacts
 
 
 def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
@@ -428,10 +430,10 @@ def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
     ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
     if storage is None:
         return list(ids.values())
-    here: dict[str, list[int]] = {}
+    stored_numbers: dict[str, list[int]] = {}
     for header in storage.list_episodes(FilterIN(key="id", value=list(ids))):
-        here.setdefault(header.recording, []).append(header.episode)
-    for name, numbers in here.items():
+        stored_numbers.setdefault(header.recording, []).append(header.episode)
+    for name, numbers in stored_numbers.items():
         with storage.open_recording(name) as stored:
             if not _same_file(recording, stored) and not episodes_alike(
                 recording, stored, numbers, storage.root
@@ -440,7 +442,7 @@ def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
                     f"episodes of the recording {recording.uuid} are in {str(storage.root)!r} already, with other "
                     f"contents: {name!r} differs from {recording.name!r}; delete the one that is wrong"
                 )
-    held = {number for numbers in here.values() for number in numbers}
+    held = {number for numbers in stored_numbers.values() for number in numbers}
     return [number for number in ids.values() if number not in held]
 
 

@@ -93,17 +93,17 @@ def scan(root: Path) -> Iterator[FoundRecording]:
         directory, prefix = pending.pop()
         try:
             with os.scandir(directory) as entries:
-                found = {entry.name: entry for entry in entries if not entry.name.startswith(".")}
+                by_name = {entry.name: entry for entry in entries if not entry.name.startswith(".")}
         except FileNotFoundError:
             continue  # deleted since it was listed
-        if not prefix and DELETING in found:
+        if not prefix and DELETING in by_name:
             deleting = Deletion.read(root)
-        for name, entry in found.items():
+        for name, entry in by_name.items():
             if name.endswith(".mcap"):
                 try:
                     if entry.is_file():
-                        journal = journal_name(name) in found
-                        stamp = _stamp(entry, found, deleting.stamp(prefix + name))
+                        journal = journal_name(name) in by_name
+                        stamp = _stamp(entry, by_name, deleting.stamp(prefix + name))
                         yield FoundRecording(prefix + name, stamp, journal)
                 except OSError as err:
                     if err.errno not in (errno.ENOENT, errno.ELOOP):  # deleted since, or a link in a circle
@@ -174,7 +174,7 @@ def compactable(root: Path) -> list[Compactable]:
     Raises:
         FormatError: a recording with deleted episodes is damaged, or what is noted beside it.
     """
-    found = []
+    compactables = []
     for item in sorted(scan(root)):
         path = root / item.relative
         notes = Notes.read(path, root)
@@ -182,8 +182,8 @@ def compactable(root: Path) -> list[Compactable]:
             with contextlib.suppress(RecordingError):  # gone meanwhile
                 deleted = notes.about(metadata_at(path)).deleted
                 if deleted:
-                    found.append(Compactable(item.relative, len(deleted), item.stamp.size))
-    return found
+                    compactables.append(Compactable(item.relative, len(deleted), item.stamp.size))
+    return compactables
 
 
 def _listed(path: Path, root: Path | None) -> ListedRecording:

@@ -74,9 +74,9 @@ class RecordingFiles:
         """The episodes of a recording that has just been ingested, without a look at the others."""
         wanted = FilterEQ(key="recording", value=path.relative_to(self._root).as_posix())
         with contextlib.suppress(*_TROUBLE):
-            found = self._catalog.episodes(wanted)
-            if found:
-                return found
+            headers = self._catalog.episodes(wanted)
+            if headers:
+                return headers
         return self.headers(wanted)
 
     def headers(
@@ -88,7 +88,7 @@ class RecordingFiles:
         return self._settled(lambda: self._catalog.count(filter))
 
     def _settled(self, ask: Callable[[], _T]) -> _T:
-        """What a catalog says that is up to date, and that nobody has put another in the place of since."""
+        """Asks a catalog that is up to date, again if somebody has replaced it meanwhile."""
 
         def settle() -> _T:
             for _ in range(_ATTEMPTS):
@@ -208,15 +208,17 @@ class RecordingFiles:
         return self._opened
 
     def _declare_keys(self) -> None:
-        """After the catalog was opened or made anew, perhaps by another process: once there is something in it, for an
-        index is made more quickly than it is added to."""
+        """Declares the keys in a catalog that was opened or made anew, perhaps by another process.
+
+        Done once its rows are in it: making an index of them is quicker than adding each to one.
+        """
         if self._undeclared:
             for key in self._declared_keys:
                 self._catalog.declare_key(key)
             self._undeclared = False
 
     def reindex(self) -> None:
-        """Forget the catalog and fill it from the files."""
+        """Empty the catalog and fill it from the files."""
 
         def make() -> None:
             with self._catalog.alone():  # nobody sees half of it
@@ -271,10 +273,10 @@ class RecordingFiles:
 
     def _follow(self, changes: Mapping[str, Path | None]) -> None:
         """Brings what has changed into the catalog."""
-        there = [relative for relative, path in changes.items() if path is not None]
+        present = [relative for relative, path in changes.items() if path is not None]
         with (
             progress(len(changes), "Cataloguing recordings") as bar,
-            contextlib.closing(read_ahead(self._root, there)) as entries,
+            contextlib.closing(read_ahead(self._root, present)) as entries,
         ):
             for relative, path in changes.items():
                 if path is None:
@@ -288,19 +290,21 @@ class RecordingFiles:
 
         The latter come first: a file that was moved is no copy of itself.
         """
-        known = self._catalog.recordings()
+        catalogued = self._catalog.recordings()
         if self._catalog.identity != self._synced:
             self._synced = self._catalog.identity
             self._undeclared = True
-        if known:
+        if catalogued:
             self._declare_keys()
         with os_errors("cannot list the recordings below", self._root):
-            found = sorted(scan(self._root))
-        changes: dict[str, Path | None] = dict.fromkeys(known.keys() - {item.relative for item in found})
-        for item in found:
+            listed = sorted(scan(self._root))
+        changes: dict[str, Path | None] = dict.fromkeys(
+            catalogued.keys() - {item.relative for item in listed}
+        )
+        for item in listed:
             path = self._root / item.relative
             # What a live writer's journal holds is in no time stamp.
-            if known.get(item.relative) != item.stamp or (item.journal and is_locked(path)):
+            if catalogued.get(item.relative) != item.stamp or (item.journal and is_locked(path)):
                 changes[item.relative] = path
         return changes
 
@@ -381,9 +385,9 @@ class RecordingFiles:
             doomed: dict[str, Sidecar] = {}
             for (relative, uuid), numbers in by_recording.items():
                 with contextlib.suppress(NotFoundError):  # somebody else was first
-                    there = self._left(self.path(relative), uuid) & numbers
-                    if there:
-                        doomed[relative] = Sidecar(uuid=uuid, deleted=there)
+                    left = self._left(self.path(relative), uuid) & numbers
+                    if left:
+                        doomed[relative] = Sidecar(uuid=uuid, deleted=left)
             if len(doomed) > 1:
                 Deletion(
                     deleted={relative: note.deleted for relative, note in doomed.items()},

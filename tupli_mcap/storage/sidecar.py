@@ -122,8 +122,7 @@ class Deletion(BaseModel):
         return found
 
     def stamp(self, relative: str) -> tuple[int, ...]:
-        """Tells what it says of a recording from all else that it may say; in numbers, for each process has other
-        hashes of texts."""
+        """Numbers that change with what is noted about a recording. (Hashes of texts differ between processes.)"""
         numbers = self.deleted.get(relative)
         return () if numbers is None else (int(self.uuids.get(relative) or "0", 16), *sorted(numbers))
 

@@ -74,16 +74,19 @@ def verify_paths(paths: Iterable[Path]) -> Iterator[VerifyReport]:
     for path in paths:
         if path.is_dir():
             try:
-                found = sorted(scan(path))
+                items = sorted(scan(path))
             except (OSError, TupliError) as err:
                 report = VerifyReport(str(path), kind="storage")
-                said, _, advice = str(err).removeprefix(f"{path}: ").partition("; ")
+                message, _, advice = str(err).removeprefix(f"{path}: ").partition("; ")
                 if isinstance(err, OSError):
-                    said, advice = f"it cannot be read: {err.strerror}", "check the directory's permissions"
-                Findings(report).error("file", said, advice=advice)
+                    message, advice = (
+                        f"it cannot be read: {err.strerror}",
+                        "check the directory's permissions",
+                    )
+                Findings(report).error("file", message, advice=advice)
                 yield report
                 continue
-            for item in found:
+            for item in items:
                 yield _recording(path / item.relative)
             yield from _directory(path)
         else:
@@ -104,9 +107,9 @@ def _recording(path: Path) -> VerifyReport:
                 _sidecar(path, findings)
                 _benchmark(path, findings)
     except (TupliError, OSError) as err:
-        said, _, advice = str(err).removeprefix(f"{path}: ").removeprefix(f"{path} ").partition("; ")
+        message, _, advice = str(err).removeprefix(f"{path}: ").removeprefix(f"{path} ").partition("; ")
         Findings(report).error(
-            "file", said, advice=advice or "give a recording (.mcap) or a directory of them"
+            "file", message, advice=advice or "give a recording (.mcap) or a directory of them"
         )
     return report
 
@@ -235,10 +238,10 @@ def _artifacts(root: Path, findings: Findings) -> None:
             )
         if not is_hash(path.name):
             continue
-        found = _digest(path)
+        digest = _digest(path)
         findings.report.attachments += 1
-        if found != path.name:
-            what = f"artifact {path.name} has bytes with SHA-256 {found}"
+        if digest != path.name:
+            what = f"artifact {path.name} has bytes with SHA-256 {digest}"
             findings.error("artifact", what, advice="store it again, or import its bundle")
         try:
             artifacts.item(path.name)

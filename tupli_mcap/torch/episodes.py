@@ -50,8 +50,8 @@ class Episodes(Items[Window]):
         firsts, lengths = self._firsts[items], self._lengths[items]
         places = np.arange(lengths.max(initial=0))
         mask = places < lengths[:, None]
-        found = self.source.read(self.fields, (firsts[:, None] + places)[mask])
-        columns = {name: _spread(column, mask) for name, column in found.items()}
+        steps = self.source.read(self.fields, (firsts[:, None] + places)[mask])
+        columns = {name: _spread(column, mask) for name, column in steps.items()}
         return Window(mask, firsts, self._numbers[items], **columns)
 
     def __repr__(self) -> str:
@@ -68,6 +68,6 @@ def _spread(column: Any, mask: Array) -> Any:
 
     def of_list(part: list[Any]) -> list[Any]:
         rest = iter(part)
-        return [[next(rest) if there else None for there in row] for row in mask.tolist()]
+        return [[next(rest) if is_step else None for is_step in row] for row in mask.tolist()]
 
     return map_arrays(of_array, column, of_list)

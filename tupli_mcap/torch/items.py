@@ -48,7 +48,7 @@ class ReadItems:
 
 
 def check_state(state: Any, identity: str, expected: Mapping[str, Any]) -> None:
-    """Sees to it that a state dict is one of these items, with the same options.
+    """Checks that a state dict is of these items, with the same options.
 
     Raises:
         SamplingError: it is another's.

@@ -44,7 +44,7 @@ class Blocks:
 
     @cached_property
     def digest(self) -> str:
-        """Of which items lie in which block."""
+        """A digest (SHA-256, hex) of which items lie in which block."""
         return hashlib.sha256(
             b"".join(part.tobytes() for part in (self.starts, self.stops, self.firsts))
         ).hexdigest()

@@ -100,7 +100,7 @@ ForkingPickler.register(PackedBatch, PackedBatch._handed_over)
 
 
 def _received(rebuild: Callable[..., Any], arguments: tuple[Any, ...], places: dict[str, Any]) -> Any:
-    """The batch of another process, which is asked for the memory.
+    """The batch of another process, in the memory that this one shares.
 
     Raises:
         RuntimeError: it is dead.

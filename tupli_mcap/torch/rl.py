@@ -61,8 +61,8 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
         if isinstance(index, slice):
             index = np.arange(*index.indices(len(self)))
         numbers = np.asarray(index, np.int64)
-        found = self._read(numbers.reshape(-1))
-        return found.reshape(numbers.shape)
+        batch = self._read(numbers.reshape(-1))
+        return batch.reshape(numbers.shape)
 
     def _read(self, numbers: np.ndarray[Any, Any]) -> TensorDict:
         columns = tensors(self._transitions[numbers].asdict())

@@ -87,7 +87,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             )
 
     def set_epoch(self, epoch: int) -> None:
-        """Says which epoch begins with the next iteration; another number is another order.
+        """Sets the number of the epoch that begins with the next iteration; each has an order of its own.
 
         Raises:
             SamplingError: it is no integer from 0.

@@ -2,7 +2,7 @@
 
 `plan` makes Rerun recordings of chosen episodes, `scene` chooses their panels (`panels`) by the spaces, `blueprints`
 places them, `blocks` reads the steps, `sending` sends columns, and `targets` is where all goes. `live` shows a rollout
-while it is recorded; `to_mcap` copies a recording for viewers without a blueprint, such as Foxglove.
+while it is recorded; `foxglove_layout` makes Foxglove plot a recording.
 """
 
 from __future__ import annotations

@@ -70,8 +70,8 @@ def card(recording: Recording) -> str:
     for name, spread in (("return", d.returns), ("length", d.lengths)):
         if spread:
             odd = nan_text(spread.nan, d.episodes)
-            told = f"mean {spread.mean:.4g}, from {spread.min:.4g} to {spread.max:.4g}{f'; {odd}' if odd else ''}"
-            rows.append((name, odd if spread.nan == d.episodes else told))
+            text = f"mean {spread.mean:.4g}, from {spread.min:.4g} to {spread.max:.4g}{f'; {odd}' if odd else ''}"
+            rows.append((name, odd if spread.nan == d.episodes else text))
     rows += _leaf_rows(recording)
     rows += [
         ("benchmark", d.benchmark_id[:12] or "none"),

@@ -71,16 +71,16 @@ def _stack(panels: Sequence[Panel], roots: Sequence[str], axis: Any, name: str) 
     lines = [panel for panel in panels if isinstance(panel, Series) and panel.leaf.path in wide]
     others = [panel for panel in panels if not any(panel is taken for taken in (*maps, *lines))]
     pages = []
-    for group, told in ((others, name), (lines, f"{name}: lines")):
+    for group, title in ((others, name), (lines, f"{name}: lines")):
         for start in range(0, len(group), _A_PAGE):
             page = group[start : start + _A_PAGE]
             where = "" if len(group) <= _A_PAGE else f" {start + 1} to {start + len(page)}"
-            pages.append((_below(page, roots, axis), told + where))
+            pages.append((_below(page, roots, axis), title + where))
     if maps:
-        shown, told = pages.pop(0) if others else ([], name)
-        pages.insert(0, (shown + _below(maps, roots, axis), told))
+        shown, title = pages.pop(0) if others else ([], name)
+        pages.insert(0, (shown + _below(maps, roots, axis), title))
     columns = [
-        rrb.Vertical(*views, row_shares=shares, name=told) for views, shares, told in map(_unzipped, pages)
+        rrb.Vertical(*views, row_shares=shares, name=title) for views, shares, title in map(_unzipped, pages)
     ]
     return columns[0] if len(columns) == 1 else rrb.Tabs(*columns, name=name)
 

@@ -32,7 +32,7 @@ def entity_of(leaf: Leaf) -> str:
 def title_of(leaf: Leaf) -> str:
     """A leaf's name for people: `state · arm · position`."""
     root = leaf.path.partition("[")[0]
-    return " · ".join([root, *(str(key)[:_LONGEST] for key in leaf.keys)])
+    return " · ".join([root, *(_text(key)[:_LONGEST] for key in leaf.keys)])
 
 
 def dimension_names(leaf: Leaf, known: Sequence[str] | None) -> list[str]:
@@ -40,8 +40,13 @@ def dimension_names(leaf: Leaf, known: Sequence[str] | None) -> list[str]:
     if known is not None:
         return list(known)
     if leaf.shape == ():
-        return [str(leaf.keys[-1]) if leaf.keys else leaf.path]
+        return [_text(leaf.keys[-1]) if leaf.keys else leaf.path]
     return [f"[{', '.join(map(str, at))}]" for at in itertools.product(*map(range, leaf.shape))]
+
+
+def _text(key: object) -> str:
+    """A key of a space; UTF-8, and so the viewer, has no lone surrogates."""
+    return str(key).encode("utf-8", "replace").decode()
 
 
 def plain(text: str) -> str:

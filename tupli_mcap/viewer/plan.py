@@ -14,6 +14,7 @@ from tupli_mcap.dataset.which import Chosen
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.description import describe
 from tupli_mcap.viewer.about import send_about
 from tupli_mcap.viewer.blocks import Block, blocks_of, row_counts
 from tupli_mcap.viewer.blueprints import blueprint_of
@@ -79,10 +80,9 @@ class Plan(NamedTuple):
     def new_stream(self) -> Any:
         """A Rerun recording stream without a sink."""
         rr = rerun_sdk()
-        fresh = (
-            f"{self.identity}-{uuid.uuid4().hex[:8]}"  # so that a viewer that is sent it twice shows it twice
-        )
-        return rr.RecordingStream(self.application, recording_id=fresh, send_properties=True)
+        # a new id each time, so that a viewer that is sent the plan twice shows it twice
+        identity = f"{self.identity}-{uuid.uuid4().hex[:8]}"
+        return rr.RecordingStream(self.application, recording_id=identity, send_properties=True)
 
     def send(self, stream: Any) -> None:
         """Sends everything, a block of steps at a time."""
@@ -117,8 +117,6 @@ def times_of(block: Block) -> Times:
 
 def name_of(recording: Recording) -> str:
     """The environment's name, else the file's."""
-    from tupli_mcap.recording.description import describe
-
     return describe(recording).environment or Path(recording.name).stem
 
 
@@ -159,8 +157,8 @@ def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
             number = item.recording.episodes[position].number
             name = f"episode {number} · {Path(item.recording.name).stem}"  # the viewer's list shows only the beginning
             part = Part(Chosen(item.recording, [position]), scene)
-            told = _episode_told(item.recording, position)
-            yield Plan(name, f"{item.recording.uuid}-{number}", [part], told, listed=several)
+            text = _episode_told(item.recording, position)
+            yield Plan(name, f"{item.recording.uuid}-{number}", [part], text, listed=several)
 
 
 def _joined(chosen: Sequence[Chosen]) -> Plan:
@@ -173,11 +171,11 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
     total = sum(len(item.positions) for item in chosen)
     name = Path(chosen[0].recording.name).stem
     if total == 1:
-        told = _episode_told(chosen[0].recording, chosen[0].positions[0])
+        text = _episode_told(chosen[0].recording, chosen[0].positions[0])
     else:
-        told = f"{total:,} episodes, {sum(part.steps for part in parts):,} steps, on one timeline"
+        text = f"{total:,} episodes, {sum(part.steps for part in parts):,} steps, on one timeline"
     scene.rows = first
-    return Plan(name, chosen[0].recording.uuid, parts, told)
+    return Plan(name, chosen[0].recording.uuid, parts, text)
 
 
 def _episode_told(recording: Recording, position: int) -> str:

@@ -35,7 +35,8 @@ __all__ = [
 ]
 
 LOCAL = "127.0.0.1"
-_PATIENCE = 30.0  # seconds for a viewer to answer
+_PATIENCE = 30.0  # seconds for a viewer to start
+_ANSWER = 0.25  # seconds for one that listens to answer
 
 
 def viewer_program() -> Path:
@@ -51,15 +52,16 @@ def viewer_program() -> Path:
         program = Path(folder) / "rerun"
         if program.is_file():
             return program
-    found = shutil.which("rerun")
-    if found is None:
+    on_path = shutil.which("rerun")
+    if on_path is None:
         raise ViewerError(f"there is no viewer: expected the program 'rerun' of rerun-sdk {sdk}; {again}")
-    told = run_quietly(Path(found), "--version")
-    if version_of(told) != version_of(sdk):
+    version = run_quietly(Path(on_path), "--version")
+    if version_of(version) != version_of(sdk):
         raise ViewerError(
-            f"expected the viewer {found} to be of version {sdk}, as rerun-sdk is, found {told.strip()[:80]!r}; {again}"
+            f"expected the viewer {on_path} to be of version {sdk}, as rerun-sdk is, found {version.strip()[:80]!r}; "
+            f"{again}"
         )
-    return Path(found)
+    return Path(on_path)
 
 
 def run_quietly(program: Path, *arguments: str) -> str:
@@ -94,10 +96,10 @@ def free_port() -> int:
         return int(found.getsockname()[1])
 
 
-def answers(host: str, port: int, seconds: float = 0.25) -> bool:
+def answers(host: str, port: int) -> bool:
     """Whether something listens there."""
     try:
-        socket.create_connection((host, port), seconds).close()
+        socket.create_connection((host, port), _ANSWER).close()
     except OSError:
         return False
     return True

@@ -11,7 +11,8 @@ from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.step import StepLayout, can_stack
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Columns, Recording
+from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names, entity_of, escaped, title_of
@@ -30,7 +31,7 @@ from tupli_mcap.viewer.panels import (
     value_range,
 )
 
-__all__ = ["Scene", "live_scene", "scene_of"]
+__all__ = ["MOST_LINES", "Scene", "live_scene", "scene_of"]
 
 MOST_LINES: Final = 12  # in one plot; more cannot be told apart
 _MOST_SMALL: Final = 48  # dimensions that get small plots besides their heat map
@@ -38,10 +39,11 @@ _LINES_SMALL: Final = 6
 _MOST_LANES: Final = 12  # values of a Discrete leaf that get a colour each
 _MOST_LANE_ROWS: Final = 20_000  # the state timeline draws every change, however narrow
 _MOST_INFOS: Final = 12
+_TITLED: Final = 4  # dimensions that a title names
 _MOST_FRAMES: Final = 16  # of a stack that is not declared as one
 _LEAST_FRAME: Final = 16  # pixels of each of its sides
 _RATIO: Final = 30.0  # magnitudes further apart than this do not share an axis
-_SAMPLE_EPISODES, _SAMPLE_STEPS, _SAMPLE_VALUES = 8, 512, 1 << 20
+_SAMPLE_EPISODES, _SAMPLE_STEPS, _SAMPLE_BYTES = 8, 512, 8 << 20
 
 
 @dataclass
@@ -180,15 +182,15 @@ def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Pan
     names = dimension_names(leaf, material.labels.dimensions.get(leaf.path))
     groups = _by_scale(_magnitudes(material.values(leaf, column)), _RATIO, most)
     stepped = column == "actions" or (leaf.dtype is not None and leaf.dtype.kind in "iub")
-    found: list[Panel] = []
+    panels: list[Panel] = []
     for dims in groups:
-        told = [names[i] for i in dims]
+        names_here = [names[i] for i in dims]
         alone = len(groups) == 1
         entity = entity_of(leaf)
         path = entity if alone else f"{entity}/dims_{'_'.join(map(str, dims))}"
-        title = title_of(leaf) if alone else f"{title_of(leaf)}: {_some(told)}"
-        found.append(Series(leaf, column, path, title, dims, told, stepped))
-    return found
+        title = title_of(leaf) if alone else f"{title_of(leaf)}: {_some(names_here)}"
+        panels.append(Series(leaf, column, path, title, dims, names_here, stepped))
+    return panels
 
 
 def _magnitudes(values: Array) -> list[float]:
@@ -215,9 +217,9 @@ def _by_scale(sizes: Sequence[float], ratio: float, most: int) -> list[list[int]
     return sorted(sorted(group) for group in groups)
 
 
-def _some(names: Sequence[str], most: int = 4) -> str:
+def _some(names: Sequence[str]) -> str:
     """The first names, as a title has room for."""
-    return ", ".join(names[:most]) + ("" if len(names) <= most else ", …")
+    return ", ".join(names[:_TITLED]) + ("" if len(names) <= _TITLED else ", …")
 
 
 def _many(scene: Scene, leaf: Leaf, column: str, material: _Material) -> list[Panel]:
@@ -240,13 +242,14 @@ def _spread(positions: Sequence[int]) -> list[int]:
     return [int(positions[i]) for i in chosen]
 
 
-def _sample(recording: Recording, positions: Sequence[int]) -> list[Any]:
-    """A few steps from the middle of a few episodes: they tell how large the values get."""
-    row = sum(leaf.size for leaf in recording.layout.leaves if leaf.dtype is not None)
-    most = max(1, min(_SAMPLE_STEPS, _SAMPLE_VALUES // (_SAMPLE_EPISODES * max(row, 1))))
-    found = []
+def _sample(recording: Recording, positions: Sequence[int]) -> list[Columns]:
+    """A few steps from the middle of a few episodes, without images: they tell how large the values get."""
+    at_once = _SAMPLE_BYTES // _SAMPLE_EPISODES // step_bytes(recording.layout, images=False)
+    most = max(1, min(_SAMPLE_STEPS, at_once))
+    sample = []
     for position in _spread(positions):
         length = int(recording.index["length"][position])
         start = max(0, (length - most) // 2)
-        found.append(recording.read_steps(position, start, min(length, start + most), ("states", "actions")))
-    return found
+        stop = min(length, start + most)
+        sample.append(recording.read_steps(position, start, stop, ("states", "actions"), images=False))
+    return sample

@@ -30,11 +30,11 @@ def rerun_sdk() -> Any:
         import rerun
     except ImportError as err:
         raise missing_extra("looking at recordings needs rerun-sdk", "rerun") from err
-    found = getattr(rerun, "__version__", None)
-    if found is None or version_of(found) < OLDEST:
+    version = getattr(rerun, "__version__", None)
+    if version is None or version_of(version) < OLDEST:
         oldest = ".".join(map(str, OLDEST))
         raise missing_extra(
-            f"expected rerun-sdk {oldest} or later, found {found or 'another package'}", "rerun"
+            f"expected rerun-sdk {oldest} or later, found {version or 'another package'}", "rerun"
         )
     return rerun
 

@@ -143,13 +143,13 @@ def tensor_array(values: Sequence[Array], names: Sequence[str]) -> Any:
     rows = len(values)
     goal = _tensor_type()
     fields = [goal.field(i) for i in range(goal.num_fields)]  # shape, names, buffer
-    each = pa.array(np.arange(0, rows * len(names) + 1, len(names), dtype=np.int32))
+    ends = pa.array(np.arange(0, rows * len(names) + 1, len(names), dtype=np.int32))
     shapes = pa.array(np.array([value.shape for value in values], np.uint64).reshape(-1))
-    told = pa.array(list(names) * rows, pa.utf8())
+    dimension_names = pa.array(list(names) * rows, pa.utf8())
     return pa.StructArray.from_arrays(
         [
-            pa.ListArray.from_arrays(each, shapes, type=fields[0].type),
-            pa.ListArray.from_arrays(each, told, type=fields[1].type),
+            pa.ListArray.from_arrays(ends, shapes, type=fields[0].type),
+            pa.ListArray.from_arrays(ends, dimension_names, type=fields[1].type),
             _tensor_buffers(values, fields[2].type),
         ],
         fields=fields,

@@ -150,12 +150,17 @@ def _checked_keys(deltas: Mapping[str, Iterable[float]]) -> Mapping[str, Iterabl
 
 def _numbers(key: str, deltas: Iterable[float]) -> Array:
     try:
-        found = np.array(list(deltas))
+        numbers = np.array(list(deltas))
     except (TypeError, ValueError):
-        found = np.empty(0)
-    if found.ndim != 1 or not len(found) or found.dtype.kind not in "iuf" or not np.isfinite(found).all():
+        numbers = np.empty(0)
+    if (
+        numbers.ndim != 1
+        or not len(numbers)
+        or numbers.dtype.kind not in "iuf"
+        or not np.isfinite(numbers).all()
+    ):
         raise SamplingError(f"expected numbers, at least one, as deltas of {key!r}, found {deltas!r:.80}")
-    return found
+    return numbers
 
 
 def _in_steps(given: Mapping[str, Array], unit: str, step_seconds: float | None) -> dict[str, Array]:
@@ -168,7 +173,7 @@ def _in_steps(given: Mapping[str, Array], unit: str, step_seconds: float | None)
                 "for the times recorded"
             )
         scale = step_seconds
-    found = {}
+    in_steps = {}
     for key, deltas in given.items():
         steps = np.round(deltas / scale)
         away = np.abs(steps * scale - deltas)
@@ -178,5 +183,5 @@ def _in_steps(given: Mapping[str, Array], unit: str, step_seconds: float | None)
                 f"expected deltas of {key!r} that are whole steps{f' of {scale} s' if unit == 'seconds' else ''}, "
                 f"found {wrong}"
             )
-        found[key] = steps.clip(-_FARTHEST, _FARTHEST).astype(np.int64)
-    return found
+        in_steps[key] = steps.clip(-_FARTHEST, _FARTHEST).astype(np.int64)
+    return in_steps

@@ -72,29 +72,30 @@ class Sampler:
 
     def _checked(self, weights: Any, n: int) -> Array:
         try:
-            found = np.asarray(weights)
+            checked = np.asarray(weights)
         except (TypeError, ValueError) as err:  # lists of different lengths
             raise SamplingError(
                 f"expected {n} weights, one for each {self._what}, found {weights!r:.80}"
             ) from err
-        if found.shape != (n,) or found.dtype.kind not in "biuf":
+        if checked.shape != (n,) or checked.dtype.kind not in "biuf":
             raise SamplingError(
-                f"expected {n} weights, one for each {self._what}, found {found.dtype} of shape {found.shape}"
+                f"expected {n} weights, one for each {self._what}, found {checked.dtype} of shape {checked.shape}"
             )
-        found = found.astype(np.float64)
-        usable = _usable(found, n)
+        checked = checked.astype(np.float64)
+        usable = _usable(checked, n)
         if not usable.all():
             i = int(np.argmin(usable))
             raise SamplingError(
-                f"expected weights from 0 on, found {found[i]} for {self._what} {i}; their sum must be finite, too"
+                f"expected weights from 0 on, found {checked[i]} for {self._what} {i}; their sum must be finite, too"
             )
-        if self._counts is not None and len(found) == len(self._counts):
-            found = np.where(self._counts > 0, found, 0.0)  # of an episode without items, none can be drawn
-        if not found.any():
+        if self._counts is not None and len(checked) == len(self._counts):
+            # of an episode without items, none can be drawn
+            checked = np.where(self._counts > 0, checked, 0.0)
+        if not checked.any():
             raise SamplingError(
                 f"expected a weight above 0, found none for any {self._what} that can be drawn"
             )
-        return found
+        return checked
 
     def update(self, places: Array | Sequence[int], weights: Array | Sequence[float] | float) -> None:
         """Sets the weights of some items (of some episodes with `by="episodes"`), from the next batch on.
@@ -137,14 +138,14 @@ class Sampler:
         if self._tree is not None:
             if not self._tree.total > 0:
                 raise SamplingError(f"expected a weight above 0, found 0 for every {self._what}")
-            found = self._tree.find(random.random(self.batch_size) * self._tree.total)
+            places = self._tree.find(random.random(self.batch_size) * self._tree.total)
         elif self._episodes is not None:
-            found = self._episodes[random.integers(0, len(self._episodes), self.batch_size)]
+            places = self._episodes[random.integers(0, len(self._episodes), self.batch_size)]
         else:
             return random.integers(0, self._n, self.batch_size)
         if self._counts is None or self._firsts is None:
-            return found
-        return self._firsts[found] + random.integers(0, self._counts[found])
+            return places
+        return self._firsts[places] + random.integers(0, self._counts[places])
 
     def __iter__(self) -> Iterator[Array]:
         return self
@@ -188,10 +189,10 @@ class Sampler:
     def _checked_unused(self, batches: Any) -> list[Array]:
         if not isinstance(batches, list):
             raise SamplingError(f"expected a list of unused batches in a state, found {batches!r:.80}")
-        found = [checked_numbers(batch, "unused numbers of items") for batch in batches]
-        if any(len(batch) and not 0 <= batch.min() <= batch.max() < self._n for batch in found):
+        unused = [checked_numbers(batch, "unused numbers of items") for batch in batches]
+        if any(len(batch) and not 0 <= batch.min() <= batch.max() < self._n for batch in unused):
             raise SamplingError(f"expected unused numbers of items from 0 to {self._n - 1}, found others")
-        return found
+        return unused
 
 
 def _usable(weights: Array, n: int) -> Array:

@@ -254,13 +254,13 @@ class OpenFiles:
         if self._process != os.getpid():  # the lock may be held by a thread that is not here
             self._forget()
         with self._lock:
-            found = self._sources.get(where)
-            if found is None:
-                found = self._sources[where] = open_source(where)
+            source = self._sources.get(where)
+            if source is None:
+                source = self._sources[where] = open_source(where)
                 if len(self._sources) > self._limit:
                     self._sources.popitem(last=False)  # closed when the last reader has let go of it
             self._sources.move_to_end(where)
-            return found
+            return source
 
     def __getstate__(self) -> dict[str, Any]:
         return {"limit": self._limit}

@@ -147,20 +147,18 @@ class Items(ABC, Generic[T]):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            **self.__dict__,
-            "_values_of": None,
-        }  # a copy elsewhere reads items; it needs no list of episodes
+        # a copy elsewhere reads items; it needs no list of episodes
+        return {**self.__dict__, "_values_of": None}
 
     def block_runs(self) -> tuple[Array, Array, Array]:
         """Runs of items that lie in one block of the storage: the first item and the length of each, and its block."""
         starts, blocks = [], []
         for first in range(0, len(self), _MANY):
             items = np.arange(first, min(first + _MANY, len(self)))
-            found = self.source.blocks(self.steps_of(items))
-            cuts = np.flatnonzero(np.diff(found, prepend=-1))
+            block_of = self.source.blocks(self.steps_of(items))
+            cuts = np.flatnonzero(np.diff(block_of, prepend=-1))
             starts.append(items[cuts])
-            blocks.append(found[cuts])
+            blocks.append(block_of[cuts])
         begin = np.concatenate(starts)
         return begin, np.diff(begin, append=len(self)), np.concatenate(blocks)
 

@@ -38,7 +38,7 @@ class NumberedRows:
         return self._rows.columns
 
     def hold(self, names: Iterable[str]) -> None:
-        """Keeps these columns decoded, in `nbytes` of memory as far as they have been read; none: not any more."""
+        """Keeps these columns decoded, and no others, in `nbytes` of memory once all rows have been read."""
         chosen = set(names) if self._rows.constant else set()
         if not chosen:
             self._held = None

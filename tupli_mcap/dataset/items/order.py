@@ -174,9 +174,8 @@ def _through_buffer(
     _, lengths, blocks = runs
     count = len(np.unique(blocks))
     span = size * count / int(lengths.sum())
-    first = min(
-        int(span), count - 1
-    )  # before that block, nothing leaves: also the first items are of many blocks
+    # before that block, nothing leaves: also the first items are of many blocks
+    first = min(int(span), count - 1)
     waiting, due, ready = np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64)
     for now, block in enumerate(_blocks(*runs, random)):
         low, high = max(now, first), min(now + span, count)
@@ -210,7 +209,7 @@ def seeded(seed: int, stream: int, number: int) -> np.random.Generator:
 
 
 def _digest(runs: tuple[Array, Array, Array]) -> str:
-    """Of which items lie in which block."""
+    """A digest (SHA-256, hex) of which items lie in which block."""
     return hashlib.sha256(b"".join(part.tobytes() for part in runs)).hexdigest()
 
 

@@ -67,8 +67,8 @@ class RecordedSteps:
     def _select(self) -> None:
         """Facts about the wanted steps."""
         index, wanted = self._index, self._wanted
-        some = index.lengths > 0
-        last, unknown = self._ends[some] - 1, self._ends[some & index.unknown] - 1
+        has_steps = index.lengths > 0
+        last, unknown = self._ends[has_steps] - 1, self._ends[has_steps & index.unknown] - 1
         if wanted is None:
             self.episode_lengths, self.breaks, self.open_ends = index.lengths, last, unknown
             self.identity = index.digest
@@ -135,9 +135,8 @@ class RecordedSteps:
     def room(self) -> int:
         """How many steps are in the chunks that fit into half the cache."""
         stored = sum(int(store.table["uncompressed"].sum()) for store in self._index.stores)
-        images = (
-            sum(leaf.size for leaf in self.layout.images) if self.layout else 0
-        )  # stored smaller, some of them
+        # images may be stored smaller than they are
+        images = sum(leaf.size for leaf in self.layout.images) if self.layout else 0
         return int(self.cache_bytes / 2 / max(1, stored / max(1, len(self)), images))
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
@@ -170,10 +169,10 @@ class RecordedSteps:
             return {field: np.empty(0) for field in checked_fields(fields)}
         with memory_for(lambda: f"reading {', '.join(fields)} of {len(listed())} steps"):
             plan = self._plans.get(tuple(fields)) or self._plan(self.layout, fields)
-            found: dict[str, Any] = {}
+            leaf_columns: dict[str, Any] = {}
             for i, leaves in plan.sources:
-                found.update(read(self._rows[i], leaves))
-            columns = plan.nest(found)
+                leaf_columns.update(read(self._rows[i], leaves))
+            columns = plan.nest(leaf_columns)
             if "next_states" not in fields:
                 return columns
             columns["next_states"] = self._next_states(listed())
@@ -213,26 +212,26 @@ class RecordedSteps:
         at_end = np.flatnonzero(after < 0)
         rows = np.where(after < 0, listed, after)
         plan = self._plans[_STATES]
-        found: dict[str, Any] = {}
+        columns: dict[str, Any] = {}
         for i, names in plan.sources:
-            found.update(self._rows[i].read(names, rows, self.threads))
+            columns.update(self._rows[i].read(names, rows, self.threads))
         if len(at_end):
-            finals = self._finals(list(found), -1 - after[at_end])
-            for name, column in found.items():
+            finals = self._finals(list(columns), -1 - after[at_end])
+            for name, column in columns.items():
                 put(column, at_end, finals[name])
-        return plan.nest(found)["states"]
+        return plan.nest(columns)["states"]
 
     def _finals(self, names: Sequence[str], rows: Array) -> dict[str, Any]:
-        found = self._rows[-1].read([*names, EPISODE], rows, self.threads)
+        finals = self._rows[-1].read([*names, EPISODE], rows, self.threads)
         expected = self._index.final_numbers[rows]
-        wrong = np.flatnonzero(found[EPISODE] != expected)
+        wrong = np.flatnonzero(finals[EPISODE] != expected)
         if len(wrong):
             i = int(wrong[0])
             raise FormatError(
-                f"expected the final state of episode {expected[i]}, found that of {found[EPISODE][i]}; "
+                f"expected the final state of episode {expected[i]}, found that of {finals[EPISODE][i]}; "
                 "verify the recordings"
             )
-        return found
+        return finals
 
 
 def steps_of(

@@ -97,7 +97,7 @@ class MemorySteps:
         return len(self._rest)
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
-        checked_fields(fields)
+        fields = checked_fields(fields)
         missing = [field for field in fields if field not in self._columns]
         found = self._rest.read(missing, rows) if missing else {}
         where = following(rows, len(self))
@@ -106,7 +106,7 @@ class MemorySteps:
         }
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
-        checked_fields(fields)
+        fields = checked_fields(fields)
         missing = [field for field in fields if field not in self._columns]
         found = self._rest.read_runs(missing, starts, length) if missing else {}
         return {
@@ -149,7 +149,7 @@ def pick(column: Any, rows: Array | slice) -> Any:
 
 
 def following(rows: Array, total: int) -> Array | slice:
-    """Rows out of `total` as a slice, if each is the one after that before it: it is copied several times as fast."""
+    """Rows out of `total`, as a slice if they follow each other: NumPy copies that more quickly."""
     n = len(rows)
     if n < 2 or rows[0] < 0 or rows[-1] >= total or rows[-1] - rows[0] != n - 1:
         return rows
@@ -218,13 +218,12 @@ def checked_numbers(value: Any, what: str) -> Array:
         SamplingError: it is something else.
     """
     try:
-        found = np.asarray(value)
+        numbers = np.asarray(value)
     except (TypeError, ValueError, OverflowError):  # lists of different lengths, for example
-        found = np.empty(())
-    if found.ndim != 1 or (found.dtype.kind not in "iu" and len(found)):
+        numbers = np.empty(())
+    if numbers.ndim != 1 or (numbers.dtype.kind not in "iu" and len(numbers)):
         raise SamplingError(f"expected {what} in one dimension, found {value!r:.80}")
-    if found.dtype == np.uint64:
-        found = np.minimum(
-            found, np.uint64(_MOST)
-        )  # which is beyond everything, and does not become negative
-    return found.astype(np.int64)
+    if numbers.dtype == np.uint64:
+        # which is beyond everything, and does not become negative
+        numbers = np.minimum(numbers, np.uint64(_MOST))
+    return numbers.astype(np.int64)

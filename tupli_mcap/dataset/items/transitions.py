@@ -112,8 +112,8 @@ class Transitions(StepItems[Transition]):
         ahead = np.arange(min(self.n_step, int((breaks - rows).max(initial=0)) + 1))
         wanted = np.minimum(rows[:, None] + ahead, breaks[:, None])
         names = ["terminals", *(["rewards"] if "rewards" in self.fields else [])]
-        found = source.read(names, wanted.reshape(-1))
-        over = found["terminals"].reshape(wanted.shape)
+        columns = source.read(names, wanted.reshape(-1))
+        over = columns["terminals"].reshape(wanted.shape)
         earlier = np.cumsum(over, axis=1) - over > 0  # a terminal lies before
         counts = ((rows[:, None] + ahead <= breaks[:, None]) & ~earlier).sum(axis=1)
         last = rows + counts - 1
@@ -121,9 +121,9 @@ class Transitions(StepItems[Transition]):
         short = (counts > 1) & _isin(last, source.open_ends) & ~over_last
         counts, last = counts - short, last - short
         sums: dict[str, Any] = {}
-        if "rewards" in found:
+        if "rewards" in columns:
             weights = np.where(ahead < counts[:, None], self.discount**ahead, 0.0)
-            sums["rewards"] = map_arrays(lambda part: _sum(part, weights), found["rewards"])
+            sums["rewards"] = map_arrays(lambda part: _sum(part, weights), columns["rewards"])
         return last, counts, sums
 
     def __repr__(self) -> str:
@@ -142,8 +142,8 @@ def _sum(rewards: Array, weights: Array) -> Array:
 def _isin(rows: Array, ascending: Array) -> Array:
     if not len(ascending):
         return np.zeros(len(rows), np.bool_)
-    found: Array = ascending[np.minimum(ascending.searchsorted(rows), len(ascending) - 1)] == rows
-    return found
+    is_in: Array = ascending[np.minimum(ascending.searchsorted(rows), len(ascending) - 1)] == rows
+    return is_in
 
 
 def _first(column: Any) -> Any:

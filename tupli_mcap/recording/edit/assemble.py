@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -18,19 +18,9 @@ from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.recording import Recording
 
-__all__ = ["Assembler", "Follower"]
+__all__ = ["Assembler"]
 
 _CHUNK = 256 * 1024
-
-
-class Follower(NamedTuple):
-    """A companion channel: `make` gives it a message for each step of the channel `follows`, in the same row."""
-
-    topic: str
-    schema: str
-    text: str
-    follows: str
-    make: Callable[[int, Rows], Rows]
 
 
 class Assembler:
@@ -41,7 +31,6 @@ class Assembler:
     Attributes:
         container: what it is written to.
         index: the episodes so far.
-        followers: companion channels to make, by step channel.
         held: rows whose `log_time` was raised to that of the row ahead.
         copied: chunks that were copied as they are.
     """
@@ -49,7 +38,6 @@ class Assembler:
     def __init__(self, container: Container) -> None:
         self.container = container
         self.index = IndexBuilder()
-        self.followers: dict[int, list[tuple[int, Follower]]] = {}
         self.held = 0
         self.copied = 0
         self._latest: dict[int, int] = {}
@@ -73,7 +61,7 @@ class Assembler:
 
     def copy_first(self, source: Recording, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
         """Copies chunks of the first `count` rows of a channel, which has the same id here; returns how many rows."""
-        if self.next_row(channel) or channel in self.followers or count == 0:
+        if self.next_row(channel) or count == 0:
             return 0
         if channel in self.container.codecs:  # only in memory they are of constant size
             dtype = None
@@ -133,11 +121,9 @@ class Assembler:
         batch.clear()
 
     def add_chunk(self, rows: Rows) -> None:
-        """Adds rows to their channel, and to those that follow it."""
+        """Adds rows to their channel."""
         self.container.add_chunk(rows)
         self._latest[rows.channel] = int(rows.times[-1])
-        for number, follower in self.followers.get(rows.channel, []):
-            self.container.add_chunk(follower.make(number, rows))
 
     def finish(self, time_ns: int) -> None:
         """Writes the episode index and the summary."""

@@ -10,19 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.edit.assemble import Assembler, Follower
+from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
 
-__all__ = ["Follower", "NewFrames", "camera_channels", "define", "rewrite_recording", "write"]
-
-_FOLLOWS = "follows"  # in the metadata of a companion channel: the topic it was made from
+__all__ = ["NewFrames", "camera_channels", "define", "rewrite_recording", "write"]
 
 
 def rewrite_recording(
@@ -33,7 +30,6 @@ def rewrite_recording(
     attachments: Mapping[str, tuple[str, bytes]] | None = None,
     benchmark_id: str | None = None,
     compression: str = "zstd",
-    followers: Sequence[Follower] = (),
     frames: NewFrames | None = None,
 ) -> None:
     """Writes `target` (replaced in one rename) from `source`.
@@ -42,7 +38,6 @@ def rewrite_recording(
         episodes: numbers of the episodes to keep (all by default).
         attachments: name -> (media type, bytes), added to the source's or replacing them.
         benchmark_id: replaces the source's.
-        followers: companion channels to make. Those of the source are left out: they can be made again.
         frames: of a camera that may be a new one.
 
     Chunks before the first row that is left out are copied as they are, where they are compressed so already.
@@ -61,7 +56,7 @@ def rewrite_recording(
     same = episodes is None and benchmark_id in (None, source.benchmark_id) and frames is None
     with replacing(target) as (fd, _):
         container = Container(fd, str(target), compression)
-        write(source, container, metadata, episodes, attachments or {}, followers, frames, signed=same)
+        write(source, container, metadata, episodes, attachments or {}, frames, signed=same)
 
 
 def write(
@@ -70,7 +65,6 @@ def write(
     metadata: Mapping[str, str],
     numbers: Sequence[int] | None,
     attachments: Mapping[str, tuple[str, bytes]],
-    followers: Sequence[Follower] = (),
     frames: NewFrames | None = None,
     *,
     signed: bool,
@@ -88,7 +82,7 @@ def write(
     }
     now, target = time.time_ns(), Assembler(container)
     target.begin(metadata, {**own, **attachments}, now)
-    define(source, target, followers)
+    define(source, target)
     rows = source.index
     if numbers is not None:
         rows = rows[np.isin(rows["episode"], np.asarray(list(numbers), dtype=np.int64))]
@@ -100,29 +94,12 @@ def write(
     return target.copied
 
 
-def define(source: Recording, target: Assembler, followers: Sequence[Follower] = ()) -> None:
-    """The source's channels, and those of the followers after them."""
+def define(source: Recording, target: Assembler) -> None:
+    """The source's channels and schemas, with the ids that they have there."""
     container, contents = target.container, source._contents
-    own = {i: c for i, c in contents.channels.items() if _FOLLOWS not in c.metadata}
-    if sorted(own) != list(range(1, len(own) + 1)):  # somebody else's channels are in between
-        own = dict(contents.channels)
-    used = {channel.schema_id for channel in own.values()}
-    schemas = {i: schema for i, schema in contents.schemas.items() if i in used}
-    whole = sorted(schemas) == list(range(1, len(schemas) + 1))
-    container.schemas = schemas if whole else dict(contents.schemas)
-    container.channels = own
-    container.codecs = image_codecs(source.layout, own) if source._step_channels else {}
-    taken = {channel.topic for channel in own.values()} & {follower.topic for follower in followers}
-    if taken:
-        raise RecordingError(f"{source.name} has channels of its own named {', '.join(sorted(taken))}")
-    container.counts = dict.fromkeys(own, 0)
-    known: dict[str, int] = {}
-    for follower in followers:
-        if follower.schema not in known:
-            known[follower.schema] = container.add_schema(follower.schema, follower.text)
-        about = {_FOLLOWS: follower.follows}
-        number = container.add_channel(follower.topic, known[follower.schema], about)
-        target.followers.setdefault(source._topics[follower.follows], []).append((number, follower))
+    container.schemas, container.channels = dict(contents.schemas), dict(contents.channels)
+    container.codecs = image_codecs(source.layout, contents.channels) if source._step_channels else {}
+    container.counts = dict.fromkeys(contents.channels, 0)
 
 
 def camera_channels(

@@ -98,7 +98,7 @@ class Catalog:
         return self._database.is_current()
 
     def alone(self) -> AbstractContextManager[None]:
-        """Held by who brings the catalog up to date: what another one read a moment ago must not replace what is newer.
+        """The lock to hold while the catalog is brought up to date, so that nothing older replaces what is newer.
 
         Raises:
             CatalogUnusableError: The lock cannot be taken.

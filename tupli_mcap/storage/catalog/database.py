@@ -157,15 +157,15 @@ class Database:
             if not _is_catalog(self._engine, self.path):
                 self._make()
             # The number of a file may be given again once nobody has it open: a connection of ours stays in the pool.
-            found = _identity(self.path)
+            identity = _identity(self.path)
             try:
                 with self._engine.connect():
                     pass
             except DBAPIError:
-                if found is not None and found == _identity(self.path):
+                if identity is not None and identity == _identity(self.path):
                     raise
-            if found is not None and found == _identity(self.path):
-                self._identity = found
+            if identity is not None and identity == _identity(self.path):
+                self._identity = identity
                 self._opened += 1
                 return
             self._engine.dispose()  # it was replaced or deleted meanwhile

@@ -1,8 +1,8 @@
 """What the catalog holds of a recording, read from its index and what is noted beside it; by several processes where
 there are many recordings to read.
 
-Such a process must not run the caller's script again, as those of `multiprocessing` do, ends with the one that started
-it, and leaves Ctrl-C to that. What goes wrong in one is nobody's trouble: the recording is read here then.
+Such a process must not run the caller's script again, as those of `multiprocessing` do; it ends with the process that
+started it, and leaves Ctrl-C to that one. A recording that it fails to read is read here.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED
 from tupli_mcap.recording import Recording
 from tupli_mcap.storage.base import LOCAL_USER
 from tupli_mcap.storage.catalog.rows import EpisodeRow
@@ -32,7 +33,6 @@ from tupli_mcap.storage.sidecar import Notes, Sidecar
 
 __all__ = ["Entry", "entry_of", "read_ahead"]
 
-_ENDS = ("terminal", "timeout", "interrupted")
 _MOST_EPISODES = 50_000  # of a recording that another process reads: its rows are in memory twice
 _TRIAL = 1.0  # seconds of reading here before it is known whether more processes are worth their start
 _WORTH = 3.0  # seconds that must be left then
@@ -70,7 +70,8 @@ def entry_of(root: Path, relative: str) -> Iterator[Entry]:
 
 
 def read_ahead(root: Path, names: Sequence[str]) -> Generator[Entry | None]:
-    """What other processes read of recordings, once they are worth their start; None for what is to be read here."""
+    """An entry for each recording that other processes read, once starting them is worth it; None for each that the
+    caller has to read."""
     begun, workers = time.monotonic(), min(len(os.sched_getaffinity(0)), _MOST_WORKERS)
     if workers == 1 or multiprocessing.current_process().daemon:  # which may start none
         workers = 0
@@ -126,7 +127,7 @@ def _end_with_parent() -> None:
 
 
 def _read(root: Path, relative: str) -> Entry | None:
-    """In another process: a recording's entry with its rows; None if it is too long, or there is anything to say."""
+    """In another process: a recording's entry with its rows; None if it is too long, fails, or causes a warning."""
     with contextlib.suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("error")
         with entry_of(root, relative) as entry:
@@ -155,7 +156,7 @@ def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[Epi
             episode=number,
             env=env,
             n_tuples=length,
-            end=_ENDS[end],
+            end=END_NAMES[end],
             episode_return=total,
             seed=seed,
             created_at=created_at,
@@ -169,4 +170,4 @@ def _running(envs: Sequence[int], ends: Sequence[int]) -> set[int]:
     """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no
     end."""
     last = {env: i for i, env in enumerate(envs)}
-    return {i for i in last.values() if _ENDS[ends[i]] == "interrupted"}
+    return {i for i in last.values() if ends[i] == INTERRUPTED}

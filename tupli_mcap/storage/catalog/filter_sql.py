@@ -20,6 +20,7 @@ from typing import Any, Final, NamedTuple
 from sqlalchemy import and_, false, func, not_, or_, select, true, union_all
 from sqlalchemy.sql.elements import ColumnElement
 
+from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.schema import BaseFilter, FilterIN, FilterType
 from tupli_mcap.schema.facts import comparisons
 from tupli_mcap.schema.filters import COMBINING, ORDERING, path_of
@@ -59,7 +60,7 @@ _TEXTS: Final = {
 _INTEGERS: Final = {name: EPISODE.c[name] for name in ("created_at", "n_tuples", "env", "episode")}
 _NUMBERS: Final = {name: EPISODE.c[name] for name in ("episode_return", "seed")}
 _CHOICES: Final[Mapping[str, Mapping[Scalar, Condition]]] = {
-    "end": {Scalar("text", end): EPISODE.c.end == end for end in ("terminal", "timeout", "interrupted")},
+    "end": {Scalar("text", end): EPISODE.c.end == end for end in END_NAMES},
     "terminated": {
         Scalar("bool", True): EPISODE.c.end == "terminal",
         Scalar("bool", False): EPISODE.c.end != "terminal",
@@ -132,13 +133,13 @@ def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], 
         if part.type in COMBINING:
             parts.append(_narrow(part, indexed, negated))
             continue
-        found = _compared(part)
+        narrow = _compared(part)
         if negated:
-            found = Narrowed(not_(found.condition), exact=True) if found.exact else _ALL
+            narrow = Narrowed(not_(narrow.condition), exact=True) if narrow.exact else _ALL
         elif path_of(part) in indexed and part.type is not FilterType.NE and not few:
             near = _near(part, VALUE.c.number, VALUE.c.text)
             values.setdefault(indexed[path_of(part)], []).append(near)
-        parts.append(found)
+        parts.append(narrow)
     held = (select(VALUE.c.episode_id).where(VALUE.c.key == key, *values[key]) for key in values)
     conditions = [*(part.condition for part in parts), *(EPISODE.c.id.in_(ids) for ids in held)]
     return Narrowed(and_(true(), *conditions), all(part.exact for part in parts))

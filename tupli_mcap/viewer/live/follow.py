@@ -136,31 +136,33 @@ class Follower:
         steps: the step channels of the sub-environments whose steps are read.
     """
 
-    def __init__(self, source: PathSource, metadata: Mapping[str, str], found: Evidence, begin: int) -> None:
+    def __init__(
+        self, source: PathSource, metadata: Mapping[str, str], evidence: Evidence, begin: int
+    ) -> None:
         self.is_over = False
-        self.channels, self.schemas = found.channels, found.schemas
-        self.topics = {channel.topic: number for number, channel in found.channels.items()}
+        self.channels, self.schemas = evidence.channels, evidence.schemas
+        self.topics = {channel.topic: number for number, channel in evidence.channels.items()}
         self.camera = next(iter(camera_names(self.topics)), None)
-        channels = step_channels(found.channels, source.name)
+        channels = step_channels(evidence.channels, source.name)
         self.num_envs = len(channels)
         self.steps = [channel.id for channel in channels][:_ENVS]
         self.layout = layout = StepLayout.from_metadata(channels[0].metadata)
         self.labels = Labels.none()
-        if LABELS_NAME in found.attachments:
-            data = read_attachment(source, found.attachments[LABELS_NAME])
+        if LABELS_NAME in evidence.attachments:
+            data = read_attachment(source, evidence.attachments[LABELS_NAME])
             self.labels = Labels.from_json(data, layout.leaves, source.name)
         self._of_env = [Topics.of_step(channel.topic) for channel in channels]
-        self._codecs = image_codecs(layout, found.channels)
+        self._codecs = image_codecs(layout, evidence.channels)
         self._source, self._metadata = source, metadata
-        self._known = RecordedChannels.of(found, layout)._replace(steps=self.steps)
-        self._file = _GrowingFile(source, found.good_end, begin)
+        self._known = RecordedChannels.of(evidence, layout)._replace(steps=self.steps)
+        self._file = _GrowingFile(source, evidence.good_end, begin)
         self._seen = dict(self._file.earlier)  # how many rows of each channel were looked at
         envs = range(len(self.steps))
         self._areas = {"steps", "events", "info"}
         self._areas |= {f"{top}{i}" for top in ("steps/", FRAMES_AREA) for i in envs}
         self._areas |= {f"{leaf.name}/{i}" for leaf in layout.images for i in envs}
         apart = [
-            topic for topic in self.topics if (told := parse(topic)) and told.kind in ("camera", "frame")
+            topic for topic in self.topics if (parsed := parse(topic)) and parsed.kind in ("camera", "frame")
         ]
         self._others = [self.topics[topic] for topic in (INFO, *apart) if topic in self.topics]
         self._logs = [
@@ -264,7 +266,7 @@ class Follower:
         channel = self.topics.get(INFO)
         if channel is None:
             return []
-        decoder, begins, found = InfoCodec.from_metadata(self.channels[channel].metadata), self._begins[0], []
+        decoder, begins, infos = InfoCodec.from_metadata(self.channels[channel].metadata), self._begins[0], []
         most *= self.num_envs
         new = [*self._infos, *messages_of(self._store, channel, self._new_rows(channel, most))][-most:]
         self._infos = []
@@ -272,10 +274,10 @@ class Follower:
             body = memoryview(message)[BODY - _HEADER :]
             episode, step = _PAIR.unpack_from(body)
             if episode in begins:
-                found.append(NewInfo(begins[episode] + step, time_ns, decoder.decode(body)[2]))
+                infos.append(NewInfo(begins[episode] + step, time_ns, decoder.decode(body)[2]))
             else:  # of another sub-environment, or of steps that have not been looked at
                 self._infos.append((time_ns, message))
-        return found
+        return infos
 
 
 def follow(path: Path, uuid: str, begin: int) -> Follower | None:
@@ -288,19 +290,19 @@ def follow(path: Path, uuid: str, begin: int) -> Follower | None:
         source = PathSource(path)
     except RecordingError:  # no step was recorded
         return None
-    found = prefix(source, only_metadata=True)
-    told = found.metadata or {}
-    if told.get("uuid") == uuid:
-        metadata = check_metadata(source, told)
+    evidence = prefix(source, only_metadata=True)
+    stated = evidence.metadata or {}
+    if stated.get("uuid") == uuid:
+        metadata = check_metadata(source, stated)
         journal = _journal_of(source, metadata, ())
         # while somebody records, the journal defines the channels, later the summary does
         if journal is not None:
-            define(found, journal)
+            define(evidence, journal)
         elif has_summary(source) and not is_locked(path):
             summary = read_summary(source)
-            found.schemas, found.channels = summary.schemas, summary.channels
-        if any(channel.topic.endswith("/step") for channel in found.channels.values()):
-            return Follower(source, metadata, found, begin)
+            evidence.schemas, evidence.channels = summary.schemas, summary.channels
+        if any(channel.topic.endswith("/step") for channel in evidence.channels.values()):
+            return Follower(source, metadata, evidence, begin)
     source.close()
     return None
 

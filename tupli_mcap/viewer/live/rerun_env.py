@@ -174,11 +174,11 @@ class LiveEnv:
         first = max(steps.first, stop - self._images)
         wanted = range(first - self._shift, stop - self._shift)
         for number, leaf in enumerate(self._layout.images):
-            found = follower.images(number, self._env, wanted)
+            records = follower.images(number, self._env, wanted)
             for panel in self._panels:
-                if found and getattr(panel, "leaf", None) is leaf:
-                    rows = np.array(sorted(found))
-                    images = np.stack([leaf.as_values(found[row]["data"]) for row in rows.tolist()])
+                if records and getattr(panel, "leaf", None) is leaf:
+                    rows = np.array(sorted(records))
+                    images = np.stack([leaf.as_values(records[row]["data"]) for row in rows.tolist()])
                     rows += self._shift
                     times = steps.facts.time[rows - steps.first]
                     part: Any = _Columns(self._nested(leaf, images), None, None)

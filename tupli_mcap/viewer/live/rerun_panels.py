@@ -127,9 +127,9 @@ class LivePanels:
             spread = spread_of(np.array(self._returns))
             if spread is not None:
                 odd = nan_text(spread.nan, len(self._returns))
-                told = f"mean return {spread.mean:.4g}{f' ({odd})' if odd else ''}"
-                told = f"return {odd}" if spread.nan == len(self._returns) else told
-                lines.append(f"{follower.episodes:,} episodes; the last {len(self._returns):,}: {told}")
+                text = f"mean return {spread.mean:.4g}{f' ({odd})' if odd else ''}"
+                text = f"return {odd}" if spread.nan == len(self._returns) else text
+                lines.append(f"{follower.episodes:,} episodes; the last {len(self._returns):,}: {text}")
             for name, values in (("return", self._returns), ("length", self._lengths)):
                 finite = np.nan_to_num(np.array(values, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
                 stream.log(f"/overview/{name}", rr.BarChart(tensor_array([finite], ["episode"])), static=True)

@@ -40,15 +40,15 @@ def parse_target(text: str) -> Target:
         return Target("rerun", LOCAL, RERUN_PORT)
     if text == "foxglove":
         return Target("foxglove", LOCAL, FOXGLOVE_PORT)
-    found = _URL.fullmatch(text) if isinstance(text, str) else None
-    port = int(found["port"] or 0) if found else 0
-    if found and port < 1 << 16:
-        scheme, host, path = found["scheme"], found["host"], found["path"] or ""
+    url = _URL.fullmatch(text) if isinstance(text, str) else None
+    port = int(url["port"] or 0) if url else 0
+    if url and port < 1 << 16:
+        scheme, host, path = url["scheme"], url["host"], url["path"] or ""
         if scheme in _RERUN and path in ("", "/", "/proxy"):
             port = port or RERUN_PORT
             return Target("rerun", host, port, f"{scheme}://{host}:{port}/proxy")
         if scheme in _FOXGLOVE and path in ("", "/"):
-            return Target("foxglove", host, port if found["port"] else FOXGLOVE_PORT)
+            return Target("foxglove", host, port if url["port"] else FOXGLOVE_PORT)
     raise RecordingError(
         "live: expected 'rerun', 'foxglove', 'rerun+http://host:port/proxy' or 'foxglove://host:port', "
         f"found {text!r:.200}"

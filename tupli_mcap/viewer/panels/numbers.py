@@ -46,9 +46,8 @@ class Series:
         send_scalars(place.stream, place.root + self.entity, times, values)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        legend = (
-            len(roots) == 1 and len(self.names) > 1
-        )  # compared episodes are named once, beside the returns
+        # compared episodes are named once, beside the returns
+        legend = len(roots) == 1 and len(self.names) > 1
         return plot(self.title, [root + self.entity for root in roots], axis, legend=legend)
 
 

@@ -126,14 +126,16 @@ class Infos:
     def send(self, place: Place, block: Block, times: Times) -> None:
         import rerun as rr
 
-        found: dict[str, list[tuple[int, Any]]] = {key: [] for key in (*self.numbers, *self.texts)}
+        pairs_of: dict[str, list[tuple[int, Any]]] = {key: [] for key in (*self.numbers, *self.texts)}
         for piece in block.pieces:
             infos = block.recording.infos(piece.position) or []
             for row, info in enumerate(infos[piece.step : piece.step + piece.end - piece.begin], piece.begin):
                 for key, value in (info or {}).items():
-                    if key in found and (isinstance(value, str) if key in self.texts else _is_number(value)):
-                        found[key].append((row, value))
-        for key, pairs in found.items():
+                    if key in pairs_of and (
+                        isinstance(value, str) if key in self.texts else _is_number(value)
+                    ):
+                        pairs_of[key].append((row, value))
+        for key, pairs in pairs_of.items():
             if not pairs:
                 continue
             at = times.at(np.array([row for row, _ in pairs]))
