@@ -1,8 +1,10 @@
-"""Datasets: a lazy query over recorded episodes, and the arrays it yields.
+"""Datasets: episodes, wherever they lie, and the arrays they are.
 
-dataset, query     `TupliDataset`: three filters, and what has been read so far
+dataset            `open` and `Dataset`: narrowed, put in order, read, handed on
+tupli, query       `TupliDataset`: PyTupli's, with three filters, and what has been read so far
 sources, which     where episodes come from; which of them a word, a number or a filter means
 load               from episodes to whole columns; tuple filters
+statistics, tables what values are like; pandas and Arrow
 tuples, convert    columns as steps and episodes; as what other libraries expect
 access, items/     steps by number; windows, transitions, samplers
 saved              columns as a directory of `.npy` files
@@ -22,24 +24,24 @@ if TYPE_CHECKING:
         TorchTupleParser,
     )
     from tupli_mcap.dataset.curate import FilterReport, filter_recording
-    from tupli_mcap.dataset.dataset import TupliDataset
-    from tupli_mcap.dataset.front import Dataset, open
+    from tupli_mcap.dataset.dataset import Dataset, open
     from tupli_mcap.dataset.saved import SavedColumns, open_columns
     from tupli_mcap.dataset.sources import DatasetError
+    from tupli_mcap.dataset.tupli import TupliDataset
 
 # Imported on first use: who only reads items, as a worker of a DataLoader does, needs no storage.
 _HOMES = {
     "BaseTupleParser": "convert",
-    "Dataset": "front",
+    "Dataset": "dataset",
     "DatasetError": "sources",
     "FilterReport": "curate",
     "NumpyTupleParser": "convert",
     "SavedColumns": "saved",
     "TensorflowTupleParser": "convert",
     "TorchTupleParser": "convert",
-    "TupliDataset": "dataset",
+    "TupliDataset": "tupli",
     "filter_recording": "curate",
-    "open": "front",
+    "open": "dataset",
     "open_columns": "saved",
 }
 

@@ -14,7 +14,7 @@ from tupli_mcap.recording import Recording, merge_recordings, rewrite_recording
 from tupli_mcap.schema import BaseFilter, parse_filter
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset.front import Dataset
+    from tupli_mcap.dataset.dataset import Dataset
 
 __all__ = ["FilterReport", "filter_recording", "save"]
 

@@ -1,410 +1,409 @@
-"""`TupliDataset`: which episodes and steps, and the arrays they are."""
+"""`Dataset`: episodes, wherever they lie, narrowed, put in order, read and handed on; and `open`, which gives one."""
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import os
-from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 import numpy as np
 
-from tupli_mcap.dataset import convert, display
+from tupli_mcap.arrays import Array
+from tupli_mcap.dataset import curate, display, tables
 from tupli_mcap.dataset.access import RandomAccess
-from tupli_mcap.dataset.convert import BaseTupleParser, NumpyTupleParser
-from tupli_mcap.dataset.items import Steps
-from tupli_mcap.dataset.items.steps import checked_count
-from tupli_mcap.dataset.items.windows import FIVE
-from tupli_mcap.dataset.load import TupleFilter, read_columns
-from tupli_mcap.dataset.query import Query
-from tupli_mcap.dataset.saved import save_columns
-from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
-from tupli_mcap.dataset.tuples import EpisodeItems, Tuples, items_of
-from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
-from tupli_mcap.storage import TupliStorage
-from tupli_mcap.storage.base import anew
+from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
+from tupli_mcap.dataset.items.steps import pick
+from tupli_mcap.dataset.load import read_columns
+from tupli_mcap.dataset.sources import DatasetError, FilesSource, OpenRecordings, Source, StorageSource
+from tupli_mcap.dataset.statistics import FieldStatistics, statistics_of
+from tupli_mcap.recording import Episode, Recording
+from tupli_mcap.recording.columns.fields import FIVE, field_names
+from tupli_mcap.recording.columns.read import Columns
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter
+from tupli_mcap.schema.facts import filter_keys, path_in
+from tupli_mcap.schema.predicate import MISSING, look_up
+from tupli_mcap.storage import FileStorage, TupliStorage
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
-__all__ = ["TupliDataset"]
+    from tupli_mcap.dataset.tables import Level
 
-SIX = (*FIVE, "infos")
+__all__ = ["Dataset", "open"]
+
+Test: TypeAlias = "str | BaseFilter | Callable[[Episode], bool]"
+Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Dataset"
 
 
-class TupliDataset(RandomAccess):
-    """Episodes of a storage (or of files, see `from_files`), and the steps in them, as filters choose them.
+def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as in gzip.open
+    """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a URL, a recording, or a list of them.
 
-    A dataset reads when it is asked for something, and only what it is asked for. Its filters never change:
-    `with_benchmark_filter`, `with_episode_filter` and `with_tuple_filter` return another dataset with that
-    one filter replaced (None takes it away; combine conditions with `&` and `|`), which finds its episodes
-    itself.
+    An episode that is in two of the files counts once, with a warning. One that is still being recorded is there as
+    far as it has come, and ends as interrupted.
 
-    The episodes are listed once, and everything the dataset says agrees with that list until `preview()` or
-    `load()` list them anew. Properties keep what they have read, as arrays that cannot be written to; the
-    `convert_to_…` methods give arrays that are the caller's own, and keep nothing that `load()` has not read
-    before.
+        ds = tupli_mcap.open("runs/")
+        best = ds.filter("return > 100").sort("return", descending=True).head(10)
 
-    A column is an array of shape (steps, ...) in the dtype that was recorded, a list of one value a step
-    where values differ in size (texts, graphs), or dicts and tuples of those, nested as the environment's
-    space is. Recordings may differ in dtype as long as one dtype holds the values of both exactly. Not
-    thread-safe.
+    Raises:
+        RecordingError: there is no such file, it is none of these, or it cannot be opened.
+        StorageError: the directory may not be looked at.
+    """
+    if isinstance(source, Dataset):
+        return source
+    if isinstance(source, TupliStorage):
+        return Dataset(StorageSource(source))
+    if isinstance(source, Recording):
+        return Dataset(FilesSource([_place_of(source)]))
+    if isinstance(source, str | os.PathLike):
+        name = os.fspath(source)
+        if "://" not in name and Path(name).expanduser().is_dir():
+            return Dataset(StorageSource(FileStorage(Path(name).expanduser())))
+        return Dataset(FilesSource(source))
+    if not isinstance(source, Iterable):
+        raise DatasetError(
+            f"expected a path, a pattern, a URL, a storage, or a list of those, found {source!r:.80}"
+        )
+    return Dataset(FilesSource([name for item in source for name in _files_in(item)]))
 
-    Args:
-        storage: where the episodes are.
-        info: anything the user wants to keep with the dataset.
+
+def _place_of(recording: Recording) -> str:
+    if recording.path is None and "://" not in recording.name:
+        raise DatasetError(f"{recording.name} was opened as a file object; open it by its path or URL")
+    return os.fspath(recording.path or recording.name)
+
+
+def _files_in(source: Openable) -> Sequence[str]:
+    """The recordings of one item of a list."""
+    from tupli_mcap.storage.listing import find_recordings
+
+    if isinstance(source, Recording):
+        return [_place_of(source)]
+    if isinstance(source, str | os.PathLike):
+        name = os.fspath(source)
+        if "://" not in name and Path(name).expanduser().is_dir():
+            return [str(path) for path in find_recordings(Path(name).expanduser())]
+        return FilesSource(source).names
+    raise DatasetError(
+        f"expected paths, patterns, URLs and recordings in a list, found {source!r:.80}; open a storage by itself"
+    )
+
+
+class Dataset(RandomAccess):
+    """Episodes, wherever they lie, in an order.
+
+    It reads when it is asked for something, and only what it is asked for. The episodes are listed once. Verbs that
+    narrow (`filter`, `sort`, `head`, `sample`, `split`, an index) give another dataset and change nothing in this one.
+    Iteration gives episodes, and `len` counts them. Not thread-safe; a pickled copy opens the files itself.
+
+    Use `tupli_mcap.open` to make one.
     """
 
-    def __init__(self, storage: TupliStorage, info: dict[str, Any] | None = None) -> None:
-        if not isinstance(storage, TupliStorage):
-            raise DatasetError(
-                f"expected a storage, such as FileStorage('lab'), found {storage!r:.80}; recordings "
-                "that are in no storage are opened with TupliDataset.from_files(...)"
-            )
-        self._setup(StorageSource(storage), info)
+    def __init__(self, source: Source, headers: Sequence[EpisodeHeader] | None = None) -> None:
+        self._source = source
+        self._filter: BaseFilter | None = None
+        self._listed = None if headers is None else list(headers)
+        self._recordings = OpenRecordings(source.open)
+        self._steps: RecordedSteps | None = None
 
-    @classmethod
-    def from_files(
-        cls,
-        files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-        info: dict[str, Any] | None = None,
-    ) -> Self:
-        """A dataset of recordings in no storage: a path, a pattern ("runs/*.mcap"), a URL, or a list.
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_recordings": None}
 
-        An episode that is in two of the files counts once, with a warning; one that is still being recorded
-        is listed as interrupted.
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._recordings = OpenRecordings(self._source.open)
 
-        Raises:
-            RecordingError: there is no such file.
-        """
-        made = cls.__new__(cls)
-        made._setup(FilesSource(files), info)
-        return made
-
-    def _setup(self, source: Source, info: dict[str, Any] | None) -> None:
-        self.info = info
-        self._query = Query(source)
-        self.set_seed(None)
-
-    @property
-    def storage(self) -> TupliStorage | None:
-        """The storage; None for a dataset of files."""
-        source = self._query.source
-        return source.storage if isinstance(source, StorageSource) else None
-
-    # --- filters ---
-
-    def with_benchmark_filter(self, filter: BaseFilter | None) -> Self:
-        """The dataset of benchmarks a filter over `BenchmarkHeader` fields is true of, in place of any such
-        filter.
-
-        Raises:
-            FilterError: the filter names an unknown field.
-        """
-        return self._with(benchmark_filter=filter)
-
-    def with_episode_filter(self, filter: BaseFilter | None) -> Self:
-        """The dataset of episodes a filter over `EpisodeHeader` fields (`metadata.score`, `n_tuples`, `end`,
-        …) is true of, in place of any such filter.
-
-        Raises:
-            FilterError: the filter names an unknown field.
-        """
-        return self._with(episode_filter=filter)
-
-    def with_tuple_filter(self, filter_fcn: TupleFilter | None) -> Self:
-        """The dataset of steps a filter is true of, in place of any such filter.
-
-        Args:
-            filter_fcn: an expression over state, action, reward, terminal, timeout, info, next_state and step
-                (counted from 0 in each episode), such as `F("state.0") > 1`, which is evaluated on whole
-                columns; or a function of one `RLTuple` that returns True or False, called for every step.
-
-        Raises:
-            FilterError: it is neither, or names an unknown field.
-        """
-        return self._with(tuple_filter=filter_fcn)
-
-    def _with(self, **filters: Any) -> Self:
-        made = type(self).__new__(type(self))
-        made.__dict__.update(self.__dict__)
-        made._query = self._query.with_filters(**filters)
-        made.set_seed(self._seed)
-        return made
-
-    def with_cache(self, cache_bytes: int, threads: int | None = None) -> Self:
-        """The dataset with another budget (bytes, 512 MiB by default) for what random access keeps in memory.
-
-        Args:
-            threads: how many read chunks; by default as many as there are cores, at most 4.
-
-        Raises:
-            SamplingError: a number is no integer, or too small.
-        """
-        made = self._with()
-        made._query.cache_bytes = checked_count(cache_bytes, 0, "a budget in bytes")
-        if threads is not None:
-            made._query.threads = checked_count(threads, 1, "a number of threads")
-        return made
-
-    # --- looking and loading ---
-
-    def preview(self) -> list[EpisodeHeader]:
-        """The episodes, listed anew; no step is read."""
-        return list(self._query.refresh())
-
-    def explain(self) -> str:
-        """How the episodes are looked up: the SQL of the filters and its plan, for a storage with a catalog."""
-        return self._query.source.explain(self._query.benchmark_filter, self._query.episode_filter)
-
-    def load(self) -> None:
-        """List the episodes anew and read their steps (states, actions, rewards, terminals, timeouts) into
-        memory.
-
-        Raises:
-            SpaceError: the steps of two recordings do not fit into one array; the message says which.
-        """
-
-        def attempt() -> None:
-            self._query.refresh()
-            self._query.read(FIVE)
-
-        anew(attempt)  # episodes that are deleted while they are read are listed no more the next time
-
-    def save_columns(self, directory: str | os.PathLike[str]) -> None:
-        """Write the steps to a new directory as plain `.npy` files, which `open_columns` reads mapped into memory.
-
-        The directory also holds `manifest.json`; see docs/columns.md. It is there as a whole or not at all: a process
-        that is killed leaves none. It keeps the steps as they are listed now, whatever becomes of their recordings, and
-        no infos. Steps are read a few at a time, within the budget of `with_cache`.
-
-        Args:
-            directory: where nothing is yet.
-
-        Raises:
-            DatasetError: there is no step, values differ in size (texts, graphs), or the directory is no path.
-            SpaceError: the steps of two recordings do not fit into one array; the message says which.
-            StorageError: there is something at that path, the disk is full, ...
-        """
-        save_columns(directory, self.steps, self._headers, self._step_seconds())
-
-    # --- what is in it ---
-
-    @property
-    def steps(self) -> Steps:
-        return self._query.steps()
+    # ---- episodes
 
     @property
     def _headers(self) -> Sequence[EpisodeHeader]:
-        return self._query.headers
-
-    def _step_seconds(self) -> float | None:
-        known = set()
-        for name in dict.fromkeys(header.recording for header in self._headers):
-            with self._query.source.open(name) as recording:
-                known.add(recording.labels.step_seconds)
-        return known.pop() if len(known) == 1 else None
-
-    @property
-    def benchmarks(self) -> list[BenchmarkHeader]:
-        """The benchmarks the benchmark filter is true of."""
-        return list(self._query.benchmarks)
-
-    @property
-    def episodes(self) -> Sequence[EpisodeItem]:
-        """The episodes with those of their steps that the tuple filter is true of; each is made when it is
-        asked for.
-
-        Steps are read at the first access to an item. Use `preview()` for facts about episodes only.
-        """
-        query, headers = self._query, self._query.headers
-        return EpisodeItems(headers, lambda: query.columns_of(headers, SIX))
-
-    @property
-    def tuples(self) -> Sequence[RLTuple]:
-        """The steps; each is made when it is asked for."""
-        return Tuples(self._query.read(SIX), self._query.layout)
-
-    @property
-    def observations(self) -> Any:
-        """The state of each step, the observation its action was chosen on: a read-only column."""
-        return self._query.read(["states"])["states"]
-
-    @property
-    def next_states(self) -> Any:
-        """The state after each step, never one of another episode: a read-only column.
-
-        Where it was not recorded (the last step of an episode built by hand), the step's own state.
-        """
-        return self._query.read(["next_states"])["next_states"]
-
-    @property
-    def actions(self) -> Any:
-        """The action of each step: a read-only column."""
-        return self._query.read(["actions"])["actions"]
-
-    @property
-    def rewards(self) -> Any:
-        """The reward of each step: a read-only column, float64 unless the rewards have a space of their
-        own."""
-        return self._query.read(["rewards"])["rewards"]
-
-    @property
-    def terminals(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Whether the environment ended with the step (read-only, of bools)."""
-        found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["terminals"])["terminals"]
-        return found
-
-    @property
-    def timeouts(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Whether the episode was truncated with the step, as it was recorded (read-only, of bools)."""
-        found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["timeouts"])["timeouts"]
-        return found
-
-    @property
-    def infos(self) -> list[dict[str, Any]]:
-        """The info of each step; empty where none was recorded."""
-        return list(self._query.read(["infos"])["infos"])
+        if self._listed is None:
+            self._listed = self._source.episodes(None, self._filter)
+        return self._listed
 
     def __len__(self) -> int:
-        """The number of steps, after all filters; with a tuple filter, this evaluates it."""
-        if self._query.tuple_filter is None:
-            return sum(header.n_tuples for header in self._query.headers)
-        return self._query.selected.steps
+        """The number of episodes."""
+        return len(self._headers)
 
-    def __iter__(self) -> Iterator[RLTuple]:
-        return iter(self.tuples)
+    @property
+    def n_steps(self) -> int:
+        """The number of steps of all episodes."""
+        return sum(header.n_tuples for header in self._headers)
 
-    # --- conversions ---
+    @property
+    def lengths(self) -> Array:
+        """Steps of each episode: int64 (episodes,)."""
+        return np.array([header.n_tuples for header in self._headers], np.int64)
 
-    def convert_to_numpy(self, *, mark_cuts: bool = True) -> tuple[Any, Any, Any, Any, Any]:
-        """States, actions, rewards, terminals and timeouts as columns of NumPy arrays; they are the caller's
-        own.
-
-        Args:
-            mark_cuts: also set the timeout of a step that is followed by anything else than its own episode's
-                next step: the last one of an interrupted episode, or the one before steps that a tuple filter
-                left out. Learners that find episodes by their flags (d3rlpy, D4RL) would join two episodes
-                otherwise. False gives the flags as they were recorded.
-        """
-        columns = self._query.own(FIVE)
-        if mark_cuts:
-            convert.mark_cuts(columns, self._query.selected)
-        return (
-            columns["states"],
-            columns["actions"],
-            columns["rewards"],
-            columns["terminals"],
-            columns["timeouts"],
+    @property
+    def returns(self) -> Array:
+        """The sum of each episode's rewards: float64 (episodes,), NaN where the rewards are no numbers."""
+        return np.array(
+            [np.nan if header.episode_return is None else header.episode_return for header in self._headers]
         )
 
-    def convert_to_tensors(
-        self, parser: type[BaseTupleParser] = NumpyTupleParser, *, mark_cuts: bool = True
-    ) -> tuple[Any, ...]:
-        """What a parser makes of the five columns of `convert_to_numpy`.
+    @overload
+    def __getitem__(self, chosen: int) -> Episode: ...
+    @overload
+    def __getitem__(self, chosen: slice | Sequence[int] | Array) -> Dataset: ...
+    def __getitem__(self, chosen: int | slice | Sequence[int] | Array) -> Episode | Dataset:
+        """`ds[3]` is an episode; `ds[-5:]`, `ds[[4, 2]]` and `ds[mask]` are datasets.
 
         Raises:
-            MissingExtraError: the library the parser needs is not installed.
+            IndexError: there is no such episode.
+            DatasetError: it is no number, slice, list of numbers or mask.
         """
-        return parser.parse_lists(*self.convert_to_numpy(mark_cuts=mark_cuts))
+        headers = self._headers
+        if isinstance(chosen, int | np.integer) and not isinstance(chosen, bool):
+            try:
+                return self._episode(headers[chosen])
+            except IndexError as err:
+                raise IndexError(f"expected an episode from 0 to {len(headers) - 1}, found {chosen}") from err
+        if isinstance(chosen, slice):
+            return self._of(headers[chosen])
+        return self._of([headers[i] for i in _places(chosen, len(headers))])
 
-    def convert_to_d4rl_format(self, *, mark_cuts: bool = True) -> dict[str, Any]:
-        """Columns named as in D4RL: observations, actions, next_observations, rewards, terminals, timeouts.
+    def __iter__(self) -> Iterator[Episode]:
+        for header in self._headers:
+            yield self._episode(header)
 
-        `next_observations` are `next_states`; `terminals` are true terminals only. `mark_cuts` is that of
-        `convert_to_numpy`.
+    def _episode(self, header: EpisodeHeader) -> Episode:
+        recording = self._recordings.get(header.recording)
+        position = int(np.searchsorted(recording.index["episode"], header.episode))
+        episode = recording.episodes[position]
+        if episode.number != header.episode:
+            raise DatasetError(f"{header.recording} has no episode {header.episode} any more; open it again")
+        return episode
+
+    def _of(self, headers: Sequence[EpisodeHeader]) -> Dataset:
+        made = Dataset(self._source, headers)
+        made._recordings = self._recordings
+        return made
+
+    # ---- narrowing
+
+    def filter(self, test: Test) -> Dataset:
+        """The episodes that a test is true of, in their order.
+
+        Args:
+            test: a text ("metadata.success and return > 100"), an expression (`F("return") > 100`), or a function of an
+                `Episode`. Keys are those of `Dataset.keys`.
+
+        Raises:
+            FilterError: the test names an unknown key, compares it with what it can never be, or is none of these.
         """
-        columns = self._query.own((*FIVE, "next_states"))
-        if mark_cuts:
-            convert.mark_cuts(columns, self._query.selected)
-        return {name: columns[field] for name, field in convert.D4RL_NAMES.items()}
+        if callable(test) and not isinstance(test, BaseFilter):
+            return self._of([header for header in self._headers if test(self._episode(header))])
+        wanted = parse_filter(test) if isinstance(test, str) else test
+        check_keys(wanted, EpisodeHeader)
+        if self._listed is None:
+            made = self._of([])
+            made._listed = None
+            made._filter = wanted if self._filter is None else self._filter & wanted
+            return made
+        matches = compile_predicate(wanted, EpisodeHeader)
+        return self._of([header for header in self._listed if matches(header)])
 
-    def convert_to_dataframe(self) -> pd.DataFrame:
-        """A pandas DataFrame with a row a step: the episode (its place in `preview()`), the step (from 0 in
-        its episode), and the columns of `convert_to_d4rl_format`, flags as they were recorded.
+    def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
+        """The episodes in the order of a key ("return", "steps", "metadata.score"), or of a function of an `Episode`.
 
-        Columns of numbers keep their dtype; a value of several numbers is one object in its cell.
+        Equal ones stay in their order; those that have no such value come last.
+
+        Raises:
+            FilterError: an unknown key, or values that have no order among each other.
+        """
+        if callable(key):
+            values = [key(self._episode(header)) for header in self._headers]
+        else:
+            values = [self._value(header, key) for header in self._headers]
+        places = [i for i, value in enumerate(values) if value is not None and value == value]
+        try:
+            ordered = sorted(places, key=lambda i: values[i], reverse=descending)
+        except TypeError as err:
+            raise DatasetError(f"cannot sort by {key!r}: {err}") from err
+        if descending:  # `sorted` keeps equal ones in their order both ways
+            ordered = sorted(places, key=lambda i: values[i], reverse=True)
+        rest = sorted(set(range(len(values))) - set(places))
+        return self._of([self._headers[i] for i in [*ordered, *rest]])
+
+    def head(self, n: int) -> Dataset:
+        """The first `n` episodes, or as many as there are."""
+        return self._of(self._headers[: _count(n)])
+
+    def sample(self, n: int, *, seed: int | None = None) -> Dataset:
+        """`n` different episodes (or as many as there are), drawn at random, in the order in which they were drawn."""
+        drawn = np.random.default_rng(seed).permutation(len(self))[: _count(n)]
+        return self[drawn]
+
+    def split(self, fraction: float, *, seed: int = 0, by: str | None = None) -> tuple[Dataset, Dataset]:
+        """Two datasets: about `fraction` of the episodes, and the others. No episode is in both.
+
+        Which side an episode is on depends on its id and the seed alone: it stays there when others are added.
+
+        Args:
+            by: a key ("run", "metadata.task", "seed"): episodes with the same value stay together.
+
+        Raises:
+            DatasetError: the fraction is not between 0 and 1.
+            FilterError: an unknown key.
+        """
+        if not 0 <= fraction <= 1:
+            raise DatasetError(f"expected a fraction from 0 to 1, found {fraction!r:.80}")
+        parts: tuple[list[EpisodeHeader], list[EpisodeHeader]] = ([], [])
+        for header in self._headers:
+            name = header.id if by is None else repr(self._value(header, by))
+            digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
+            parts[int.from_bytes(digest[:8], "big") >= fraction * 2**64].append(header)
+        return self._of(parts[0]), self._of(parts[1])
+
+    @property
+    def keys(self) -> list[str]:
+        """What filters, `sort` and `split` may name: the facts about episodes, and the metadata that some have."""
+        own = {"metadata." + key for header in self._headers for key in header.metadata}
+        return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own)
+
+    def _value(self, header: EpisodeHeader, key: str) -> Any:
+        if key == "run":
+            return header.id.partition("-")[0]
+        value = look_up(header, path_in(key, EpisodeHeader))
+        return None if value is MISSING else value
+
+    # ---- reading
+
+    def read(self, fields: Sequence[str] = FIVE) -> Columns:
+        """Columns of all steps, episode after episode; `episode_lengths` says where each ends.
+
+        Args:
+            fields: of states, actions, rewards, terminals, timeouts, next_states, times, infos; Gymnasium's names
+                (observations, terminations, truncations) mean the same.
+
+        Raises:
+            DatasetError: an unknown field.
+            SpaceError: the steps of two recordings do not fit into one array; the message says which.
+        """
+        wanted = field_names(fields)
+        names = list(dict.fromkeys(header.recording for header in self._headers))
+        place = {name: i for i, name in enumerate(names)}
+        order = np.argsort([place[header.recording] for header in self._headers], kind="stable")
+        headers = [self._headers[i] for i in order]
+        columns, selected, _ = read_columns(self._source, headers, wanted)
+        if (np.diff(order) < 0).any():
+            ends = np.cumsum(selected.lengths)
+            starts = ends - selected.lengths
+            back = np.argsort(order)
+            rows = np.concatenate([np.arange(starts[i], ends[i]) for i in back.tolist()])
+            columns = {field: pick(column, rows) for field, column in columns.items()}
+        return Columns(self.lengths, **columns)
+
+    @property
+    def steps(self) -> Steps:
+        if self._steps is None:
+            groups = itertools.groupby(self._headers, key=lambda header: header.recording)
+            self._steps = RecordedSteps(
+                (ListedEpisodes.of(name, group) for name, group in groups), self._recordings.lent
+            )
+        return self._steps
+
+    def _step_seconds(self) -> float | None:
+        names = dict.fromkeys(header.recording for header in self._headers)
+        known = {self._recordings.get(name).labels.step_seconds for name in names}
+        return known.pop() if len(known) == 1 else None
+
+    def loader(
+        self,
+        length: int | None = None,
+        *,
+        batch_size: int = 64,
+        shuffle: bool = True,
+        num_workers: int = 0,
+        fields: Sequence[str] | None = None,
+        seed: int | None = None,
+    ) -> Any:
+        """A PyTorch `DataLoader` of batches of tensors.
+
+        Args:
+            length: of windows of steps that follow each other within an episode; without it, single transitions.
+            fields: as for `windows`, or for `transitions`.
+            seed: of the order; drawn if it is None.
+
+        Raises:
+            MissingExtraError: PyTorch is not installed.
+            SamplingError: no episode has so many steps.
+        """
+        from tupli_mcap.torch.loader import loader
+
+        chosen: dict[str, Any] = {} if fields is None else {"fields": fields}
+        items = self.transitions(**chosen) if length is None else self.windows(length, **chosen)
+        return loader(items, batch_size=batch_size, shuffle=shuffle, num_workers=num_workers, seed=seed)
+
+    def stats(
+        self, fields: Sequence[str] = ("states", "actions", "rewards")
+    ) -> Mapping[str, FieldStatistics]:
+        """Count, mean, std, min, max and quantiles of each leaf (`state`, `state['arm']`, `action`, `reward`).
+
+        Steps are read a block at a time; what was found is kept.
+
+        Raises:
+            DatasetError: an unknown field, or there is no step.
+        """
+        return statistics_of(self, field_names(fields))
+
+    # ---- out
+
+    def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
+        """A row a step, or a row an episode; a column a dimension, with its name where the recording knows it.
 
         Raises:
             MissingExtraError: pandas is not installed.
         """
-        convert.import_pandas()
-        columns = self._query.own((*FIVE, "next_states", "steps"))
-        return convert.dataframe(columns, self._query.selected)
+        return tables.dataframe(self, level)
 
-    # --- batches and samples ---
-
-    def set_seed(self, seed: int | None) -> None:
-        """Seed what `as_batch_generator` and `sample_episodes` draw; no other randomness is touched.
-
-        Datasets derived from this one by filters start from the same seed. None is a seed of the system's.
+    def to_arrow(self, level: Level = "steps") -> pa.Table:
+        """The same as an Arrow table.
 
         Raises:
-            DatasetError: it is no integer from 0.
+            MissingExtraError: pandas or pyarrow is not installed.
         """
-        if seed is not None and (
-            isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0
-        ):
-            raise DatasetError(f"expected a seed that is an integer from 0, found {seed!r:.80}")
-        self._seed = None if seed is None else int(seed)
-        self._random = np.random.default_rng(self._seed)
+        return tables.arrow(self, level)
 
-    def as_batch_generator(
-        self, batch_size: int, shuffle: bool = False, parser: type[BaseTupleParser] | None = None
-    ) -> Iterator[Any]:
-        """Batches of `batch_size` steps, the last one as long as is left; the steps are loaded first.
-
-        Args:
-            shuffle: in an order drawn anew each time, see `set_seed`.
-            parser: makes five columns of each batch; without one, a batch is a list of `RLTuple`.
+    def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+        """Writes the episodes to a new recording, with all that belongs to them, in the order of their times.
 
         Raises:
-            DatasetError: the batch size is no integer from 1.
+            RecordingError: there is no episode, the target exists (and not `overwrite`) or cannot be written.
+            SpaceError: two recordings have different spaces.
         """
-        size = _count(batch_size, 1, "a batch size")
-        columns = self._query.read(FIVE if parser else SIX)
-        order = self._random.permutation(len(columns["terminals"])) if shuffle else None
-        return convert.batches(columns, self._query.layout, size, order, parser)
+        return curate.save(self, Path(target), overwrite=overwrite)
 
-    def sample_episodes(self, n_samples: int) -> list[EpisodeItem]:
-        """Up to `n_samples` different episodes, drawn at random, with all their steps: the tuple filter is
-        for steps.
-
-        Only their steps are read. See `set_seed`.
-
-        Raises:
-            DatasetError: the number is no integer from 0.
-        """
-        headers = self._query.headers
-        n = min(_count(n_samples, 0, "a number of episodes"), len(headers))
-        drawn = self._random.choice(len(headers), n, replace=False)
-        in_order = np.sort(drawn)
-        chosen = [headers[i] for i in in_order]
-        columns, selected, layout = read_columns(self._query.source, chosen, SIX)
-        items = items_of(chosen, columns, selected.lengths, layout)
-        return [items[i] for i in np.searchsorted(in_order, drawn)]
-
-    # --- display ---
-
-    def _facts(self) -> display.Facts:
-        headers, selected = self._query.known
-        filters = {
-            "benchmarks": self._query.benchmark_filter,
-            "episodes": self._query.episode_filter,
-            "tuples": self._query.tuple_filter,
-        }
-        return display.Facts(
-            repr(self._query.source), headers, None if selected is None else selected.steps, filters
-        )
+    # ---- looking
 
     def __repr__(self) -> str:
-        return display.text(type(self).__name__, self._facts())
+        if self._listed is None:
+            return f"<Dataset of {self._source!r}: not listed yet>"
+        return f"<Dataset of {self._source!r}: {len(self):,} episodes, {self.n_steps:,} steps>"
 
     def _repr_html_(self) -> str:
-        _ = self._query.headers
-        return display.html(type(self).__name__, self._facts())
+        return display.html("Dataset", display.Facts(repr(self._source), self._headers, None, {}))
 
 
-def _count(value: int, least: int, what: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise DatasetError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
-    return int(value)
+def _places(chosen: object, count: int) -> list[int]:
+    """The places that a mask or a list of numbers names."""
+    array = np.asarray(chosen)
+    if array.ndim == 1 and array.dtype == np.bool_ and len(array) == count:
+        return np.flatnonzero(array).tolist()
+    if array.ndim != 1 or (len(array) and array.dtype.kind not in "iu"):
+        raise DatasetError(
+            f"expected a number, a slice, a list of numbers or a mask of {count} episodes, found {chosen!r:.80}"
+        )
+    if len(array) and not -count <= array.min() <= array.max() < count:
+        raise IndexError(f"expected episodes from 0 to {count - 1}, found {chosen!r:.80}")
+    return [int(i) % count for i in array]
+
+
+def _count(n: int) -> int:
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 0:
+        raise DatasetError(f"expected a number of episodes from 0, found {n!r:.80}")
+    return int(n)

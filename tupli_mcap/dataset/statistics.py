@@ -16,7 +16,7 @@ from tupli_mcap.recording.columns.statistics import ElementStatistics
 from tupli_mcap.spaces.leaves import Leaf
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset.front import Dataset
+    from tupli_mcap.dataset.dataset import Dataset
 
 __all__ = ["QUANTILES", "FieldStatistics", "statistics_of"]
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-    from tupli_mcap.dataset.front import Dataset
+    from tupli_mcap.dataset.dataset import Dataset
     from tupli_mcap.messages.step import StepLayout
     from tupli_mcap.spaces.labels import Labels
 

@@ -22,7 +22,7 @@ from tupli_mcap.errors import FilterError, RecordingError, TupliError
 from tupli_mcap.recording import Episode, Recording
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset.dataset import TupliDataset
+    from tupli_mcap.dataset.tupli import TupliDataset
     from tupli_mcap.schema import BaseFilter, EpisodeHeader
     from tupli_mcap.storage import TupliStorage
 
@@ -181,7 +181,7 @@ def subjects_of(
         RecordingError: it is none of those.
         FilterError: the filter names an unknown field.
     """
-    from tupli_mcap.dataset.dataset import TupliDataset
+    from tupli_mcap.dataset.tupli import TupliDataset
     from tupli_mcap.storage import TupliStorage
 
     if isinstance(source, str | os.PathLike):

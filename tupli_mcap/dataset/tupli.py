@@ -1,0 +1,410 @@
+"""`TupliDataset`: which episodes and steps, and the arrays they are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from tupli_mcap.dataset import convert, display
+from tupli_mcap.dataset.access import RandomAccess
+from tupli_mcap.dataset.convert import BaseTupleParser, NumpyTupleParser
+from tupli_mcap.dataset.items import Steps
+from tupli_mcap.dataset.items.steps import checked_count
+from tupli_mcap.dataset.items.windows import FIVE
+from tupli_mcap.dataset.load import TupleFilter, read_columns
+from tupli_mcap.dataset.query import Query
+from tupli_mcap.dataset.saved import save_columns
+from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
+from tupli_mcap.dataset.tuples import EpisodeItems, Tuples, items_of
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
+from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage.base import anew
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["TupliDataset"]
+
+SIX = (*FIVE, "infos")
+
+
+class TupliDataset(RandomAccess):
+    """Episodes of a storage (or of files, see `from_files`), and the steps in them, as filters choose them.
+
+    A dataset reads when it is asked for something, and only what it is asked for. Its filters never change:
+    `with_benchmark_filter`, `with_episode_filter` and `with_tuple_filter` return another dataset with that
+    one filter replaced (None takes it away; combine conditions with `&` and `|`), which finds its episodes
+    itself.
+
+    The episodes are listed once, and everything the dataset says agrees with that list until `preview()` or
+    `load()` list them anew. Properties keep what they have read, as arrays that cannot be written to; the
+    `convert_to_…` methods give arrays that are the caller's own, and keep nothing that `load()` has not read
+    before.
+
+    A column is an array of shape (steps, ...) in the dtype that was recorded, a list of one value a step
+    where values differ in size (texts, graphs), or dicts and tuples of those, nested as the environment's
+    space is. Recordings may differ in dtype as long as one dtype holds the values of both exactly. Not
+    thread-safe.
+
+    Args:
+        storage: where the episodes are.
+        info: anything the user wants to keep with the dataset.
+    """
+
+    def __init__(self, storage: TupliStorage, info: dict[str, Any] | None = None) -> None:
+        if not isinstance(storage, TupliStorage):
+            raise DatasetError(
+                f"expected a storage, such as FileStorage('lab'), found {storage!r:.80}; recordings "
+                "that are in no storage are opened with TupliDataset.from_files(...)"
+            )
+        self._setup(StorageSource(storage), info)
+
+    @classmethod
+    def from_files(
+        cls,
+        files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+        info: dict[str, Any] | None = None,
+    ) -> Self:
+        """A dataset of recordings in no storage: a path, a pattern ("runs/*.mcap"), a URL, or a list.
+
+        An episode that is in two of the files counts once, with a warning; one that is still being recorded
+        is listed as interrupted.
+
+        Raises:
+            RecordingError: there is no such file.
+        """
+        made = cls.__new__(cls)
+        made._setup(FilesSource(files), info)
+        return made
+
+    def _setup(self, source: Source, info: dict[str, Any] | None) -> None:
+        self.info = info
+        self._query = Query(source)
+        self.set_seed(None)
+
+    @property
+    def storage(self) -> TupliStorage | None:
+        """The storage; None for a dataset of files."""
+        source = self._query.source
+        return source.storage if isinstance(source, StorageSource) else None
+
+    # --- filters ---
+
+    def with_benchmark_filter(self, filter: BaseFilter | None) -> Self:
+        """The dataset of benchmarks a filter over `BenchmarkHeader` fields is true of, in place of any such
+        filter.
+
+        Raises:
+            FilterError: the filter names an unknown field.
+        """
+        return self._with(benchmark_filter=filter)
+
+    def with_episode_filter(self, filter: BaseFilter | None) -> Self:
+        """The dataset of episodes a filter over `EpisodeHeader` fields (`metadata.score`, `n_tuples`, `end`,
+        …) is true of, in place of any such filter.
+
+        Raises:
+            FilterError: the filter names an unknown field.
+        """
+        return self._with(episode_filter=filter)
+
+    def with_tuple_filter(self, filter_fcn: TupleFilter | None) -> Self:
+        """The dataset of steps a filter is true of, in place of any such filter.
+
+        Args:
+            filter_fcn: an expression over state, action, reward, terminal, timeout, info, next_state and step
+                (counted from 0 in each episode), such as `F("state.0") > 1`, which is evaluated on whole
+                columns; or a function of one `RLTuple` that returns True or False, called for every step.
+
+        Raises:
+            FilterError: it is neither, or names an unknown field.
+        """
+        return self._with(tuple_filter=filter_fcn)
+
+    def _with(self, **filters: Any) -> Self:
+        made = type(self).__new__(type(self))
+        made.__dict__.update(self.__dict__)
+        made._query = self._query.with_filters(**filters)
+        made.set_seed(self._seed)
+        return made
+
+    def with_cache(self, cache_bytes: int, threads: int | None = None) -> Self:
+        """The dataset with another budget (bytes, 512 MiB by default) for what random access keeps in memory.
+
+        Args:
+            threads: how many read chunks; by default as many as there are cores, at most 4.
+
+        Raises:
+            SamplingError: a number is no integer, or too small.
+        """
+        made = self._with()
+        made._query.cache_bytes = checked_count(cache_bytes, 0, "a budget in bytes")
+        if threads is not None:
+            made._query.threads = checked_count(threads, 1, "a number of threads")
+        return made
+
+    # --- looking and loading ---
+
+    def preview(self) -> list[EpisodeHeader]:
+        """The episodes, listed anew; no step is read."""
+        return list(self._query.refresh())
+
+    def explain(self) -> str:
+        """How the episodes are looked up: the SQL of the filters and its plan, for a storage with a catalog."""
+        return self._query.source.explain(self._query.benchmark_filter, self._query.episode_filter)
+
+    def load(self) -> None:
+        """List the episodes anew and read their steps (states, actions, rewards, terminals, timeouts) into
+        memory.
+
+        Raises:
+            SpaceError: the steps of two recordings do not fit into one array; the message says which.
+        """
+
+        def attempt() -> None:
+            self._query.refresh()
+            self._query.read(FIVE)
+
+        anew(attempt)  # episodes that are deleted while they are read are listed no more the next time
+
+    def save_columns(self, directory: str | os.PathLike[str]) -> None:
+        """Write the steps to a new directory as plain `.npy` files, which `open_columns` reads mapped into memory.
+
+        The directory also holds `manifest.json`; see docs/columns.md. It is there as a whole or not at all: a process
+        that is killed leaves none. It keeps the steps as they are listed now, whatever becomes of their recordings, and
+        no infos. Steps are read a few at a time, within the budget of `with_cache`.
+
+        Args:
+            directory: where nothing is yet.
+
+        Raises:
+            DatasetError: there is no step, values differ in size (texts, graphs), or the directory is no path.
+            SpaceError: the steps of two recordings do not fit into one array; the message says which.
+            StorageError: there is something at that path, the disk is full, ...
+        """
+        save_columns(directory, self.steps, self._headers, self._step_seconds())
+
+    # --- what is in it ---
+
+    @property
+    def steps(self) -> Steps:
+        return self._query.steps()
+
+    @property
+    def _headers(self) -> Sequence[EpisodeHeader]:
+        return self._query.headers
+
+    def _step_seconds(self) -> float | None:
+        known = set()
+        for name in dict.fromkeys(header.recording for header in self._headers):
+            with self._query.source.open(name) as recording:
+                known.add(recording.labels.step_seconds)
+        return known.pop() if len(known) == 1 else None
+
+    @property
+    def benchmarks(self) -> list[BenchmarkHeader]:
+        """The benchmarks the benchmark filter is true of."""
+        return list(self._query.benchmarks)
+
+    @property
+    def episodes(self) -> Sequence[EpisodeItem]:
+        """The episodes with those of their steps that the tuple filter is true of; each is made when it is
+        asked for.
+
+        Steps are read at the first access to an item. Use `preview()` for facts about episodes only.
+        """
+        query, headers = self._query, self._query.headers
+        return EpisodeItems(headers, lambda: query.columns_of(headers, SIX))
+
+    @property
+    def tuples(self) -> Sequence[RLTuple]:
+        """The steps; each is made when it is asked for."""
+        return Tuples(self._query.read(SIX), self._query.layout)
+
+    @property
+    def observations(self) -> Any:
+        """The state of each step, the observation its action was chosen on: a read-only column."""
+        return self._query.read(["states"])["states"]
+
+    @property
+    def next_states(self) -> Any:
+        """The state after each step, never one of another episode: a read-only column.
+
+        Where it was not recorded (the last step of an episode built by hand), the step's own state.
+        """
+        return self._query.read(["next_states"])["next_states"]
+
+    @property
+    def actions(self) -> Any:
+        """The action of each step: a read-only column."""
+        return self._query.read(["actions"])["actions"]
+
+    @property
+    def rewards(self) -> Any:
+        """The reward of each step: a read-only column, float64 unless the rewards have a space of their
+        own."""
+        return self._query.read(["rewards"])["rewards"]
+
+    @property
+    def terminals(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Whether the environment ended with the step (read-only, of bools)."""
+        found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["terminals"])["terminals"]
+        return found
+
+    @property
+    def timeouts(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Whether the episode was truncated with the step, as it was recorded (read-only, of bools)."""
+        found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["timeouts"])["timeouts"]
+        return found
+
+    @property
+    def infos(self) -> list[dict[str, Any]]:
+        """The info of each step; empty where none was recorded."""
+        return list(self._query.read(["infos"])["infos"])
+
+    def __len__(self) -> int:
+        """The number of steps, after all filters; with a tuple filter, this evaluates it."""
+        if self._query.tuple_filter is None:
+            return sum(header.n_tuples for header in self._query.headers)
+        return self._query.selected.steps
+
+    def __iter__(self) -> Iterator[RLTuple]:
+        return iter(self.tuples)
+
+    # --- conversions ---
+
+    def convert_to_numpy(self, *, mark_cuts: bool = True) -> tuple[Any, Any, Any, Any, Any]:
+        """States, actions, rewards, terminals and timeouts as columns of NumPy arrays; they are the caller's
+        own.
+
+        Args:
+            mark_cuts: also set the timeout of a step that is followed by anything else than its own episode's
+                next step: the last one of an interrupted episode, or the one before steps that a tuple filter
+                left out. Learners that find episodes by their flags (d3rlpy, D4RL) would join two episodes
+                otherwise. False gives the flags as they were recorded.
+        """
+        columns = self._query.own(FIVE)
+        if mark_cuts:
+            convert.mark_cuts(columns, self._query.selected)
+        return (
+            columns["states"],
+            columns["actions"],
+            columns["rewards"],
+            columns["terminals"],
+            columns["timeouts"],
+        )
+
+    def convert_to_tensors(
+        self, parser: type[BaseTupleParser] = NumpyTupleParser, *, mark_cuts: bool = True
+    ) -> tuple[Any, ...]:
+        """What a parser makes of the five columns of `convert_to_numpy`.
+
+        Raises:
+            MissingExtraError: the library the parser needs is not installed.
+        """
+        return parser.parse_lists(*self.convert_to_numpy(mark_cuts=mark_cuts))
+
+    def convert_to_d4rl_format(self, *, mark_cuts: bool = True) -> dict[str, Any]:
+        """Columns named as in D4RL: observations, actions, next_observations, rewards, terminals, timeouts.
+
+        `next_observations` are `next_states`; `terminals` are true terminals only. `mark_cuts` is that of
+        `convert_to_numpy`.
+        """
+        columns = self._query.own((*FIVE, "next_states"))
+        if mark_cuts:
+            convert.mark_cuts(columns, self._query.selected)
+        return {name: columns[field] for name, field in convert.D4RL_NAMES.items()}
+
+    def convert_to_dataframe(self) -> pd.DataFrame:
+        """A pandas DataFrame with a row a step: the episode (its place in `preview()`), the step (from 0 in
+        its episode), and the columns of `convert_to_d4rl_format`, flags as they were recorded.
+
+        Columns of numbers keep their dtype; a value of several numbers is one object in its cell.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        convert.import_pandas()
+        columns = self._query.own((*FIVE, "next_states", "steps"))
+        return convert.dataframe(columns, self._query.selected)
+
+    # --- batches and samples ---
+
+    def set_seed(self, seed: int | None) -> None:
+        """Seed what `as_batch_generator` and `sample_episodes` draw; no other randomness is touched.
+
+        Datasets derived from this one by filters start from the same seed. None is a seed of the system's.
+
+        Raises:
+            DatasetError: it is no integer from 0.
+        """
+        if seed is not None and (
+            isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0
+        ):
+            raise DatasetError(f"expected a seed that is an integer from 0, found {seed!r:.80}")
+        self._seed = None if seed is None else int(seed)
+        self._random = np.random.default_rng(self._seed)
+
+    def as_batch_generator(
+        self, batch_size: int, shuffle: bool = False, parser: type[BaseTupleParser] | None = None
+    ) -> Iterator[Any]:
+        """Batches of `batch_size` steps, the last one as long as is left; the steps are loaded first.
+
+        Args:
+            shuffle: in an order drawn anew each time, see `set_seed`.
+            parser: makes five columns of each batch; without one, a batch is a list of `RLTuple`.
+
+        Raises:
+            DatasetError: the batch size is no integer from 1.
+        """
+        size = _count(batch_size, 1, "a batch size")
+        columns = self._query.read(FIVE if parser else SIX)
+        order = self._random.permutation(len(columns["terminals"])) if shuffle else None
+        return convert.batches(columns, self._query.layout, size, order, parser)
+
+    def sample_episodes(self, n_samples: int) -> list[EpisodeItem]:
+        """Up to `n_samples` different episodes, drawn at random, with all their steps: the tuple filter is
+        for steps.
+
+        Only their steps are read. See `set_seed`.
+
+        Raises:
+            DatasetError: the number is no integer from 0.
+        """
+        headers = self._query.headers
+        n = min(_count(n_samples, 0, "a number of episodes"), len(headers))
+        drawn = self._random.choice(len(headers), n, replace=False)
+        in_order = np.sort(drawn)
+        chosen = [headers[i] for i in in_order]
+        columns, selected, layout = read_columns(self._query.source, chosen, SIX)
+        items = items_of(chosen, columns, selected.lengths, layout)
+        return [items[i] for i in np.searchsorted(in_order, drawn)]
+
+    # --- display ---
+
+    def _facts(self) -> display.Facts:
+        headers, selected = self._query.known
+        filters = {
+            "benchmarks": self._query.benchmark_filter,
+            "episodes": self._query.episode_filter,
+            "tuples": self._query.tuple_filter,
+        }
+        return display.Facts(
+            repr(self._query.source), headers, None if selected is None else selected.steps, filters
+        )
+
+    def __repr__(self) -> str:
+        return display.text(type(self).__name__, self._facts())
+
+    def _repr_html_(self) -> str:
+        _ = self._query.headers
+        return display.html(type(self).__name__, self._facts())
+
+
+def _count(value: int, least: int, what: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise DatasetError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
+    return int(value)
