@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from tupli_mcap.recording.recover.file_end import Tail
 __all__ = ["Structure"]
 
 _CDR = int.from_bytes(CDR_HEADER, "little")
+_SUMMARY_OFFSET = struct.Struct("<BQQ")  # opcode of a group of records, where it starts, its length
 _KINDS = {
     Opcode.CHUNK: "chunk", Opcode.ATTACHMENT: "attachment", Opcode.MESSAGE_INDEX: "message_index",
     Opcode.METADATA: "metadata",
@@ -342,8 +344,12 @@ class Structure:
                     self._findings.error("summary", why, offset=groups.get(opcode, [start])[0])
 
     def _offsets(self, body: memoryview, groups: dict[int, list[int]], offset: int) -> None:
-        start, length = int.from_bytes(body[1:9], "little"), int.from_bytes(body[9:17], "little")
-        if groups.get(body[0]) != [start, start + length]:
+        if len(body) != _SUMMARY_OFFSET.size:
+            why = f"a summary offset has {len(body)} bytes, not {_SUMMARY_OFFSET.size}"
+            self._findings.error("summary", why, offset=offset)
+            return
+        opcode, start, length = _SUMMARY_OFFSET.unpack(body)
+        if groups.get(opcode) != [start, start + length]:
             self._findings.error("summary", "a summary offset points elsewhere", offset=offset)
 
     def _statistics(self) -> Statistics:
