@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from mcap.records import Channel
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
@@ -19,6 +20,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.index import EpisodeIndex
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.leaves import Leaf
@@ -33,11 +35,11 @@ def verify_episodes(recording: Recording, findings: Findings) -> None:
     if not recording.num_envs:
         return
     checker = _Checker(recording, findings)
-    for env, channel in enumerate(recording._step_channels):
+    for env, channel in enumerate(recording.file.steps):
         checker.steps(env, channel)
-        checker.images(env, channel)
+        checker.images(channel)
         checker.bools(channel, recording.layout.step_leaves)
-    checker.bools(recording._topics.get(FINAL_STATE, 0), recording.layout.final_leaves)
+    checker.bools(recording.file.topics.get(FINAL_STATE, 0), recording.layout.final_leaves)
     checker.starts()
     checker.ends()
     checker.finals()
@@ -48,8 +50,11 @@ class _Checker:
     def __init__(self, recording: Recording, findings: Findings) -> None:
         self._recording = recording
         self._layout: StepLayout = recording.layout
-        self._store: ChunkStore = recording._store
-        self._topics: dict[str, int] = recording._topics
+        file = recording.file
+        self._store: ChunkStore = file.store
+        self._topics: Mapping[str, int] = file.topics
+        self._channels: Mapping[int, Channel] = file.contents.channels
+        self._index: EpisodeIndex = file.contents.index
         self._findings = findings
         self._rows: Array = recording.index
         self._at = {int(number): i for i, number in enumerate(self._rows["episode"])}
@@ -61,7 +66,7 @@ class _Checker:
 
     def steps(self, env: int, channel: int) -> None:
         """Every row of a step channel against the episode it lies in."""
-        topic = self._recording._contents.channels[channel].topic
+        topic = self._channels[channel].topic
         mine = self._rows[self._rows["env"] == env]
         mine = mine[np.argsort(mine["first_row"], kind="stable")]
         firsts, lengths = mine["first_row"].astype(np.int64), mine["length"].astype(np.int64)
@@ -124,9 +129,9 @@ class _Checker:
             why = f"its return is {told!r}, its rewards sum up to {found!r}"
             self._error("episode", why, episode=int(mine["episode"][i]))
 
-    def images(self, env: int, channel: int) -> None:
+    def images(self, channel: int) -> None:
         """Image channels have a row for each step, and the bytes that never change."""
-        topics = Topics.of_step(self._recording._contents.channels[channel].topic)
+        topics = Topics.of_step(self._channels[channel].topic)
         for leaf in self._layout.images:
             topic = topics.image(leaf.name)
             number = self._topics.get(topic, 0)
@@ -150,7 +155,7 @@ class _Checker:
         names = [leaf.name for leaf in leaves if leaf.size and self._layout.dtypes.get(leaf.name) == np.bool_]
         if not names or not self._layout.constant:
             return
-        step = channel in self._recording._step_channels
+        step = channel in self._recording.file.steps
         dtype = (self._layout.step_message if step else self._layout.final_message).dtype
         try:
             for chunk in self._store.chunks(channel):
@@ -161,7 +166,7 @@ class _Checker:
                 for name in names:
                     wrong = (rows[name].view(np.uint8) > 1).reshape(len(rows), -1).any(axis=1)
                     for i in np.flatnonzero(wrong)[:3].tolist():
-                        place = self._recording._contents.channels[channel].topic
+                        place = self._channels[channel].topic
                         self._error(
                             "rows",
                             f"row {first + i} has a bool in {name!r} other than 0 and 1",
@@ -250,7 +255,7 @@ class _Checker:
             same = np.float64(end.episode_return).tobytes() == told["return"].tobytes()
             if facts != index or not same or body[33] > 1:
                 self._error("episode", f"its end and the index differ: {facts} and {index}", **place)
-            if end.metadata != self._recording._contents.index.metadata_text(i):
+            if end.metadata != self._index.metadata_text(i):
                 self._error("episode", "its metadata differ between its end and the index", **place)
         for number in sorted(self._at.keys() - seen):
             self._error("episode", "it has no end", episode=number, channel=EPISODE_END)
@@ -301,7 +306,7 @@ class _Checker:
         channel = self._topics.get(INFO)
         if channel is None:
             return
-        decoder = InfoCodec.from_metadata(self._recording._contents.channels[channel].metadata)
+        decoder = InfoCodec.from_metadata(self._channels[channel].metadata)
         last: dict[int, int] = {}
         for row, _, body in self._messages(INFO):
             place: dict[str, Any] = {"channel": INFO}

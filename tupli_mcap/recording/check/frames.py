@@ -29,10 +29,10 @@ class _Pair:
     def __init__(self, recording: Recording, findings: Findings, camera: str, env: int) -> None:
         self._recording = recording
         self._findings = findings
-        self._store: ChunkStore = recording._store
+        self._store: ChunkStore = recording.file.store
         self._camera = camera
         self._topics = CameraTopics.of(camera, env if recording.is_vector else None)
-        self._channels = recording._cameras.channels(camera, env)
+        self._channels = recording.file.cameras.channels(camera, env)
         self._rows = recording.index[recording.index["env"] == env]
 
     def run(self) -> None:

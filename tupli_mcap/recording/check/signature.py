@@ -17,7 +17,7 @@ from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.recording import OpenFile, Recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, STATEMENTS, Signed, is_covered_kind
 
@@ -110,12 +110,11 @@ def manifest(recording: Recording) -> dict[str, Any]:
 
 def manifest_of_episodes(recording: Recording) -> dict[str, Any]:
     """The part of the manifest that is about episodes."""
-    index = recording._contents.index
+    contents = recording.file.contents
+    index = contents.index
     return {
         "recording": {key: recording.metadata[key] for key in _IDENTITY if key in recording.metadata},
-        "channels": {
-            str(number): _channel(recording, number) for number in sorted(recording._contents.channels)
-        },
+        "channels": {str(number): _channel(recording.file, number) for number in sorted(contents.channels)},
         "episodes": {
             "count": len(index.episodes),
             "sha256": sha256(index.episodes.tobytes() + index.metadata),
@@ -123,10 +122,10 @@ def manifest_of_episodes(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _channel(recording: Recording, number: int) -> dict[str, Any]:
+def _channel(file: OpenFile, number: int) -> dict[str, Any]:
     """Of a channel: its topic, and the digest of its definition and of all its message records, in order."""
-    channel = recording._contents.channels[number]
-    schema = recording._contents.schemas.get(channel.schema_id)
+    channel = file.contents.channels[number]
+    schema = file.contents.schemas.get(channel.schema_id)
     definition = {
         "topic": channel.topic,
         "encoding": channel.message_encoding,
@@ -134,17 +133,16 @@ def _channel(recording: Recording, number: int) -> dict[str, Any]:
         "schema": None if schema is None else [schema.name, schema.encoding, sha256(schema.data)],
     }
     digest = hashlib.sha256(canonical_json(definition))
-    store = recording._store
-    for chunk in store.chunks(number):
-        digest.update(store.load(chunk, keep=False))
-    return {"topic": channel.topic, "messages": store.count(number), "sha256": digest.hexdigest()}
+    for chunk in file.store.chunks(number):
+        digest.update(file.store.load(chunk, keep=False))
+    return {"topic": channel.topic, "messages": file.store.count(number), "sha256": digest.hexdigest()}
 
 
 def check_readers(recording: Recording, covered: Container[str], walk: Structure | None) -> None:
     """Other readers go by the definitions in the chunks, by the summary's indexes, or by the order of the file: what
     they see must be what was hashed, so all of it must agree, and nothing `covered` may be there twice."""
     if walk is None:
-        source = recording._source
+        source = recording.file.source
         walk = Structure(source, read_tail(source), Findings(VerifyReport(recording.name)))
         walk.run()
     wrong = [problem.message + f" ({problem.place})" * bool(problem.place) for problem in walk.report.errors]

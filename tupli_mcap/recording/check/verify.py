@@ -145,7 +145,7 @@ def _contents(source: Source, structure: Structure, findings: Findings) -> None:
         if not damaged:  # else the reader says again what is known, or what follows from it
             findings.error("layout", str(err).removeprefix(f"{source.name}: "))
         return
-    recording._store.claims = None  # which rows differ from the index is said one by one
+    recording.file.store.claims = None  # which rows differ from the index is said one by one
     with recording:
         findings.report.attachments = len(recording.attachments)
         _layout(recording, structure, findings)
@@ -159,13 +159,14 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
     """The definitions in the file are those that the spaces give."""
     if not recording.num_envs:
         return
-    topics = {channel.topic: channel for channel in recording._contents.channels.values()}
+    channels = recording.file.contents.channels
+    topics = {channel.topic: channel for channel in channels.values()}
     info = topics.get(INFO)
     wanted = Container(-1, recording.name, "none")
     vector = recording.num_envs if recording.is_vector else None
     try:
         infos = None if info is None else (InfoCodec.from_metadata(info.metadata).schema()[0], info.metadata)
-        png = png_leaves(recording._contents.channels)
+        png = png_leaves(channels)
         register_channels(wanted, recording.name, recording.layout, vector, infos, recording.cameras, png)
     except FormatError as err:
         findings.error("layout", str(err))

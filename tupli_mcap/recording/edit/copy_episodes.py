@@ -51,7 +51,8 @@ class EpisodeCopier:
         self._source, self._target, self._shift = source, target, shift
         self._channels = channels or {}
         self._cameras, self._new_frames = cameras, frames
-        self._store, self._topics = source._store, source._topics
+        self._file = source.file
+        self._store, self._topics = source.file.store, source.file.topics
         self._held: dict[
             int, int
         ] = {}  # times must not decrease, whatever the clock did between two episodes
@@ -60,14 +61,14 @@ class EpisodeCopier:
         """Copies the episodes that `rows` of the source's index name."""
         layout = self._source.layout
         firsts = np.zeros(len(rows), dtype=np.int64)
-        for env, channel in enumerate(self._source._step_channels):
+        for env, channel in enumerate(self._file.steps):
             mine = np.flatnonzero(rows["env"] == env)
             mine = mine[np.argsort(rows["first_row"][mine], kind="stable")]
             lengths = rows["length"][mine].astype(np.int64)
             firsts[mine] = self._target.next_row(self._to(channel)) + np.cumsum(lengths) - lengths
             spans = _merged([(int(rows["first_row"][i]), int(rows["length"][i])) for i in mine])
             self._copy(channel, spans, layout.step_message.dtype if layout.constant else None)
-            topics = Topics.of_step(self._source._contents.channels[channel].topic)
+            topics = Topics.of_step(self._file.contents.channels[channel].topic)
             for leaf in layout.images:
                 images = self._topics[topics.image(leaf.name)]
                 self._copy(images, spans, layout.image_messages[leaf.name].dtype)
@@ -83,7 +84,7 @@ class EpisodeCopier:
     def _copy_first(self, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
         if self._shift or self._to(channel) != channel:
             return 0
-        return self._target.copy_first(self._source, channel, count, dtype)
+        return self._target.copy_first(self._file, channel, count, dtype)
 
     def _copy(self, channel: int, spans: list[tuple[int, int]], dtype: np.dtype[Any] | None) -> None:
         """Rows `spans` of a channel of steps or images, renumbered, in chunks of the usual size."""
@@ -195,14 +196,14 @@ class EpisodeCopier:
                 elif camera in source.cameras:
                     places = [self._frame_rows(camera, row) for row in mine]
                     joined = np.concatenate(places) if places else np.zeros(0, np.int64)
-                    theirs = source._cameras.channels(camera, env)
+                    theirs = self._file.cameras.channels(camera, env)
                     self._copy_places(theirs[0], joined, numbered=False)
                     self._copy_places(theirs[1], joined, numbered=True)
 
     def _frame_rows(self, camera: str, row: Any) -> Array:
         """Which rows of its channels show an episode."""
         number, length = int(row["episode"]), int(row["length"])
-        return self._source._cameras.rows(camera, int(row["env"]), number, length)[0]
+        return self._file.cameras.rows(camera, int(row["env"]), number, length)[0]
 
     def _frames_of(
         self, new: NewFrames, row: Any, channel: int, pictures: bool

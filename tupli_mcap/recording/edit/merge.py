@@ -126,7 +126,7 @@ def _merge(
     container.define_channels()
     ids = {channel.topic: channel.id for channel in container.channels.values()}
     for recording, rows, shift in turns:
-        channels = {i: ids.get(topic, i) for topic, i in recording._topics.items()}
+        channels = {i: ids.get(topic, i) for topic, i in recording.file.topics.items()}
         cameras = {
             name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
             for name, pairs_of in camera_channels(recording, container).items()
@@ -167,7 +167,7 @@ def _numbered(
         rows = recording.index[places]
         shift = max(0, free - int(rows["episode"].min())) if i in begun else free
         free = shift + (
-            recording._contents.next_episode if last[i] == turn else int(rows["episode"].max()) + 1
+            recording.file.contents.next_episode if last[i] == turn else int(rows["episode"].max()) + 1
         )
         begun.add(i)
         found.append((recording, rows, shift))
@@ -188,9 +188,10 @@ def _metadata(source: Recording, *, next_episode: int) -> dict[str, str]:
 def _define_missing(source: Recording, container: Container) -> None:
     """The channels of infos and cameras that the recordings before have not."""
     info = None
-    if INFO in source._topics:
-        channel = source._contents.channels[source._topics[INFO]]
-        text = source._contents.schemas[channel.schema_id].data.decode()
+    contents, topics = source.file.contents, source.file.topics
+    if INFO in topics:
+        channel = contents.channels[topics[INFO]]
+        text = contents.schemas[channel.schema_id].data.decode()
         info = text, {key: value for key, value in channel.metadata.items() if key != "crc"}
     vector = source.num_envs if source.is_vector else None
     png = png_leaves(container.channels)  # as the first one has them, whatever the others have
@@ -339,7 +340,7 @@ def _groups(recording: Recording, episodes: int | None, max_bytes: int | None) -
 
 
 def _write_part(recording: Recording, part: Part, numbers: list[int], compression: str) -> Part:
-    metadata = _metadata(recording, next_episode=recording._contents.next_episode)
+    metadata = _metadata(recording, next_episode=recording.file.contents.next_episode)
     with replacing(part.path) as (fd, _):
         container = Container(fd, str(part.path), compression)
         copied = write(recording, container, metadata, numbers, {}, signed=False, left_out=STATEMENTS)

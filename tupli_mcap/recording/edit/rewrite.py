@@ -56,7 +56,7 @@ def rewrite_recording(
     metadata = {key: value for key, value in source.metadata.items() if key not in ("journal", "replaced")}
     if benchmark_id is not None:
         metadata["benchmark_id"] = benchmark_id
-    metadata["next_episode"] = str(source._contents.next_episode)
+    metadata["next_episode"] = str(source.file.contents.next_episode)
     metadata["rewritten"] = uuid.uuid4().hex
     same = episodes is None and benchmark_id in (None, source.benchmark_id) and frames is None
     with replacing(target) as (fd, _):
@@ -102,7 +102,7 @@ def write(
 
 def define(source: Recording, target: Assembler, followers: Sequence[Follower] = ()) -> None:
     """The source's channels, and those of the followers after them."""
-    container, contents = target.container, source._contents
+    container, contents = target.container, source.file.contents
     own = {i: c for i, c in contents.channels.items() if _FOLLOWS not in c.metadata}
     if sorted(own) != list(range(1, len(own) + 1)):  # somebody else's channels are in between
         own = dict(contents.channels)
@@ -111,7 +111,7 @@ def define(source: Recording, target: Assembler, followers: Sequence[Follower] =
     whole = sorted(schemas) == list(range(1, len(schemas) + 1))
     container.schemas = schemas if whole else dict(contents.schemas)
     container.channels = own
-    container.codecs = image_codecs(source.layout, own) if source._step_channels else {}
+    container.codecs = image_codecs(source.layout, own) if source.file.steps else {}
     taken = {channel.topic for channel in own.values()} & {follower.topic for follower in followers}
     if taken:
         raise RecordingError(f"{source.name} has channels of its own named {', '.join(sorted(taken))}")
@@ -122,18 +122,18 @@ def define(source: Recording, target: Assembler, followers: Sequence[Follower] =
             known[follower.schema] = container.add_schema(follower.schema, follower.text)
         about = {_FOLLOWS: follower.follows}
         number = container.add_channel(follower.topic, known[follower.schema], about)
-        target.followers.setdefault(source._topics[follower.follows], []).append((number, follower))
+        target.followers.setdefault(source.file.topics[follower.follows], []).append((number, follower))
 
 
 def camera_channels(
     source: Recording, container: Container, new: NewFrames | None = None
 ) -> dict[str, list[tuple[int, int]]]:
     """By camera, then by sub-environment, the ids of its channels; those of a new camera are added."""
-    cameras = source._cameras
+    cameras = source.file.cameras
     envs = range(source.num_envs)
     found = {name: [cameras.channels(name, env) for env in envs] for name in cameras.names}
     if new is not None and new.camera not in found:
         vector = source.num_envs if source.is_vector else None
         where = (container, source.name, source.layout, vector, None, (new.camera,))
-        found[new.camera] = register_channels(*where, png_leaves(source._contents.channels)).cameras
+        found[new.camera] = register_channels(*where, png_leaves(source.file.contents.channels)).cameras
     return found
