@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording import Recording
-from tupli_mcap.recording.columns.read import Columns
+from tupli_mcap.recording import Columns, Recording
 
 __all__ = ["Block", "RecordedValues", "recorded_values"]
 

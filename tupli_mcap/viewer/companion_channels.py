@@ -27,8 +27,8 @@ from tupli_mcap.messages.episodes import record
 from tupli_mcap.messages.layout import Field, record_dtype
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
-from tupli_mcap.recording import Recording
-from tupli_mcap.recording.edit.rewrite import Follower, rewrite_recording
+from tupli_mcap.recording import Recording, rewrite_recording
+from tupli_mcap.recording.edit.rewrite import Follower
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names
 from tupli_mcap.viewer.targets import check_new
