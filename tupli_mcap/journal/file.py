@@ -49,9 +49,11 @@ __all__ = [
 ]
 
 MAGIC = b"TMCAPJ1\0"
+EVENT_AREAS = "events", "info"
+FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name
 _HEAD = struct.Struct("<8sII")
 PAGE = 4096
-_LOG_HEADER = 64
+LOG_HEADER = 64  # bytes of a log's half before its records
 _MAX_HEADER = 64 << 20
 _PIECE = 1 << 20
 # Bytes from which a journal is written once as zeros: the faults of its pages, one by one, take five times as long.
@@ -127,7 +129,7 @@ class LogArea(NamedTuple):
 
     @property
     def half(self) -> int:
-        return _LOG_HEADER + self.capacity
+        return LOG_HEADER + self.capacity
 
     @property
     def size(self) -> int:
@@ -423,7 +425,3 @@ def _area(entry: Mapping[str, Any]) -> Area:
     if type(entry["name"]) is not str or any(type(n) is not int or not 0 < n < 1 << 48 for n in sizes):
         raise ValueError(entry)
     return RowArea(**values) if entry["kind"] == "rows" else LogArea(**values)
-
-
-EVENT_AREAS = "events", "info"
-FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name

@@ -100,7 +100,7 @@ def message_headers(data: memoryview, most: int | None = None) -> Array:
     return found
 
 
-def message_places(data: Any, most: int | None = None) -> Array:
+def message_places(data: Any, most: int | None) -> Array:
     """Where consecutive Message records begin and end: int64 (records, 2). FormatError as `message_headers`."""
     starts, at, size, length_at = [], 0, len(data), _LENGTH.unpack_from
     for _ in itertools.count() if most is None else range(most):

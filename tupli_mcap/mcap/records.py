@@ -272,12 +272,13 @@ def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
     return data
 
 
-def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
+def iter_records(data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
     """(offset, end, channel, sequence, log_time) of the Message records in `data`.
 
     Raises:
         FormatError: bytes that are no whole Message record.
     """
+    start = 0
     while start < len(data):
         if start + BODY > len(data):
             raise FormatError(f"expected a message record at byte {start}, found {len(data) - start} bytes")

@@ -75,7 +75,6 @@ class VariableField:
         self,
         space: gym.Space[Any],
         name: str,
-        package: str = "tupli_mcap",
         type_prefix: str = "Value",
         *,
         path: str | None = None,
@@ -85,7 +84,7 @@ class VariableField:
         self.name = name
         self.path = name if path is None else path
         wide = {self.path + where: dtype for where, dtype in (dtypes or {}).items()}
-        builder = _Builder(package, set() if taken is None else taken, wide)
+        builder = _Builder(set() if taken is None else taken, wide)
         codec = builder.single(space, type_prefix, self.path, 0)
         if wide:
             raise SpaceError(
@@ -125,7 +124,6 @@ class VariableField:
 class _Builder:
     """Makes codecs and collects the message definitions they need."""
 
-    package: str
     taken: set[str]
     wide: dict[str, str]  # path to dtype; each is taken out when it is used
     definitions: list[tuple[str, str]] = field(default_factory=list)
@@ -225,10 +223,11 @@ class _Builder:
         while unique in self.taken:
             unique, n = f"{type_name}N{n}", n + 1
         self.taken.add(unique)
-        self.definitions.append((f"{self.package}/{unique}", "".join(lines) or f"uint8 {_DUMMY}\n"))
+        full = f"tupli_mcap/{unique}"
+        self.definitions.append((full, "".join(lines) or f"uint8 {_DUMMY}\n"))
         if not lines:
             encode, decode = with_dummy(encode, decode)
-        return Codec(f"{self.package}/{unique}", "message", encode, decode)
+        return Codec(full, "message", encode, decode)
 
 
 def _check_depth(path: str, depth: int) -> None:

@@ -24,7 +24,6 @@ from tupli_mcap.recording.signature_file import SIGNATURE_NAME, STATEMENTS, Sign
 __all__ = [
     "Signature",
     "check_readers",
-    "check_signature",
     "manifest",
     "manifest_of_episodes",
     "verify_signature",
@@ -54,11 +53,6 @@ class Signature(NamedTuple):
     def trusted(self) -> bool:
         """Whether this user trusts the key."""
         return self.name is not None
-
-
-def check_signature(recording: Recording) -> Signature | None:
-    """As `verify_signature`; None if the recording is not signed."""
-    return verify_signature(recording) if SIGNATURE_NAME in recording.attachments else None
 
 
 def verify_signature(recording: Recording, walk: Structure | None = None) -> Signature:

@@ -159,7 +159,7 @@ def recover_recording(
         with replacing(goal) as (fd, temporary):
             report = _recover(opened, fd, compression)
             if not _signature_fits(temporary):
-                os.ftruncate(fd, os.lseek(fd, 0, os.SEEK_SET))
+                os.ftruncate(fd, 0)
                 report = _recover(opened, fd, compression, leave_out=SIGNATURE_NAME)
                 report.attachments_lost = [n for n in report.attachments_lost if n != SIGNATURE_NAME]
                 report.notes.append("its signature is left out: it is not of what could be saved")

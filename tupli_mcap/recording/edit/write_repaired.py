@@ -119,7 +119,7 @@ class RepairWriter:
                 if image is not None:
                     image_type = layout.image_messages[leaf.name].dtype
                     self._copy(store, image, ids[env], mine, image_type, patch=False)
-        self._events(store, layout, old, new, plan, rows)
+        self._events(store, old, new, plan, rows)
         if old.info is not None and new.info is not None:
             self._target.add_messages(new.info, self._infos(store, old.info, plan))
         topics = {channel.topic: channel.id for channel in self._container.channels.values()}
@@ -194,7 +194,6 @@ class RepairWriter:
     def _events(
         self,
         store: PackedStore,
-        layout: StepLayout,
         old: RecordedChannels,
         new: Channels,
         plan: Plan,

@@ -161,7 +161,7 @@ def _goes_on(run: StepRun, following: StepRun) -> bool:
     return together and not (run.terminal or run.timeout)
 
 
-def sum_up(rewards: Array, total: float = 0.0) -> float:
+def sum_up(rewards: Array, total: float) -> float:
     """`total` and the rewards, added one after another as a recorder does."""
     with np.errstate(invalid="ignore", over="ignore"):
         return float(np.cumsum(np.concatenate(((total,), rewards)))[-1])
