@@ -56,8 +56,8 @@ PAGE = 4096
 LOG_HEADER = 64  # bytes of a log's half before its records
 _MAX_HEADER = 64 << 20
 _PIECE = 1 << 20
-# Bytes from which a journal is written once as zeros: the faults of its pages, one by one, take five times as long.
-# Of a smaller one a short recording touches a few pages only.
+# Bytes from which a journal is written once as zeros, so that its pages are not faulted in one by one. Of a smaller one
+# a short recording touches a few pages only.
 _WORTH_ZEROS = 2 << 20
 _UUID = re.compile("[0-9a-f]{32}")
 

@@ -178,8 +178,8 @@ def check_crc(values: Mapping[str, str], known: Collection[str], where: str) -> 
     """The pairs without `crc`.
 
     Raises:
-        FormatError: `crc` differs, or is missing where there are others than the `known` keys: the first recordings
-            had none, but a damaged key must not pass for a missing one.
+        FormatError: `crc` differs, or is missing where there are others than the `known` keys: recordings may
+            have none, but a damaged key must not pass for a missing one.
     """
     pairs = {key: value for key, value in values.items() if key != _KEY}
     if _KEY not in values:
