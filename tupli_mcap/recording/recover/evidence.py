@@ -139,11 +139,11 @@ class Evidence:
             self.pieces[channel] = kept
         return left
 
-    def add_rows(self, channel: int, found: Iterable[Rows]) -> None:
+    def add_rows(self, channel: int, batches: Iterable[Rows]) -> None:
         """Takes rows that are in memory."""
         self.add(
             channel,
-            [self.load(rows, channel, rows.first, len(rows.offsets), len(rows.data)) for rows in found],
+            [self.load(rows, channel, rows.first, len(rows.offsets), len(rows.data)) for rows in batches],
         )
 
     def load(self, place: Rows | RepairedChunk, channel: int, first: int, rows: int, size: int) -> Piece:
@@ -169,13 +169,13 @@ class Evidence:
 
     def ranges(self, channel: int) -> list[tuple[int, int]]:
         """The rows of a channel that are here, as half-open ranges."""
-        found: list[tuple[int, int]] = []
+        ranges: list[tuple[int, int]] = []
         for piece in self.pieces.get(channel, []):
-            if found and found[-1][1] == piece.first:
-                found[-1] = (found[-1][0], piece.stop)
+            if ranges and ranges[-1][1] == piece.first:
+                ranges[-1] = (ranges[-1][0], piece.stop)
             else:
-                found.append((piece.first, piece.stop))
-        return found
+                ranges.append((piece.first, piece.stop))
+        return ranges
 
 
 class RecordedChannels(NamedTuple):
@@ -191,14 +191,14 @@ class RecordedChannels(NamedTuple):
     @classmethod
     def of(cls, evidence: Evidence, layout: StepLayout) -> RecordedChannels:
         """The channels of a recording, by their topics."""
-        found = step_channels(evidence.channels, evidence.source.name)
+        steps = step_channels(evidence.channels, evidence.source.name)
         topics = {channel.topic: channel.id for channel in evidence.channels.values()}
         images = {
-            leaf.name: [topics.get(Topics.of_step(channel.topic).image(leaf.name)) for channel in found]
+            leaf.name: [topics.get(Topics.of_step(channel.topic).image(leaf.name)) for channel in steps]
             for leaf in layout.images
         }
         names = (EPISODE_START, EPISODE_END, FINAL_STATE, INFO)
-        return cls([channel.id for channel in found], images, *(topics.get(name) for name in names))
+        return cls([channel.id for channel in steps], images, *(topics.get(name) for name in names))
 
 
 class PackedStore(ChunkStore):

@@ -90,8 +90,8 @@ def _statistics(source: Source, summary: Summary) -> Statistics | None:
     data = source.read(summary.start, source.size - len(MAGIC) - FOOTER_SIZE - summary.start)
     for opcode, position, body in records(data, summary.start, source.name):
         if opcode == Opcode.STATISTICS:
-            found: Statistics = parse_record(opcode, body, position, source.name)
-            return found
+            statistics: Statistics = parse_record(opcode, body, position, source.name)
+            return statistics
     return None
 
 
@@ -128,7 +128,7 @@ def _length_at(source: Source, place: int) -> int:
     if source.read(place, 1) != b"\x09" or length > source.size - place - 9:
         return 0
     try:
-        found = attachment_index(source, place, length)
+        attachment = attachment_index(source, place, length)
     except FormatError:
         return 0
-    return length if (found.name, found.media_type) == (INDEX_NAME, INDEX_MEDIA_TYPE) else 0
+    return length if (attachment.name, attachment.media_type) == (INDEX_NAME, INDEX_MEDIA_TYPE) else 0
