@@ -87,7 +87,7 @@ def _run(numbers: Array, first: int, whole: Array) -> int:
 
 
 def rows_among(committed: Committed[Taken], wanted: Array) -> list[Taken]:
-    """All rows of which the mask `wanted` says so, whichever are missing: in runs of consecutive ones."""
+    """The whole rows that the mask `wanted` names, in runs of consecutive ones."""
     places = np.flatnonzero(wanted & committed.whole)
     edges = np.flatnonzero(np.diff(committed.numbers[places]) != 1) + 1
     return [committed.take(part) for part in np.split(places, edges) if len(part)]

@@ -82,7 +82,7 @@ def recorded_journal(path: Path, metadata: Mapping[str, str]) -> Path:
     """Where the journal of a recording with this metadata lies: beside it, or where it says.
 
     Raises:
-        FormatError: it says a place that no writer chooses: somebody else's recording must not name any file.
+        FormatError: it names a place that no writer chooses: a recording from somebody else must not name any file.
     """
     if "journal" not in metadata:
         return journal_path(path)
@@ -390,7 +390,7 @@ def owner_among(path: Path, uuids: Collection[str]) -> str:
 
 
 def _open(path: Path) -> BinaryIO:
-    """Opened for reading; where it lies may have been told by a file from somebody else."""
+    """Opens a journal for reading. Its path may come from a recording that somebody else made."""
     try:
         return os.fdopen(open_regular(path), "rb")
     except ValueError as err:  # a NUL in the path

@@ -61,7 +61,7 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
     """The records of a chunk of ours, which had `packed` bytes.
 
     Raises:
-        FormatError: it holds other than definitions and then messages, of one channel, in the order of their rows.
+        FormatError: it does not hold definitions, and then messages of one channel in the order of their rows.
     """
     skip, schemas, channels = 0, [], []
     while skip + 9 <= len(data) and data[skip] in (Opcode.SCHEMA, Opcode.CHANNEL):

@@ -262,15 +262,15 @@ def _is_stack(entry: Any) -> bool:
 
 def _as_stack(leaf: Leaf, stacks: Collection[Stack]) -> Leaf:
     """The leaf as the stack that `stacks` say it is, if any."""
-    found = replace(leaf, kind="stack", frames_last=leaf.name not in stacks)
-    if stack_of(found) not in stacks:
+    stack = replace(leaf, kind="stack", frames_last=leaf.name not in stacks)
+    if stack_of(stack) not in stacks:
         return leaf
-    if not can_stack(found):
+    if not can_stack(stack):
         raise SpaceError(
             f"{leaf.path}: expected 2 to {MAX_FRAMES} uint8 frames of shape (H, W) or (H, W, 1, 3 or 4) "
-            f"along the {'last' if found.frames_last else 'first'} axis of a stack, found {leaf.space}"
+            f"along the {'last' if stack.frames_last else 'first'} axis of a stack, found {leaf.space}"
         )
-    return found
+    return stack
 
 
 def _entry(metadata: Mapping[str, str], key: str) -> str:

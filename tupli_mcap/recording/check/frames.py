@@ -70,8 +70,8 @@ class _Pair:
         known = self._rows["episode"][order].astype(np.int64)
         lengths = np.append(self._rows["length"][order].astype(np.int64), -1)
         at = np.searchsorted(known, episodes)
-        there = np.append(known, -1)[at] == episodes
-        lost = int((~there | (steps > lengths[at])).sum())
+        is_known = np.append(known, -1)[at] == episodes
+        lost = int((~is_known | (steps > lengths[at])).sum())
         if lost and self._recording.complete:
             self._findings.note(
                 "frame",

@@ -1,4 +1,4 @@
-"""A signature, held against all that it covers.
+"""Checks a signature against everything that it covers.
 
 The manifest covers what is read from a file, not its bytes: chunks may be compressed anew, and attachments that were
 added since (a replay certificate, a quality card) are named as not covered.
@@ -74,15 +74,15 @@ def verify_signature(recording: Recording, walk: Structure | None = None) -> Sig
         raise SignatureError(f"{name}: its signature was not made by the key {fingerprint} that it names")
     if not recording.complete:
         raise SignatureError(f"{name}: what was signed is finished, this recording is not")
-    found = manifest(recording)
-    _compare(signed.manifest, found, f"{name}, signed by {fingerprint}")
-    check_readers(recording, found["attachments"], walk)
+    current = manifest(recording)
+    _compare(signed.manifest, current, f"{name}, signed by {fingerprint}")
+    check_readers(recording, current["attachments"], walk)
     names = {key.public_key: key.name for key in trust.trusted_keys()}
     not_covered = tuple(
         sorted(recording.attachments.keys() - {*signed.manifest["attachments"], SIGNATURE_NAME})
     )
     return Signature(
-        signed.public_key, fingerprint, names.get(signed.public_key), found["environment"], not_covered
+        signed.public_key, fingerprint, names.get(signed.public_key), current["environment"], not_covered
     )
 
 
@@ -152,30 +152,30 @@ def check_readers(recording: Recording, covered: Container[str], walk: Structure
         )
 
 
-def _compare(signed: Mapping[str, Any], found: Mapping[str, Any], where: str) -> None:
+def _compare(signed: Mapping[str, Any], current: Mapping[str, Any], where: str) -> None:
     """Raises SignatureError at the first difference; new attachments that nothing is rebuilt from are none."""
     for part in ("format", "version", "recording", "environment"):
-        if signed.get(part) != found[part]:
+        if signed.get(part) != current[part]:
             raise SignatureError(
-                f"{where}: its {part} was changed: expected {signed.get(part)!r:.100}, found {found[part]!r:.100}"
+                f"{where}: its {part} was changed: expected {signed.get(part)!r:.100}, found {current[part]!r:.100}"
             )
     for part, noun in (("attachments", "attachment"), ("channels", "channel")):
         expected = signed.get(part)
         if not isinstance(expected, dict):
             raise FormatError(f"{where}: the manifest lists no {part}")
         for name, value in expected.items():
-            if name not in found[part]:
+            if name not in current[part]:
                 raise SignatureError(f"{where}: the {noun} {name!r:.100} that was signed is missing")
-            if found[part][name] != value:
+            if current[part][name] != value:
                 raise SignatureError(
-                    f"{where}: the {noun} {_named(found[part][name], name)} was changed after signing"
+                    f"{where}: the {noun} {_named(current[part][name], name)} was changed after signing"
                 )
-        for name in found[part].keys() - expected.keys():
+        for name in current[part].keys() - expected.keys():
             if part == "channels" or is_covered_kind(name):
                 raise SignatureError(
-                    f"{where}: the {noun} {_named(found[part][name], name)} was added after signing"
+                    f"{where}: the {noun} {_named(current[part][name], name)} was added after signing"
                 )
-    if signed.get("episodes") != found["episodes"]:
+    if signed.get("episodes") != current["episodes"]:
         raise SignatureError(f"{where}: the episode index was changed after signing")
 
 

@@ -76,8 +76,13 @@ def write(
     signed: bool,
     left_out: Sequence[str] = (),
 ) -> int:
-    """Writes a recording of some of a source's episodes, other than the attachments `left_out`; returns how many chunks
-    were copied. A signature is kept if the contents are still what was `signed`."""
+    """Writes some of a source's episodes, and its attachments but those `left_out`, to a new recording.
+
+    `signed`: the episodes are still those that were signed; a signature is kept then, if the attachments allow it.
+
+    Returns:
+        How many chunks were copied as they are.
+    """
     kept = {name: info for name, info in source.attachments.items() if name not in attachments}
     if not (signed and stays_signed(source.attachments, attachments)):
         kept.pop(SIGNATURE_NAME, None)
@@ -131,9 +136,9 @@ def camera_channels(
     """By camera, then by sub-environment, the ids of its channels; those of a new camera are added."""
     cameras = source.file.cameras
     envs = range(source.num_envs)
-    found = {name: [cameras.channels(name, env) for env in envs] for name in cameras.names}
-    if new is not None and new.camera not in found:
+    channels = {name: [cameras.channels(name, env) for env in envs] for name in cameras.names}
+    if new is not None and new.camera not in channels:
         vector = source.num_envs if source.is_vector else None
         where = (container, source.name, source.layout, vector, None, (new.camera,))
-        found[new.camera] = register_channels(*where, png_leaves(source.file.contents.channels)).cameras
-    return found
+        channels[new.camera] = register_channels(*where, png_leaves(source.file.contents.channels)).cameras
+    return channels

@@ -62,7 +62,7 @@ class _FoundChunk(NamedTuple):
     offset: int
     length: int
     piece: Piece
-    repaired: str  # what is wrong in its header
+    repaired: str  # what is wrong with its header
 
 
 def _check_index(evidence: Evidence, record: Found, records: ChunkRecords) -> None:
@@ -72,7 +72,7 @@ def _check_index(evidence: Evidence, record: Found, records: ChunkRecords) -> No
 
 
 def _add_damage(evidence: Evidence, record: Found, why: str) -> None:
-    """What is wrong with a record that is whole."""
+    """Notes as damage what a whole record says wrongly."""
     evidence.damages.append(Damage(record.offset, record.offset + record.length, why, record.opcode))
 
 
@@ -142,7 +142,7 @@ def _take_chunk(
 
 
 def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> None:
-    """Takes the chunks of a channel, in whatever order they lie in the file."""
+    """Takes the chunks of a channel, in any order."""
     left_out = set(evidence.add(channel, [chunk.piece for chunk in chunks]))
     for chunk in chunks:
         if chunk.piece in left_out:
@@ -153,7 +153,7 @@ def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> N
 
 
 def may_be_recording(source: Source, tail: Tail) -> bool:
-    """Whether the file is to be looked at as one of ours: False if it says that it is something else."""
+    """Whether the file may be one of ours: False if it says that it is something else."""
     if tail.index is not None or source.size < len(MAGIC) + 9:
         return True
     if tail.summary is not None and RECORDING_METADATA in tail.summary.metadata:
@@ -168,6 +168,6 @@ def may_be_recording(source: Source, tail: Tail) -> bool:
 
 
 def is_recording(evidence: Evidence) -> bool:
-    """Whether the file is one of ours, as far as it can be told."""
+    """Whether anything in the file shows that it is one of ours."""
     known = evidence.profile == PROFILE or evidence.metadata is not None or evidence.tail.index is not None
     return known or any("observation_space" in channel.metadata for channel in evidence.channels.values())

@@ -42,7 +42,7 @@ class Start(NamedTuple):
 
 
 class End(NamedTuple):
-    """The same of an end."""
+    """The end of an episode, in the same way."""
 
     time: int
     end: EpisodeEnd
@@ -53,7 +53,7 @@ class End(NamedTuple):
 class EpisodeRecords:
     """What the messages of the episode channels and the index say, by episode.
 
-    `resets` are those without a step before an episode's. `ignored` are ends whose steps are not all here.
+    `resets` are those before an episode that no step followed. `ignored` are ends whose steps are not all left.
     """
 
     starts: dict[int, Start] = field(default_factory=dict)
@@ -65,11 +65,11 @@ class EpisodeRecords:
 
 
 class PlannedEpisode(NamedTuple):
-    """An episode that there is. `whole`: all of it is here.
+    """An episode of the recovered recording. `whole`: all of the old one is left.
 
     `head`, `tail`: its first step was the old one's first, its last one the old one's last. `length`: of the old
     episode, None if not known. `final`: its row in `/final_state` (as packed), RUNNING, IN_A_HOLE, or None if there is
-    none. `orphan`: metadata of the old episode, whose last step is not here. `resets`: without a step, before it.
+    none. `orphan`: metadata of the old episode, whose last step is lost. `resets`: those before it without a step.
     """
 
     number: int
@@ -103,7 +103,7 @@ class Plan:
 
 
 class NewPlaces:
-    """The episodes that are made of each old one, by the steps that they have of it."""
+    """Finds steps of old episodes in the episodes that were made of them."""
 
     def __init__(self, episodes: Iterable[PlannedEpisode]) -> None:
         self._of: dict[int, list[PlannedEpisode]] = {}
@@ -131,7 +131,7 @@ def final_state(evidence: Evidence, episode: PlannedEpisode) -> bytes:
 
 
 def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channels: RecordedChannels) -> Plan:
-    """Decides what becomes of every row that is here.
+    """Decides which episode each row that is left belongs to.
 
     Raises:
         FormatError: with `evidence.strict`, a step, a start or an end cannot be decoded.
@@ -208,7 +208,7 @@ def _add_index(records: EpisodeRecords, index: EpisodeIndex | None) -> None:
 
 
 def _totals(evidence: Evidence, channels: RecordedChannels, records: EpisodeRecords) -> list[int]:
-    """Rows that each sub-environment had, as far as anything tells."""
+    """Rows that each sub-environment had, as far as the file shows."""
     totals = [evidence.stop(channel) for channel in channels.steps]
     statistics = evidence.tail.statistics
     for env, channel in enumerate(channels.steps):

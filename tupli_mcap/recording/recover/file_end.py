@@ -1,4 +1,4 @@
-"""What the end of a file says of the rest: summary and episode index, each with a CRC; either may be missing."""
+"""Reads the summary and the episode index at the end of a file, each by itself: either may be missing or damaged."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Tail:
 
 
 def read_tail(source: Source) -> Tail:
-    """Reads what is there and good; raises nothing for what is not."""
+    """Reads both; raises nothing for what is missing or damaged."""
     tail = Tail(finished=has_summary(source))
     if tail.finished:
         try:

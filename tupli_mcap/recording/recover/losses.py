@@ -1,4 +1,4 @@
-"""What is not here of a damaged recording: steps, by episode, as far as anything tells."""
+"""Which steps of a damaged recording are lost, by episode, as far as the rest of it shows."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _of_episode(plan: Plan, number: int, runs: list[StepRun], *, ended: bool) ->
 
 
 def _is_in_a_hole(plan: Plan, number: int) -> bool:
-    """Whether an episode of which only the start is here had steps that are not."""
+    """Whether an episode whose start alone is left had steps."""
     start = plan.records.starts[number].start
     kept = plan.kept.get(start.env, [])
     after = bisect.bisect_right(kept, (start.first_row, _END))

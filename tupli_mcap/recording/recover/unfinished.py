@@ -117,7 +117,7 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
 
 
 class _Made:
-    """Messages that are made, behind those of their channels that are there."""
+    """Messages that the writer did not come to write; they follow the others of their channels."""
 
     def __init__(self, store: PackedStore) -> None:
         self._store = store
