@@ -1,4 +1,4 @@
-"""Message records of variable size in the journal: the events of all channels. Steps of variable size: `step_log`.
+"""Message records of variable size in the journal: the events of all channels, and how a log is put into chunks.
 
 A log half is a u64 end offset and the records before it. The end is stored after the bytes, in one machine word: it
 commits them. A log of events says, too, how long the file was when it took up what the log held before.
