@@ -50,7 +50,7 @@ from tupli_mcap.messages.variable.nested_codecs import (
     with_dummy,
 )
 from tupli_mcap.messages.variable.widening import EDGE_LINKS
-from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry
+from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry, camel
 
 __all__ = ["VariableField"]
 
@@ -183,7 +183,7 @@ class _Builder:
         decoders: list[Decode] = []
         for key, sub in entries:
             name = names.take(str(key) if is_dict else f"item_{key}")
-            codec = make(sub, type_name + _camel(name), f"{path}[{key!r}]", depth + 1)
+            codec = make(sub, type_name + camel(name), f"{path}[{key!r}]", depth + 1)
             fields.append((codec.ros, name))
             steps.append((key, f"[{key!r}]", codec.encode))
             decoders.append(codec.decode)
@@ -233,7 +233,3 @@ class _Builder:
 def _check_depth(path: str, depth: int) -> None:
     if depth > _MAX_DEPTH:
         raise SpaceError(f"{path}: a space nested more than {_MAX_DEPTH} deep cannot be recorded")
-
-
-def _camel(name: str) -> str:
-    return "".join(part.capitalize() for part in name.split("_"))

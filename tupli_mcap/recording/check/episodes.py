@@ -14,7 +14,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import messages
 from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
+from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
@@ -333,8 +333,8 @@ class _Checker:
 
 
 def _end_of(facts: StepFacts) -> Array:
-    """What the flags of each row say an episode's end would be (0 terminal, 1 timeout, 2 interrupted)."""
-    return np.where(facts.terminal != 0, 0, np.where(facts.timeout != 0, 1, 2))
+    """How each row would end its episode, by its flags."""
+    return np.where(facts.terminal != 0, TERMINAL, np.where(facts.timeout != 0, TIMEOUT, INTERRUPTED))
 
 
 def _plain(err: FormatError, recording: Recording) -> str:
