@@ -815,7 +815,7 @@ def test_of_a_long_recording_a_sketch_reads_a_few_chunks(
         chunk = recording._store.chunk
         monkeypatch.setattr(recording._store, "chunk", lambda i, **kw: loaded.add(i) or chunk(i, **kw))
         found = sketch(recording, 10)
-        assert 160 <= found.sampled < 1500
+        assert found.sampled == 160
         chunks = recording._store.chunks(recording._topics["/step"])
         assert 0 < len(loaded) < len(chunks)
     assert f"{found.sampled} steps sampled" in run("info", path)[1]

@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
-from fuzzing.model import Model
+from fuzzing.model import Model, footer
 
 from tupli_mcap import (
     FileStorage,
@@ -618,3 +618,13 @@ def test_a_chunk_of_too_many_messages_is_left_early() -> None:
     with pytest.raises(FormatError, match="expected at most 1600 messages"):
         chunk_records(memoryview(data + b"no message"), "the chunk", packed=100)
     assert len(message_headers(memoryview(data))) == 10_000
+
+
+@pytest.mark.parametrize("size", [0, 9, 18])
+def test_a_summary_offset_of_another_size_is_found(size: int, tmp_path: Path) -> None:
+    path = place("constant_zstd", tmp_path)
+    data = path.read_bytes()
+    start, offsets = struct.unpack_from("<QQ", data, len(data) - 28)
+    summary = data[start : len(data) - 37] + struct.pack("<BQ", Opcode.SUMMARY_OFFSET, size) + bytes(size)
+    path.write_bytes(data[:start] + summary + footer(start, offsets, summary))
+    assert f"a summary offset has {size} bytes, not 17" in said(verify_recording(path))

@@ -42,11 +42,12 @@ from tupli_mcap.cli import app
 from tupli_mcap.doctor import examine
 from tupli_mcap.environment import named_imports
 from tupli_mcap.messages import encode_rows as encoder
-from tupli_mcap.recording.check.signature import check_signature
+from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.description import describe
 from tupli_mcap.recording.edit.repair import recover_recording
 from tupli_mcap.recording.sign.carried_code import carried_code
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.replay import certify, render
 from tupli_mcap.viewer.foxglove_layout import write_layout
 
@@ -232,7 +233,8 @@ def _with(path: Path, function: Callable[[Recording], Any]) -> Any:
 def _facts(recording: Recording) -> None:
     describe(recording)
     repr((recording, recording.metadata, recording.all_metadata(), recording.observation_space))
-    check_signature(recording)
+    if SIGNATURE_NAME in recording.attachments:
+        verify_signature(recording)
     _tolerant(lambda: recording.labels)
 
 

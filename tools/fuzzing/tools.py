@@ -13,13 +13,11 @@ from typing import Any
 from unittest import mock
 
 from fuzzing.oracle import UnexpectedError, observe
-from tupli_mcap.cli.app import app
+from tupli_mcap.cli import app
 from tupli_mcap.dataset import TupliDataset
 from tupli_mcap.doctor import examine
 from tupli_mcap.errors import TupliError
-from tupli_mcap.recording import journal_path
-from tupli_mcap.recording.check.verify import verify_recording
-from tupli_mcap.recording.edit.repair import recover_recording
+from tupli_mcap.recording import journal_path, recover_recording, verify_recording
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.listing import list_recordings
 

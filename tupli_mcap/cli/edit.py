@@ -12,7 +12,7 @@ from tupli_mcap.cli.output import Column, bytes_of, counted, number, print_json,
 from tupli_mcap.cli.terminal import say
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.edit.repair import RecoveryReport
+    from tupli_mcap.recording import RecoveryReport
 
 __all__ = ["filter_", "merge", "recover", "split"]
 
@@ -44,7 +44,7 @@ def merge(
     later one follow the others, and rows that may not go back in time get a later one; a warning says how many.
     The new recording has ids of its own, the environment of the first one, and no signature.
     """
-    from tupli_mcap.recording.edit.merge import merge_recordings
+    from tupli_mcap.recording import merge_recordings
 
     report = merge_recordings(files, output, overwrite=force, dry_run=dry_run)
     if as_json:
@@ -69,7 +69,7 @@ def split(
     """
     if (episodes is None) == (max_bytes is None):
         raise typer.BadParameter("expected either --episodes or --max-bytes")
-    from tupli_mcap.recording.edit.merge import split_recording
+    from tupli_mcap.recording import split_recording
 
     parts = split_recording(file, output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
     if as_json:
@@ -94,7 +94,7 @@ def filter_(
 
     They keep their ids. A signature is left out.
     """
-    from tupli_mcap.dataset.curate import filter_recording
+    from tupli_mcap.dataset import filter_recording
 
     report = filter_recording(file, output, filter_text, overwrite=force, dry_run=dry_run)
     if as_json:
@@ -129,7 +129,7 @@ def recover(
     episode and step; an episode that lost steps in the middle becomes several. Exit code 1 only if nothing
     could be saved, or no step of a recording that had some.
     """
-    from tupli_mcap.recording.edit.repair import recover_recording
+    from tupli_mcap.recording import recover_recording
 
     report = recover_recording(file, output, overwrite=force, dry_run=dry_run)
     if as_json:

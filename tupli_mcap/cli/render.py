@@ -17,8 +17,7 @@ from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording import Recording
-    from tupli_mcap.recording.episode import Episode
+    from tupli_mcap.recording import Episode, Recording
     from tupli_mcap.replay import RenderReport
     from tupli_mcap.schema import BaseFilter
 

@@ -16,7 +16,7 @@ from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import TupliError
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.check.report import VerifyReport
+    from tupli_mcap.recording import VerifyReport
     from tupli_mcap.replay import Certificate
 
 __all__ = ["verify"]

@@ -2,7 +2,7 @@
 
 file        the mapped file, its areas, and who it belongs to
 rows        rows of constant size: how many make a half, and what is filled in when they go to the file
-logs        records of variable size: append, and read back
+logs        records of variable size: append, and group by channel
 committed   what a reader takes out of a journal: `rows_of`, the running states
 derive      starts, ends and final states, which the recorder makes from rows when these go to the file
 seals       which rows count after a power loss

@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.file import JournalContents, LogArea
+from tupli_mcap.journal.file import LOG_HEADER, JournalContents, LogArea
 from tupli_mcap.journal.logs import as_rows
 from tupli_mcap.journal.seals import SECTOR, STATE, checksum, seal_of
 from tupli_mcap.mcap.container import Rows
@@ -87,7 +87,7 @@ def _run(numbers: Array, first: int, whole: Array) -> int:
 
 
 def rows_among(committed: Committed[Taken], wanted: Array) -> list[Taken]:
-    """All rows of which the mask `wanted` says so, whichever are missing: in runs of consecutive ones."""
+    """The whole rows that the mask `wanted` names, in runs of consecutive ones."""
     places = np.flatnonzero(wanted & committed.whole)
     edges = np.flatnonzero(np.diff(committed.numbers[places]) != 1) + 1
     return [committed.take(part) for part in np.split(places, edges) if len(part)]
@@ -288,7 +288,7 @@ def _half(contents: JournalContents, area: LogArea, half: int) -> memoryview:
     end = int(raw[start : start + 8].view("<u8")[0])
     if end > area.capacity:
         raise FormatError(f"the journal's area {area.name!r} claims {end} bytes of {area.capacity}")
-    return memoryview(raw.data)[start + 64 : start + 64 + end]
+    return memoryview(raw.data)[start + LOG_HEADER : start + LOG_HEADER + end]
 
 
 def running_record(contents: JournalContents, name: str, sequence: int, layout: StepLayout) -> bytes | None:
@@ -296,7 +296,7 @@ def running_record(contents: JournalContents, name: str, sequence: int, layout: 
     not here."""
     area = contents.log_area(name)
     for half in range(area.halves):
-        start = half * area.half + 64 + len(_half(contents, area, half))
+        start = half * area.half + LOG_HEADER + len(_half(contents, area, half))
         raw = memoryview(contents.data[area.name].data)[start : (half + 1) * area.half]
         if len(raw) < BODY:
             continue

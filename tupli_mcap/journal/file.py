@@ -49,13 +49,15 @@ __all__ = [
 ]
 
 MAGIC = b"TMCAPJ1\0"
+EVENT_AREAS = "events", "info"
+FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name
 _HEAD = struct.Struct("<8sII")
 PAGE = 4096
-_LOG_HEADER = 64
+LOG_HEADER = 64  # bytes of a log's half before its records
 _MAX_HEADER = 64 << 20
 _PIECE = 1 << 20
-# Bytes from which a journal is written once as zeros: the faults of its pages, one by one, take five times as long.
-# Of a smaller one a short recording touches a few pages only.
+# Bytes from which a journal is written once as zeros, so that its pages are not faulted in one by one. Of a smaller one
+# a short recording touches a few pages only.
 _WORTH_ZEROS = 2 << 20
 _UUID = re.compile("[0-9a-f]{32}")
 
@@ -80,7 +82,7 @@ def recorded_journal(path: Path, metadata: Mapping[str, str]) -> Path:
     """Where the journal of a recording with this metadata lies: beside it, or where it says.
 
     Raises:
-        FormatError: it says a place that no writer chooses: somebody else's recording must not name any file.
+        FormatError: it names a place that no writer chooses: a recording from somebody else must not name any file.
     """
     if "journal" not in metadata:
         return journal_path(path)
@@ -127,7 +129,7 @@ class LogArea(NamedTuple):
 
     @property
     def half(self) -> int:
-        return _LOG_HEADER + self.capacity
+        return LOG_HEADER + self.capacity
 
     @property
     def size(self) -> int:
@@ -388,7 +390,7 @@ def owner_among(path: Path, uuids: Collection[str]) -> str:
 
 
 def _open(path: Path) -> BinaryIO:
-    """Opened for reading; where it lies may have been told by a file from somebody else."""
+    """Opens a journal for reading. Its path may come from a recording that somebody else made."""
     try:
         return os.fdopen(open_regular(path), "rb")
     except ValueError as err:  # a NUL in the path
@@ -423,7 +425,3 @@ def _area(entry: Mapping[str, Any]) -> Area:
     if type(entry["name"]) is not str or any(type(n) is not int or not 0 < n < 1 << 48 for n in sizes):
         raise ValueError(entry)
     return RowArea(**values) if entry["kind"] == "rows" else LogArea(**values)
-
-
-EVENT_AREAS = "events", "info"
-FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name

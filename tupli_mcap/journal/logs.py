@@ -1,4 +1,4 @@
-"""Message records of variable size in the journal: the events of all channels. Steps of variable size: `step_log`.
+"""Message records of variable size in the journal: the events of all channels, and how a log is put into chunks.
 
 A log half is a u64 end offset and the records before it. The end is stored after the bytes, in one machine word: it
 commits them. A log of events says, too, how long the file was when it took up what the log held before.
@@ -14,7 +14,7 @@ from zlib import crc32
 
 import numpy as np
 
-from tupli_mcap.journal.file import Journal
+from tupli_mcap.journal.file import LOG_HEADER, Journal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
 
@@ -29,7 +29,6 @@ __all__ = [
 ]
 
 Sink = Callable[[Rows], None]
-LOG_HEADER = 64  # bytes of a half before its records
 FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
 _LOG_TIME = FRONT.size - 8
 

@@ -61,7 +61,7 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
     """The records of a chunk of ours, which had `packed` bytes.
 
     Raises:
-        FormatError: it holds other than definitions and then messages, of one channel, in the order of their rows.
+        FormatError: it does not hold definitions, and then messages of one channel in the order of their rows.
     """
     skip, schemas, channels = 0, [], []
     while skip + 9 <= len(data) and data[skip] in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -100,7 +100,7 @@ def message_headers(data: memoryview, most: int | None = None) -> Array:
     return found
 
 
-def message_places(data: Any, most: int | None = None) -> Array:
+def message_places(data: Any, most: int | None) -> Array:
     """Where consecutive Message records begin and end: int64 (records, 2). FormatError as `message_headers`."""
     starts, at, size, length_at = [], 0, len(data), _LENGTH.unpack_from
     for _ in itertools.count() if most is None else range(most):

@@ -31,10 +31,10 @@ _private: set[int] = set()
 _files: weakref.WeakSet[io.FileIO] = weakref.WeakSet()
 
 
-def open_private(path: str | os.PathLike[str], flags: int, mode: int = 0o666) -> int:
+def open_private(path: str | os.PathLike[str], flags: int) -> int:
     """A descriptor that children do not get, neither those that go on as a copy nor those that start a program."""
     with _guard:
-        fd = os.open(path, flags | os.O_CLOEXEC, mode)
+        fd = os.open(path, flags | os.O_CLOEXEC, 0o666)
         _private.add(fd)
     return fd
 

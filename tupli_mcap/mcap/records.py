@@ -178,8 +178,8 @@ def check_crc(values: Mapping[str, str], known: Collection[str], where: str) -> 
     """The pairs without `crc`.
 
     Raises:
-        FormatError: `crc` differs, or is missing where there are others than the `known` keys: the first recordings
-            had none, but a damaged key must not pass for a missing one.
+        FormatError: `crc` differs, or is missing where there are others than the `known` keys: recordings may
+            have none, but a damaged key must not pass for a missing one.
     """
     pairs = {key: value for key, value in values.items() if key != _KEY}
     if _KEY not in values:
@@ -272,12 +272,13 @@ def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
     return data
 
 
-def iter_records(data: memoryview, start: int = 0) -> Iterator[tuple[int, int, int, int, int]]:
+def iter_records(data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
     """(offset, end, channel, sequence, log_time) of the Message records in `data`.
 
     Raises:
         FormatError: bytes that are no whole Message record.
     """
+    start = 0
     while start < len(data):
         if start + BODY > len(data):
             raise FormatError(f"expected a message record at byte {start}, found {len(data) - start} bytes")

@@ -103,7 +103,7 @@ class PathSource:
 
     def read(self, offset: int, length: int) -> bytes:
         self._check(offset, length)
-        data = _refusals_told(self.name, offset, length, lambda: self._read(offset, length))
+        data = _read_or_refused(self.name, offset, length, lambda: self._read(offset, length))
         if len(data) != length:
             raise self._too_short(offset, length)
         return data
@@ -117,7 +117,7 @@ class PathSource:
             found = os.preadv(self._fd, [buffer], offset)
         except OSError:
             found = -1
-        return buffer if found == length else memoryview(self.read(offset, length))  # which tells of refusals
+        return buffer if found == length else memoryview(self.read(offset, length))  # which raises the error
 
     def view(self, offset: int, length: int) -> memoryview:
         self._check(offset, length)
@@ -199,7 +199,7 @@ class FileSource:
                 f"{self.name} was opened by the process that this one was forked from; open it again here"
             )
         with self._lock if self._fd < 0 else contextlib.nullcontext():
-            data = _refusals_told(self.name, offset, length, lambda: self._read(offset, length))
+            data = _read_or_refused(self.name, offset, length, lambda: self._read(offset, length))
         if len(data) != length:
             raise FormatError(f"{self.name}: expected {length} bytes at offset {offset}, found {len(data)}")
         return data
@@ -230,7 +230,7 @@ def _is_system_file(file: BinaryIO) -> bool:
     return type(raw) is io.FileIO and not file.closed
 
 
-def _refusals_told(name: str, offset: int, length: int, read: Callable[[], _T]) -> _T:
+def _read_or_refused(name: str, offset: int, length: int, read: Callable[[], _T]) -> _T:
     """What `read` gives; a disk or a connection that fails is no defect of the file."""
     try:
         return read()

@@ -1,4 +1,4 @@
-"""What is read when a recording is opened: footer, summary, and the episode index."""
+"""What is read first of a finished file: its footer and its summary."""
 
 from __future__ import annotations
 

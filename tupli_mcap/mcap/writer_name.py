@@ -8,7 +8,7 @@ from importlib.metadata import version
 __all__ = ["library"]
 
 
-@functools.cache  # reading it takes a millisecond
+@functools.cache  # it is read from the disk
 def library() -> str:
     """The name and the version of this program."""
     return f"tupli-mcap {version('tupli-mcap')}"

@@ -46,30 +46,30 @@ class BatchDecoder:
             return {LOG_TIME: _log_times(data, records)}
         try:
             fields = _Fields(data, records)
-            found = self._leaves(fields, self._layout.step_leaves, names)
+            columns = self._leaves(fields, self._layout.step_leaves, names)
             flags = {name: fields.take(_BOOL, 1) for name in ("terminal", "timeout")}
             fields.end()
         except FormatError:
             self._explain(data, records, self._single.step)
             raise
-        found |= {name: flag for name, flag in flags.items() if name in names}
-        return found | ({LOG_TIME: _log_times(data, records)} if LOG_TIME in names else {})
+        columns |= {name: flag for name, flag in flags.items() if name in names}
+        return columns | ({LOG_TIME: _log_times(data, records)} if LOG_TIME in names else {})
 
     def finals(self, data: Any, records: Array, names: Collection[str]) -> dict[str, Any]:
         """Columns of final states, as those of steps, and `episode` (uint32)."""
         try:
             fields = _Fields(data, records)
-            found = self._leaves(fields, self._layout.final_leaves, names)
+            columns = self._leaves(fields, self._layout.final_leaves, names)
             fields.end()
         except FormatError:
             self._explain(data, records, self._single.final)
             raise
         if "episode" in names:
-            found["episode"] = fields.episodes
-        return found
+            columns["episode"] = fields.episodes
+        return columns
 
     def _leaves(self, fields: _Fields, leaves: Iterable[Leaf], names: Collection[str]) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        columns: dict[str, Any] = {}
         for leaf in leaves:
             wanted = leaf.name in names
             values: Any
@@ -82,8 +82,8 @@ class BatchDecoder:
             else:
                 continue
             if wanted:
-                found[leaf.name] = values
-        return found
+                columns[leaf.name] = values
+        return columns
 
     def _explain(self, data: Any, records: Array, decode: Callable[[memoryview], object]) -> None:
         """Raises the error that decoding one message after the other has."""
@@ -146,19 +146,19 @@ class _Fields:
             return []
         whole = bytes(self._data)
         stored = [whole[a:b] for a, b in zip(begin, self._at.tolist(), strict=True)]
-        known = {each: cdr.decode_string(each, 0) for each in set(stored)}  # many are alike
-        return [known[each] for each in stored]
+        decoded = {text: cdr.decode_string(text, 0) for text in set(stored)}  # many are alike
+        return [decoded[text] for text in stored]
 
     def each(self, decode: Callable[[memoryview, int, int], tuple[Any, int]]) -> list[Any]:
         """A value of each message, and where it ends, by a function of a body and an offset in it."""
-        view, found, places = memoryview(self._data), [], []
+        view, values, places = memoryview(self._data), [], []
         for body, at, end in zip(self._bodies.tolist(), self._at.tolist(), self._ends.tolist(), strict=True):
             value, offset = decode(view[body:end], at - body, 0)
-            found.append(value)
+            values.append(value)
             places.append(body + offset)
         self._at = np.array(places, np.int64)
         self._aligned = 1
-        return found
+        return values
 
     def end(self) -> None:
         """FormatError if a message is shorter or longer than its fields."""

@@ -58,8 +58,8 @@ class CameraTopics(NamedTuple):
 
 def camera_names(topics: Mapping[str, int]) -> tuple[str, ...]:
     """The cameras of a recording, by its topics."""
-    found = [topic for topic in map(parse, topics) if topic is not None and topic.kind == "frame"]
-    return tuple(sorted(topic.name for topic in found if topic.env == 0 and _NAME.fullmatch(topic.name)))
+    frames = [topic for topic in map(parse, topics) if topic is not None and topic.kind == "frame"]
+    return tuple(sorted(topic.name for topic in frames if topic.env == 0 and _NAME.fullmatch(topic.name)))
 
 
 class EncodedFrame(NamedTuple):

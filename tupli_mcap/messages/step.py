@@ -20,7 +20,7 @@ from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.layout import ImageLayout, MessageLayout, field_line, image_layout, message_text
 from tupli_mcap.messages.variable.codec import VariableField
-from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf, NameRegistry, flatten_space, structure
+from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf, NameRegistry, camel, flatten_space, structure
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 
 __all__ = ["FINAL_STATE_SCHEMA", "STEP_SCHEMA", "Stack", "StepLayout", "can_stack", "stack_of"]
@@ -118,7 +118,7 @@ class StepLayout:
             leaf.name: VariableField(
                 leaf.space,
                 leaf.name,
-                type_prefix=_camel(leaf.name),
+                type_prefix=camel(leaf.name),
                 path=leaf.path,
                 taken=taken,
                 dtypes=self.inner_dtypes.get(leaf.name),
@@ -262,22 +262,18 @@ def _is_stack(entry: Any) -> bool:
 
 def _as_stack(leaf: Leaf, stacks: Collection[Stack]) -> Leaf:
     """The leaf as the stack that `stacks` say it is, if any."""
-    found = replace(leaf, kind="stack", frames_last=leaf.name not in stacks)
-    if stack_of(found) not in stacks:
+    stack = replace(leaf, kind="stack", frames_last=leaf.name not in stacks)
+    if stack_of(stack) not in stacks:
         return leaf
-    if not can_stack(found):
+    if not can_stack(stack):
         raise SpaceError(
             f"{leaf.path}: expected 2 to {MAX_FRAMES} uint8 frames of shape (H, W) or (H, W, 1, 3 or 4) "
-            f"along the {'last' if found.frames_last else 'first'} axis of a stack, found {leaf.space}"
+            f"along the {'last' if stack.frames_last else 'first'} axis of a stack, found {leaf.space}"
         )
-    return found
+    return stack
 
 
 def _entry(metadata: Mapping[str, str], key: str) -> str:
     if key not in metadata:
         raise FormatError(f"channel metadata: expected the key {key!r}, found {sorted(metadata)}")
     return metadata[key]
-
-
-def _camel(name: str) -> str:
-    return "".join(part.capitalize() for part in name.split("_"))

@@ -67,7 +67,7 @@ class Topic(NamedTuple):
 
 def parse(topic: str) -> Topic | None:
     """None for a topic that belongs to no single environment, or is not of a recording."""
-    found = _TOPIC.fullmatch(topic)
-    if found is None:
+    match = _TOPIC.fullmatch(topic)
+    if match is None:
         return None
-    return Topic(Topics(found[1]), int(found[2] or 0), found[3] or found[4], found[5] or "")
+    return Topic(Topics(match[1]), int(match[2] or 0), match[3] or match[4], match[5] or "")

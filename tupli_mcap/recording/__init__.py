@@ -3,11 +3,11 @@
 recording, episode, frames    `Recording`, and what it gives
 open, contents                opening a file: everything that is known of it then
 index, limits                 the episode index, and whether it can be true
-channels, file_series          the channels that a layout needs; the files of a series
+channels, file_series         the channels that a layout needs; the files of a series
 description, series           what `info` shows
 blocks                        whole episodes in bounded memory
 signature_file                the attachment that a signature is
-columns/, recover/            from rows to columns; from remains to episodes
+columns/, recover/            from rows to columns; from what a killed process left to episodes
 write/, edit/, check/, sign/  new recordings; out of others; whether they are right; who vouches for them
 """
 

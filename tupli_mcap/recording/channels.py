@@ -38,8 +38,8 @@ def register_channels(
     layout: StepLayout,
     sub_environments: int | None,
     info: tuple[str, Mapping[str, str]] | None,
-    cameras: Sequence[str] = (),
-    png: Collection[str] = (),
+    cameras: Sequence[str],
+    png: Collection[str],
 ) -> Channels:
     """Adds the channels a layout needs, or finds them in a recording that is appended to.
 

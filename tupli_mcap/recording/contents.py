@@ -45,9 +45,19 @@ class NewerVersionError(FormatError):
 
 @dataclass
 class Contents:
-    """`table` is a CHUNK_ROWS array; `memory` holds the rows of chunks that are only in the journal (`tail`, as the
-    writer would take them); `data_end` is the offset where the episode index (or what is to be cut) begins; `undefined`
-    are the channels that only the journal defines."""
+    """What the summary says of a finished file, or recovery of another.
+
+    Attributes:
+        metadata: of the recording, undamaged.
+        schemas, channels: by id. attachments: by name, without the episode index.
+        metadata_indexes: where the metadata records are.
+        table: the chunks (CHUNK_ROWS), those in `memory` with offsets from IN_MEMORY on.
+        memory: the bytes of rows that are in no chunk of the file. tail: the same as the writer takes them.
+        complete: the writer finished the file.
+        data_end: the offset where the episode index begins, or what a writer that goes on cuts off.
+        undefined: the channels that only the journal defines.
+        used_episodes: a number beyond those of episodes whose steps, or ends, are lost.
+    """
 
     metadata: dict[str, str]
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -63,7 +73,7 @@ class Contents:
     complete: bool = True
     data_end: int = 0
     undefined: list[int] = field(default_factory=list)
-    used_episodes: int = 0  # beyond the numbers of episodes whose steps were lost, and whose ends were not
+    used_episodes: int = 0
 
     @property
     def next_episode(self) -> int:

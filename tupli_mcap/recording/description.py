@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -12,11 +12,9 @@ from tupli_mcap import signing
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
+from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
-
-if TYPE_CHECKING:
-    from tupli_mcap.recording.recording import Recording
 
 __all__ = [
     "ChannelFacts",
@@ -97,8 +95,8 @@ def describe(recording: Recording) -> RecordingDescription:
         FormatError: the environment that the recording carries is damaged.
     """
     rows = recording.index
-    channels = _channels(recording)
-    table = recording._contents.table
+    contents = recording.file.contents
+    table = contents.table
     chunks = table[table["offset"] < IN_MEMORY]
     stored = int(chunks["length"].sum())
     carried = "benchmark.json" in recording.attachments
@@ -106,7 +104,7 @@ def describe(recording: Recording) -> RecordingDescription:
         name=recording.name,
         uuid=recording.uuid,
         state=state_of(recording),
-        size=recording._source.size,
+        size=recording.size,
         library=recording.metadata.get("library", ""),
         created_ns=recording.created_ns,
         start_ns=int(rows["start_time"].min()) if len(rows) else 0,
@@ -123,7 +121,7 @@ def describe(recording: Recording) -> RecordingDescription:
         observation_space=describe_space(recording.observation_space) if recording.num_envs else None,
         action_space=describe_space(recording.action_space) if recording.num_envs else None,
         compression=int(chunks["uncompressed"].sum()) / stored if stored else None,
-        channels=channels,
+        channels=_channels(contents),
         attachments=[info._asdict() for info in recording.attachments.values()],
     )
 
@@ -179,8 +177,7 @@ def nan_text(count: int, episodes: int) -> str:
     )
 
 
-def _channels(recording: Recording) -> list[ChannelFacts]:
-    contents = recording._contents
+def _channels(contents: Contents) -> list[ChannelFacts]:
     facts = []
     for channel in contents.channels.values():
         chunks = contents.table[contents.table["channel"] == channel.id]

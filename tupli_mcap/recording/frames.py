@@ -159,7 +159,7 @@ class Frames(Sequence[Picture]):
         """The bytes of a frame (`data`) in its format (`form`: "png" or "jpeg")."""
         if not -len(self) <= i < len(self):
             raise IndexError(f"expected a frame from 0 to {len(self) - 1}, found {i}")
-        return self._recording._cameras.frame(self.camera, self._env, int(self._rows[i]))
+        return self._recording.file.cameras.frame(self.camera, self._env, int(self._rows[i]))
 
     def of_step(self, step: int) -> Picture:
         """The frame of the state after `step` steps; RecordingError if it was not recorded."""

@@ -23,9 +23,8 @@ _HEAD = struct.Struct("<8sQQQ")
 _MAGIC = b"TMIDX\0\0\1"
 _SIZE = struct.Struct("<Q")
 _MAX_METADATA = 1 << 26
-_MAX_ROW_RATIO = (
-    256  # rows differ, in the numbers of episodes and the checksums of chunks: they compress to a tenth
-)
+# Rows differ, in the numbers of episodes and the checksums of chunks: they compress far less than this.
+_MAX_ROW_RATIO = 256
 
 EPISODE_ROWS = np.dtype(
     [
@@ -113,7 +112,7 @@ class IndexBuilder:
 
 
 def _compress(data: bytes) -> bytes:
-    packed = zstandard.ZstdCompressor(level=-1).compress(data)  # neither larger nor slower than level 1
+    packed = zstandard.ZstdCompressor(level=-1).compress(data)
     return _SIZE.pack(len(packed)) + packed
 
 

@@ -16,7 +16,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
 from tupli_mcap.errors import FormatError, RecordingError, memory_for
 from tupli_mcap.mcap.records import BODY, read_attachment
-from tupli_mcap.mcap.source import open_source
+from tupli_mcap.mcap.source import Source, open_source
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA, EpisodeStart
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec
@@ -36,7 +36,7 @@ from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.trust import TrustedKey, is_trusted
 
-__all__ = ["AttachmentInfo", "RecordedBenchmark", "Recording"]
+__all__ = ["AttachmentInfo", "OpenFile", "RecordedBenchmark", "Recording"]
 
 CACHE_BYTES = 512 << 20
 _THREADS = min(4, os.cpu_count() or 1)
@@ -48,6 +48,20 @@ class AttachmentInfo(NamedTuple):
     name: str
     media_type: str
     size: int
+
+
+class OpenFile(NamedTuple):
+    """The file of an open recording, for those who copy, check or sign what is in it.
+
+    topics: the id of each topic's channel. steps: the ids of the step channels, by sub-environment.
+    """
+
+    source: Source
+    contents: Contents
+    store: ChunkStore
+    topics: Mapping[str, int]
+    steps: Sequence[int]
+    cameras: Cameras
 
 
 class RecordedBenchmark(NamedTuple):
@@ -359,7 +373,7 @@ class Recording:
         rows = self.index[i : i + 1]
         if rows["final_row"][0] < 0:
             return None
-        columns = self._reader.final_columns(self._channel("/final_state"), rows)
+        columns = self._reader.final_columns(self._channel(FINAL_STATE), rows)
         values = [
             column[0] if isinstance(column, list) or leaf.is_scalar else column[0, ...]
             for leaf, column in zip(self.layout.state, columns, strict=True)
@@ -556,6 +570,13 @@ class Recording:
                     shifted[ends[known]] = finals[i]
             columns.append(shifted)
         return layout.nest_state(columns)
+
+    @property
+    def file(self) -> OpenFile:
+        """Its channels, chunks and messages. It is closed with the recording."""
+        return OpenFile(
+            self._source, self._contents, self._store, self._topics, self._step_channels, self._cameras
+        )
 
     @property
     def stored(self) -> StoredSteps:

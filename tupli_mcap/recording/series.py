@@ -24,6 +24,7 @@ READ_BYTES = 4 << 20
 """Steps of so many bytes are read at most; of longer recordings, some at a few places."""
 _PLACES, _AT_EACH = 16, 256
 _VARIABLE_PLACES, _VARIABLE_AT_EACH = 8, 32  # steps of variable size are decoded one by one
+_FIELDS = ("states", "actions", "rewards")
 _MOST_REWARDS, _MOST_STATES, _MOST_ACTIONS = 2, 12, 6
 
 
@@ -97,27 +98,33 @@ def _course(name: str, values: Array, points: int) -> Series | None:
 
 def _pieces(recording: Recording) -> Iterator[Columns]:
     """Steps of the whole recording, or some at even distances."""
-    fields = ("states", "actions", "rewards")
-    lengths = recording.index["length"].astype(np.int64)
-    ends = np.cumsum(lengths)
-    total = int(ends[-1])
+    total = recording.num_steps
     constant = recording.layout.constant
     most = READ_BYTES // step_bytes(recording.layout, images=False)
     if total <= most and constant:
-        yield recording.read(fields=fields, images=False)
+        yield recording.read(fields=_FIELDS, images=False)
         return
     places, each = (_PLACES, _AT_EACH) if constant else (_VARIABLE_PLACES, _VARIABLE_AT_EACH)
     each = max(1, min(each, most // places))
     if total <= places * each:
         places, each = 1, total
-    for step in np.linspace(0, total - each, places).astype(np.int64).tolist():
-        first = int(np.searchsorted(ends, step, side="right"))
-        start = step - int(ends[first] - lengths[first])
-        if lengths[first] - start >= each:
-            yield recording.read_steps(first, start, start + each, fields, images=False)
-        else:
-            last = int(np.searchsorted(ends, step + each, side="left"))
-            yield recording.read(np.arange(first, last + 1), fields=fields, images=False)
+    for begin in np.linspace(0, total - each, places).astype(np.int64).tolist():
+        yield from _consecutive(recording, begin, begin + each)
+
+
+def _consecutive(recording: Recording, begin: int, stop: int) -> Iterator[Columns]:
+    """The steps `begin:stop` of the recording, counted from one episode to the next."""
+    lengths = recording.index["length"].astype(np.int64)
+    ends = np.cumsum(lengths)
+    first, last = np.searchsorted(ends, [begin, stop - 1], side="right").tolist()
+    start, end = begin - int(ends[first] - lengths[first]), stop - int(ends[last] - lengths[last])
+    if first == last:
+        yield recording.read_steps(first, start, end, _FIELDS, images=False)
+        return
+    yield recording.read_steps(first, start, int(lengths[first]), _FIELDS, images=False)
+    if last > first + 1:
+        yield recording.read(np.arange(first + 1, last), fields=_FIELDS, images=False)
+    yield recording.read_steps(last, 0, end, _FIELDS, images=False)
 
 
 def _distributions(

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, Field, JsonValue, ValidationError
 
 from tupli_mcap import signing, trust
 from tupli_mcap.environment import canonical_json
 from tupli_mcap.errors import FormatError
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "SIGNATURE_MEDIA_TYPE",

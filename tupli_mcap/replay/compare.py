@@ -16,7 +16,7 @@ import numpy as np
 from tupli_mcap.arrays import DType
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.columns.read import Columns
+from tupli_mcap.recording import Columns
 from tupli_mcap.replay.reapply import Moment
 from tupli_mcap.spaces.exact import exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf

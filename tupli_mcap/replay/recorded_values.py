@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Columns, Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
-from tupli_mcap.recording.columns.read import Columns
 
 __all__ = ["Block", "RecordedValues", "recorded_values"]
 

@@ -12,10 +12,8 @@ import gymnasium as gym
 
 from tupli_mcap.errors import RecordingError, TupliError, UntrustedError
 from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Episode, Recording, rewrite_recording
 from tupli_mcap.recording.edit.replacing import replacing
-from tupli_mcap.recording.edit.rewrite import rewrite_recording
-from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import CAMERA, RENDER_MODE
 from tupli_mcap.replay.attempt import Watch

@@ -25,13 +25,14 @@ __all__ = [
     "structure_check",
 ]
 
+_LONGEST = 120  # characters of a value in an error
 _MANTISSA = {"float16": 11, "float32": 24, "float64": 53}
 
 
-def shorten(value: object, limit: int = 120) -> str:
-    """A repr for error messages, cut to `limit` characters."""
+def shorten(value: object) -> str:
+    """A repr for error messages, cut to 120 characters."""
     text = " ".join(repr(value).split())
-    return text if len(text) <= limit else text[: limit - 1] + "…"
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
 
 
 def decide_dtype(leaf: Leaf, values: Sequence[Any]) -> DType:

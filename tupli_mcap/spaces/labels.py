@@ -54,17 +54,17 @@ class Labels(NamedTuple):
         if len(data) > MAX_LABELS:
             raise FormatError(f"{expected}, of at most {MAX_LABELS} bytes, found {len(data)}")
         try:
-            found = json.loads(data)
+            document = json.loads(data)
         except (ValueError, RecursionError) as err:
             raise FormatError(f"{expected}, found no JSON: {err}") from err
-        if not isinstance(found, dict):
-            raise FormatError(f"{expected}, found {found!r:.80}")
-        seconds = found.get("step_seconds")
+        if not isinstance(document, dict):
+            raise FormatError(f"{expected}, found {document!r:.80}")
+        seconds = document.get("step_seconds")
         if seconds is not None and not _is_time(seconds):
             raise FormatError(f"{expected}, found {seconds!r:.80} as the seconds of a step")
         parts = []
         for key in ("dimensions", "values"):
-            part = found.get(key, {})
+            part = document.get(key, {})
             if not isinstance(part, dict) or not all(_are_texts(texts) for texts in part.values()):
                 raise FormatError(f"{expected}, found {part!r:.80} as {key!r}")
             parts.append({path: tuple(texts) for path, texts in part.items()})

@@ -23,6 +23,7 @@ __all__ = [
     "ROS_TYPES",
     "Leaf",
     "NameRegistry",
+    "camel",
     "flatten_space",
     "ros_type",
     "structure",
@@ -120,6 +121,11 @@ class NameRegistry:
         self._counted[counted] = n
         self._taken.update(prefix + name for prefix in prefixes)
         return name
+
+
+def camel(name: str) -> str:
+    """A field's name as a type is called: `arm_x` is `ArmX`."""
+    return "".join(part.capitalize() for part in name.split("_"))
 
 
 def ros_type(dtype: DType) -> str:

@@ -455,7 +455,7 @@ def _same_file(one: Recording, other: Recording) -> bool:
 
 def _pieces(recording: Recording) -> Iterator[bytes]:
     for start in range(0, recording.size, _PIECE):
-        yield recording._source.read(start, min(_PIECE, recording.size - start))
+        yield recording.file.source.read(start, min(_PIECE, recording.size - start))
 
 
 class _NothingNewError(Exception):
@@ -474,7 +474,7 @@ def _copy(
     try:
         with os_errors("cannot import", target), fill(target) as new:
             if recording.complete:
-                recording._source.refresh()  # as it is now, whole
+                recording.file.source.refresh()  # as it is now, whole
                 with os.fdopen(create(new), "wb") as file:
                     file.writelines(_pieces(recording))
             else:

@@ -14,9 +14,8 @@ from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, TupliError
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
-from tupli_mcap.recording import Recording
-from tupli_mcap.recording.check.report import Findings, VerifyReport
-from tupli_mcap.recording.check.verify import verify_recording
+from tupli_mcap.recording import Recording, VerifyReport, verify_recording
+from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.storage import bundles
 from tupli_mcap.storage.artifacts import ArtifactFiles
 from tupli_mcap.storage.atomic import Lock

@@ -43,7 +43,7 @@ def image_codecs(layout: StepLayout, channels: Mapping[int, Channel]) -> dict[in
     Raises:
         FormatError: a channel names a codec that this version does not know.
     """
-    found: dict[int, ImageCodec] = {}
+    codecs: dict[int, ImageCodec] = {}
     leaves = {leaf.name: leaf for leaf in layout.images}
     for number, channel in channels.items():
         leaf = leaves.get(channel.metadata.get("leaf", ""))
@@ -54,8 +54,8 @@ def image_codecs(layout: StepLayout, channels: Mapping[int, Channel]) -> dict[in
             continue
         codec = _codec(channel, leaf, layout.image_messages[leaf.name])
         if codec is not None:
-            found[number] = codec
-    return found
+            codecs[number] = codec
+    return codecs
 
 
 def _codec(channel: Channel, leaf: Leaf, layout: ImageLayout) -> ImageCodec | None:

@@ -75,7 +75,7 @@ def encode_picture(picture: Picture, form: FrameFormat) -> bytes:
     """A picture as the bytes of a PNG, which gives it back exactly, or of a JPEG, which does not."""
     out = io.BytesIO()
     image = _pillow().fromarray(picture)
-    if form == "png":  # higher levels take up to twice the time
+    if form == "png":  # higher levels take longer
         image.save(out, "PNG", compress_level=1)
     else:
         image.save(out, "JPEG", quality=_QUALITY)

@@ -79,11 +79,11 @@ class PngCodec:
     def _decode(self, data: Any, count: int) -> Any:
         out = np.zeros(count, self._dtype)
         out["fixed"] = self._fixed
-        view, windows, found = memoryview(data), self._windows(out), 0
+        view, windows, number = memoryview(data), self._windows(out), 0
         for start, end, channel, sequence, log_time in iter_records(view):
-            if found == count:
+            if number == count:
                 raise FormatError(f"expected {count} images, found more")
-            row = out[found]
+            row = out[number]
             frame, name = decode_frame(view[start + BODY : end])
             if (name, frame.form) != (self._leaf.name, "png"):
                 raise FormatError(
@@ -97,12 +97,12 @@ class PngCodec:
             shape = self._height, self._width, self._channels
             frames = decode_pixels(frame.data, shape, self._frames).reshape(-1, windows.shape[2])
             old = self._frames - len(frames)
-            if old and not found:
+            if old and not number:
                 raise FormatError(f"expected {self._frames} frames in the first picture, found {len(frames)}")
             if old:
-                windows[found, :old] = windows[found - 1, -old:]
-            windows[found, old:] = frames
-            found += 1
-        if found != count:
-            raise FormatError(f"expected {count} images, found {found}")
+                windows[number, :old] = windows[number - 1, -old:]
+            windows[number, old:] = frames
+            number += 1
+        if number != count:
+            raise FormatError(f"expected {count} images, found {number}")
         return out.view(np.uint8)

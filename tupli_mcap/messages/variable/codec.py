@@ -50,7 +50,7 @@ from tupli_mcap.messages.variable.nested_codecs import (
     with_dummy,
 )
 from tupli_mcap.messages.variable.widening import EDGE_LINKS
-from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry
+from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry, camel
 
 __all__ = ["VariableField"]
 
@@ -75,7 +75,6 @@ class VariableField:
         self,
         space: gym.Space[Any],
         name: str,
-        package: str = "tupli_mcap",
         type_prefix: str = "Value",
         *,
         path: str | None = None,
@@ -85,7 +84,7 @@ class VariableField:
         self.name = name
         self.path = name if path is None else path
         wide = {self.path + where: dtype for where, dtype in (dtypes or {}).items()}
-        builder = _Builder(package, set() if taken is None else taken, wide)
+        builder = _Builder(set() if taken is None else taken, wide)
         codec = builder.single(space, type_prefix, self.path, 0)
         if wide:
             raise SpaceError(
@@ -125,7 +124,6 @@ class VariableField:
 class _Builder:
     """Makes codecs and collects the message definitions they need."""
 
-    package: str
     taken: set[str]
     wide: dict[str, str]  # path to dtype; each is taken out when it is used
     definitions: list[tuple[str, str]] = field(default_factory=list)
@@ -185,7 +183,7 @@ class _Builder:
         decoders: list[Decode] = []
         for key, sub in entries:
             name = names.take(str(key) if is_dict else f"item_{key}")
-            codec = make(sub, type_name + _camel(name), f"{path}[{key!r}]", depth + 1)
+            codec = make(sub, type_name + camel(name), f"{path}[{key!r}]", depth + 1)
             fields.append((codec.ros, name))
             steps.append((key, f"[{key!r}]", codec.encode))
             decoders.append(codec.decode)
@@ -225,16 +223,13 @@ class _Builder:
         while unique in self.taken:
             unique, n = f"{type_name}N{n}", n + 1
         self.taken.add(unique)
-        self.definitions.append((f"{self.package}/{unique}", "".join(lines) or f"uint8 {_DUMMY}\n"))
+        full = f"tupli_mcap/{unique}"
+        self.definitions.append((full, "".join(lines) or f"uint8 {_DUMMY}\n"))
         if not lines:
             encode, decode = with_dummy(encode, decode)
-        return Codec(f"{self.package}/{unique}", "message", encode, decode)
+        return Codec(full, "message", encode, decode)
 
 
 def _check_depth(path: str, depth: int) -> None:
     if depth > _MAX_DEPTH:
         raise SpaceError(f"{path}: a space nested more than {_MAX_DEPTH} deep cannot be recorded")
-
-
-def _camel(name: str) -> str:
-    return "".join(part.capitalize() for part in name.split("_"))

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from mcap.records import Channel
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import messages
 from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
+from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.index import EpisodeIndex
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.leaves import Leaf
@@ -33,11 +35,11 @@ def verify_episodes(recording: Recording, findings: Findings) -> None:
     if not recording.num_envs:
         return
     checker = _Checker(recording, findings)
-    for env, channel in enumerate(recording._step_channels):
+    for env, channel in enumerate(recording.file.steps):
         checker.steps(env, channel)
-        checker.images(env, channel)
+        checker.images(channel)
         checker.bools(channel, recording.layout.step_leaves)
-    checker.bools(recording._topics.get(FINAL_STATE, 0), recording.layout.final_leaves)
+    checker.bools(recording.file.topics.get(FINAL_STATE, 0), recording.layout.final_leaves)
     checker.starts()
     checker.ends()
     checker.finals()
@@ -48,8 +50,11 @@ class _Checker:
     def __init__(self, recording: Recording, findings: Findings) -> None:
         self._recording = recording
         self._layout: StepLayout = recording.layout
-        self._store: ChunkStore = recording._store
-        self._topics: dict[str, int] = recording._topics
+        file = recording.file
+        self._store: ChunkStore = file.store
+        self._topics: Mapping[str, int] = file.topics
+        self._channels: Mapping[int, Channel] = file.contents.channels
+        self._index: EpisodeIndex = file.contents.index
         self._findings = findings
         self._rows: Array = recording.index
         self._at = {int(number): i for i, number in enumerate(self._rows["episode"])}
@@ -61,10 +66,10 @@ class _Checker:
 
     def steps(self, env: int, channel: int) -> None:
         """Every row of a step channel against the episode it lies in."""
-        topic = self._recording._contents.channels[channel].topic
-        mine = self._rows[self._rows["env"] == env]
-        mine = mine[np.argsort(mine["first_row"], kind="stable")]
-        firsts, lengths = mine["first_row"].astype(np.int64), mine["length"].astype(np.int64)
+        topic = self._channels[channel].topic
+        episodes = self._rows[self._rows["env"] == env]
+        episodes = episodes[np.argsort(episodes["first_row"], kind="stable")]
+        firsts, lengths = episodes["first_row"].astype(np.int64), episodes["length"].astype(np.int64)
         total = self._store.count(channel)
         expected = np.append(0, (firsts + lengths))
         begins = np.append(firsts, total)
@@ -73,66 +78,73 @@ class _Checker:
             self._error("rows", f"rows {where} to {until} belong to no episode", channel=topic)
         if (firsts != expected[:-1]).any():
             return  # what follows would say the same of every episode
-        sums = np.zeros(len(mine))
+        sums = np.zeros(len(episodes))
         row = 0
         try:
             for facts in step_facts(self._store, self._layout, channel, 0, total):
-                self._batch(facts, row, mine, firsts, lengths, sums, topic)
+                self._batch(facts, row, episodes, firsts, lengths, sums, topic)
                 row += len(facts.episode)
         except FormatError as err:
             self._error("rows", _plain(err, self._recording), channel=topic)
             return
-        self._returns(mine, sums)
+        self._returns(episodes, sums)
 
     def _batch(
-        self, facts: StepFacts, row: int, mine: Array, firsts: Array, lengths: Array, sums: Array, topic: str
+        self,
+        facts: StepFacts,
+        row: int,
+        episodes: Array,
+        firsts: Array,
+        lengths: Array,
+        sums: Array,
+        topic: str,
     ) -> None:
         rows = row + np.arange(len(facts.episode))
-        of = np.searchsorted(firsts, rows, side="right") - 1
-        known = (of >= 0) & (rows < firsts[of] + lengths[of]) if len(firsts) else np.zeros(len(rows), bool)
+        at = np.searchsorted(firsts, rows, side="right") - 1
+        known = (at >= 0) & (rows < firsts[at] + lengths[at]) if len(firsts) else np.zeros(len(rows), bool)
         for i, why in facts.bad.items():
             self._error("rows", f"row {row + i} cannot be decoded: {why}", channel=topic)
             known[i] = False
-        steps = rows - np.where(known, firsts[of] if len(firsts) else 0, 0)
-        last = known & (steps == (lengths[of] if len(firsts) else 0) - 1)
+        steps = rows - np.where(known, firsts[at] if len(firsts) else 0, 0)
+        last = known & (steps == (lengths[at] if len(firsts) else 0) - 1)
         checks = {
             "is not numbered as its episode": known
-            & (facts.episode != (mine["episode"][of] if len(mine) else 0)),
+            & (facts.episode != (episodes["episode"][at] if len(episodes) else 0)),
             "does not count from the one before": known & (facts.step != steps),
             "has a flag that is neither 0 nor 1": (facts.terminal > 1) | (facts.timeout > 1),
             "ends its episode before its last step": known & ~last & ((facts.terminal | facts.timeout) != 0),
             "has other flags than the end of its episode says": last
-            & (_end_of(facts) != (mine["end"][of] if len(mine) else 0)),
+            & (_end_of(facts) != (episodes["end"][at] if len(episodes) else 0)),
         }
         for what, wrong in checks.items():
             for i in np.flatnonzero(wrong)[:3].tolist():
                 place: dict[str, Any] = {"channel": topic}
                 if known[i]:
-                    place.update(episode=int(mine["episode"][of[i]]), step=int(steps[i]))
+                    place.update(episode=int(episodes["episode"][at[i]]), step=int(steps[i]))
                 self._error("episode", f"row {row + i} {what}", **place)
         if known.any():
             with np.errstate(invalid="ignore", over="ignore"):
-                np.add.at(sums, of[known], facts.reward[known])
+                np.add.at(sums, at[known], facts.reward[known])
 
-    def _returns(self, mine: Array, sums: Array) -> None:
+    def _returns(self, episodes: Array, sums: Array) -> None:
         with np.errstate(invalid="ignore"):
-            close = np.isclose(sums, mine["return"], rtol=1e-6, atol=1e-6, equal_nan=True)
+            close = np.isclose(sums, episodes["return"], rtol=1e-6, atol=1e-6, equal_nan=True)
         for i in np.flatnonzero(~close).tolist():
-            told, found = float(mine["return"][i]), float(sums[i])
-            if not (math.isfinite(told) and math.isfinite(found)):
+            listed, total = float(episodes["return"][i]), float(sums[i])
+            if not (math.isfinite(listed) and math.isfinite(total)):
                 continue  # the order of summation decides
-            why = f"its return is {told!r}, its rewards sum up to {found!r}"
-            self._error("episode", why, episode=int(mine["episode"][i]))
+            why = f"its return is {listed!r}, its rewards sum up to {total!r}"
+            self._error("episode", why, episode=int(episodes["episode"][i]))
 
-    def images(self, env: int, channel: int) -> None:
+    def images(self, channel: int) -> None:
         """Image channels have a row for each step, and the bytes that never change."""
-        topics = Topics.of_step(self._recording._contents.channels[channel].topic)
+        topics = Topics.of_step(self._channels[channel].topic)
         for leaf in self._layout.images:
             topic = topics.image(leaf.name)
             number = self._topics.get(topic, 0)
-            steps, found = self._store.count(channel), self._store.count(number)
-            if steps != found:
-                self._error("image", f"expected {steps} images, found {found}", channel=topic)
+            steps, images = self._store.count(channel), self._store.count(number)
+            if steps != images:
+                self._error("image", f"expected {steps} images, found {images}", channel=topic)
             layout = self._layout.image_messages[leaf.name]
             fixed = np.frombuffer(layout.body[8:], np.uint8)
             try:
@@ -150,7 +162,7 @@ class _Checker:
         names = [leaf.name for leaf in leaves if leaf.size and self._layout.dtypes.get(leaf.name) == np.bool_]
         if not names or not self._layout.constant:
             return
-        step = channel in self._recording._step_channels
+        step = channel in self._recording.file.steps
         dtype = (self._layout.step_message if step else self._layout.final_message).dtype
         try:
             for chunk in self._store.chunks(channel):
@@ -161,7 +173,7 @@ class _Checker:
                 for name in names:
                     wrong = (rows[name].view(np.uint8) > 1).reshape(len(rows), -1).any(axis=1)
                     for i in np.flatnonzero(wrong)[:3].tolist():
-                        place = self._recording._contents.channels[channel].topic
+                        place = self._channels[channel].topic
                         self._error(
                             "rows",
                             f"row {first + i} has a bool in {name!r} other than 0 and 1",
@@ -204,14 +216,14 @@ class _Checker:
             if i is None or int(self._rows["start_row"][i]) != row:
                 continue  # a reset without a step
             seen.add(start.episode)
-            told = self._rows[i]
+            entry = self._rows[i]
             seed = start.seed_number
             if seed is not None and not -(2**63) <= seed < 2**63:
                 seed = None
             facts = (start.env, start.first_row, time, seed)
             index = (
-                int(told["env"]), int(told["first_row"]), int(told["start_time"]),
-                int(told["seed"]) if told["has_seed"] else None,
+                int(entry["env"]), int(entry["first_row"]), int(entry["start_time"]),
+                int(entry["seed"]) if entry["has_seed"] else None,
             )  # fmt: skip
             if facts != index or bytes(body[16:18]) not in (b"\0\0", b"\1\0", b"\0\1", b"\1\1"):
                 self._error("episode", f"its start and the index differ: {facts} and {index}", **place)
@@ -241,16 +253,16 @@ class _Checker:
             if end.episode in seen:
                 self._error("episode", "it ends twice", **place)
             seen.add(end.episode)
-            told = self._rows[i]
+            entry = self._rows[i]
             facts = (end.env, end.first_row, end.length, end.end, end.has_final_state, time, row)
             index = (
-                int(told["env"]), int(told["first_row"]), int(told["length"]), int(told["end"]),
-                int(told["final_row"]) >= 0, int(told["end_time"]), int(told["end_row"]),
+                int(entry["env"]), int(entry["first_row"]), int(entry["length"]), int(entry["end"]),
+                int(entry["final_row"]) >= 0, int(entry["end_time"]), int(entry["end_row"]),
             )  # fmt: skip
-            same = np.float64(end.episode_return).tobytes() == told["return"].tobytes()
+            same = np.float64(end.episode_return).tobytes() == entry["return"].tobytes()
             if facts != index or not same or body[33] > 1:
                 self._error("episode", f"its end and the index differ: {facts} and {index}", **place)
-            if end.metadata != self._recording._contents.index.metadata_text(i):
+            if end.metadata != self._index.metadata_text(i):
                 self._error("episode", "its metadata differ between its end and the index", **place)
         for number in sorted(self._at.keys() - seen):
             self._error("episode", "it has no end", episode=number, channel=EPISODE_END)
@@ -265,13 +277,13 @@ class _Checker:
         for row, _, body in self._messages(topic):
             number = int.from_bytes(body[:4], "little")
             place = {"channel": topic, "episode": number}
-            told = rows.pop(row, None)
-            if told is None and self._is_of_an_unfinished_step(row, number):
+            entry = rows.pop(row, None)
+            if entry is None and self._is_of_an_unfinished_step(row, number):
                 continue
             if (
-                told is None
-                or int(told["episode"]) != number
-                or int(told["env"]) != int.from_bytes(body[4:8], "little")
+                entry is None
+                or int(entry["episode"]) != number
+                or int(entry["env"]) != int.from_bytes(body[4:8], "little")
             ):
                 if self._recording.complete or number in self._at:
                     self._error("final_state", f"row {row} is the final state of no episode", **place)
@@ -285,8 +297,8 @@ class _Checker:
                     self._error(
                         "final_state", f"it cannot be decoded: {_plain(err, self._recording)}", **place
                     )
-        for told in rows.values():
-            self._error("final_state", "it is missing", episode=int(told["episode"]), channel=topic)
+        for entry in rows.values():
+            self._error("final_state", "it is missing", episode=int(entry["episode"]), channel=topic)
 
     def _is_of_an_unfinished_step(self, row: int, number: int) -> bool:
         """Whether a final state was written ahead of a step that its recorder did not finish, and does not count."""
@@ -297,11 +309,11 @@ class _Checker:
         return end == INTERRUPTED and not 0 <= final_row <= row
 
     def infos(self) -> None:
-        """Infos are those of steps that are there, at most one each."""
+        """Each info is of a step of the recording, and each step has at most one."""
         channel = self._topics.get(INFO)
         if channel is None:
             return
-        decoder = InfoCodec.from_metadata(self._recording._contents.channels[channel].metadata)
+        decoder = InfoCodec.from_metadata(self._channels[channel].metadata)
         last: dict[int, int] = {}
         for row, _, body in self._messages(INFO):
             place: dict[str, Any] = {"channel": INFO}
@@ -321,8 +333,8 @@ class _Checker:
 
 
 def _end_of(facts: StepFacts) -> Array:
-    """What the flags of each row say an episode's end would be (0 terminal, 1 timeout, 2 interrupted)."""
-    return np.where(facts.terminal != 0, 0, np.where(facts.timeout != 0, 1, 2))
+    """How each row would end its episode, by its flags."""
+    return np.where(facts.terminal != 0, TERMINAL, np.where(facts.timeout != 0, TIMEOUT, INTERRUPTED))
 
 
 def _plain(err: FormatError, recording: Recording) -> str:

@@ -29,10 +29,10 @@ class _Pair:
     def __init__(self, recording: Recording, findings: Findings, camera: str, env: int) -> None:
         self._recording = recording
         self._findings = findings
-        self._store: ChunkStore = recording._store
+        self._store: ChunkStore = recording.file.store
         self._camera = camera
         self._topics = CameraTopics.of(camera, env if recording.is_vector else None)
-        self._channels = recording._cameras.channels(camera, env)
+        self._channels = recording.file.cameras.channels(camera, env)
         self._rows = recording.index[recording.index["env"] == env]
 
     def run(self) -> None:
@@ -70,8 +70,8 @@ class _Pair:
         known = self._rows["episode"][order].astype(np.int64)
         lengths = np.append(self._rows["length"][order].astype(np.int64), -1)
         at = np.searchsorted(known, episodes)
-        there = np.append(known, -1)[at] == episodes
-        lost = int((~there | (steps > lengths[at])).sum())
+        is_known = np.append(known, -1)[at] == episodes
+        lost = int((~is_known | (steps > lengths[at])).sum())
         if lost and self._recording.complete:
             self._findings.note(
                 "frame",

@@ -1,4 +1,4 @@
-"""A signature, held against all that it covers.
+"""Checks a signature against everything that it covers.
 
 The manifest covers what is read from a file, not its bytes: chunks may be compressed anew, and attachments that were
 added since (a replay certificate, a quality card) are named as not covered.
@@ -17,14 +17,13 @@ from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.recording import OpenFile, Recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, STATEMENTS, Signed, is_covered_kind
 
 __all__ = [
     "Signature",
     "check_readers",
-    "check_signature",
     "manifest",
     "manifest_of_episodes",
     "verify_signature",
@@ -56,11 +55,6 @@ class Signature(NamedTuple):
         return self.name is not None
 
 
-def check_signature(recording: Recording) -> Signature | None:
-    """As `verify_signature`; None if the recording is not signed."""
-    return verify_signature(recording) if SIGNATURE_NAME in recording.attachments else None
-
-
 def verify_signature(recording: Recording, walk: Structure | None = None) -> Signature:
     """Checks the signature of a recording against everything it covers; all chunks are read.
 
@@ -80,15 +74,15 @@ def verify_signature(recording: Recording, walk: Structure | None = None) -> Sig
         raise SignatureError(f"{name}: its signature was not made by the key {fingerprint} that it names")
     if not recording.complete:
         raise SignatureError(f"{name}: what was signed is finished, this recording is not")
-    found = manifest(recording)
-    _compare(signed.manifest, found, f"{name}, signed by {fingerprint}")
-    check_readers(recording, found["attachments"], walk)
+    current = manifest(recording)
+    _compare(signed.manifest, current, f"{name}, signed by {fingerprint}")
+    check_readers(recording, current["attachments"], walk)
     names = {key.public_key: key.name for key in trust.trusted_keys()}
     not_covered = tuple(
         sorted(recording.attachments.keys() - {*signed.manifest["attachments"], SIGNATURE_NAME})
     )
     return Signature(
-        signed.public_key, fingerprint, names.get(signed.public_key), found["environment"], not_covered
+        signed.public_key, fingerprint, names.get(signed.public_key), current["environment"], not_covered
     )
 
 
@@ -110,12 +104,11 @@ def manifest(recording: Recording) -> dict[str, Any]:
 
 def manifest_of_episodes(recording: Recording) -> dict[str, Any]:
     """The part of the manifest that is about episodes."""
-    index = recording._contents.index
+    contents = recording.file.contents
+    index = contents.index
     return {
         "recording": {key: recording.metadata[key] for key in _IDENTITY if key in recording.metadata},
-        "channels": {
-            str(number): _channel(recording, number) for number in sorted(recording._contents.channels)
-        },
+        "channels": {str(number): _channel(recording.file, number) for number in sorted(contents.channels)},
         "episodes": {
             "count": len(index.episodes),
             "sha256": sha256(index.episodes.tobytes() + index.metadata),
@@ -123,10 +116,10 @@ def manifest_of_episodes(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _channel(recording: Recording, number: int) -> dict[str, Any]:
+def _channel(file: OpenFile, number: int) -> dict[str, Any]:
     """Of a channel: its topic, and the digest of its definition and of all its message records, in order."""
-    channel = recording._contents.channels[number]
-    schema = recording._contents.schemas.get(channel.schema_id)
+    channel = file.contents.channels[number]
+    schema = file.contents.schemas.get(channel.schema_id)
     definition = {
         "topic": channel.topic,
         "encoding": channel.message_encoding,
@@ -134,17 +127,16 @@ def _channel(recording: Recording, number: int) -> dict[str, Any]:
         "schema": None if schema is None else [schema.name, schema.encoding, sha256(schema.data)],
     }
     digest = hashlib.sha256(canonical_json(definition))
-    store = recording._store
-    for chunk in store.chunks(number):
-        digest.update(store.load(chunk, keep=False))
-    return {"topic": channel.topic, "messages": store.count(number), "sha256": digest.hexdigest()}
+    for chunk in file.store.chunks(number):
+        digest.update(file.store.load(chunk, keep=False))
+    return {"topic": channel.topic, "messages": file.store.count(number), "sha256": digest.hexdigest()}
 
 
 def check_readers(recording: Recording, covered: Container[str], walk: Structure | None) -> None:
     """Other readers go by the definitions in the chunks, by the summary's indexes, or by the order of the file: what
     they see must be what was hashed, so all of it must agree, and nothing `covered` may be there twice."""
     if walk is None:
-        source = recording._source
+        source = recording.file.source
         walk = Structure(source, read_tail(source), Findings(VerifyReport(recording.name)))
         walk.run()
     wrong = [problem.message + f" ({problem.place})" * bool(problem.place) for problem in walk.report.errors]
@@ -160,30 +152,30 @@ def check_readers(recording: Recording, covered: Container[str], walk: Structure
         )
 
 
-def _compare(signed: Mapping[str, Any], found: Mapping[str, Any], where: str) -> None:
+def _compare(signed: Mapping[str, Any], current: Mapping[str, Any], where: str) -> None:
     """Raises SignatureError at the first difference; new attachments that nothing is rebuilt from are none."""
     for part in ("format", "version", "recording", "environment"):
-        if signed.get(part) != found[part]:
+        if signed.get(part) != current[part]:
             raise SignatureError(
-                f"{where}: its {part} was changed: expected {signed.get(part)!r:.100}, found {found[part]!r:.100}"
+                f"{where}: its {part} was changed: expected {signed.get(part)!r:.100}, found {current[part]!r:.100}"
             )
     for part, noun in (("attachments", "attachment"), ("channels", "channel")):
         expected = signed.get(part)
         if not isinstance(expected, dict):
             raise FormatError(f"{where}: the manifest lists no {part}")
         for name, value in expected.items():
-            if name not in found[part]:
+            if name not in current[part]:
                 raise SignatureError(f"{where}: the {noun} {name!r:.100} that was signed is missing")
-            if found[part][name] != value:
+            if current[part][name] != value:
                 raise SignatureError(
-                    f"{where}: the {noun} {_named(found[part][name], name)} was changed after signing"
+                    f"{where}: the {noun} {_named(current[part][name], name)} was changed after signing"
                 )
-        for name in found[part].keys() - expected.keys():
+        for name in current[part].keys() - expected.keys():
             if part == "channels" or is_covered_kind(name):
                 raise SignatureError(
-                    f"{where}: the {noun} {_named(found[part][name], name)} was added after signing"
+                    f"{where}: the {noun} {_named(current[part][name], name)} was added after signing"
                 )
-    if signed.get("episodes") != found["episodes"]:
+    if signed.get("episodes") != current["episodes"]:
         raise SignatureError(f"{where}: the episode index was changed after signing")
 
 

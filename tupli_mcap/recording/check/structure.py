@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from tupli_mcap.recording.recover.file_end import Tail
 __all__ = ["Structure"]
 
 _CDR = int.from_bytes(CDR_HEADER, "little")
+_SUMMARY_OFFSET = struct.Struct("<BQQ")  # opcode of a group of records, where it starts, its length
 _KINDS = {
     Opcode.CHUNK: "chunk", Opcode.ATTACHMENT: "attachment", Opcode.MESSAGE_INDEX: "message_index",
     Opcode.METADATA: "metadata",
@@ -122,64 +124,64 @@ class Structure:
         head = self._source.read(damage.offset, min(9, damage.end - damage.offset))
         return len(head) < 9 or damage.offset + 9 + int.from_bytes(head[1:], "little") > self._source.size
 
-    def _take(self, found: Found) -> None:
+    def _take(self, record: Found) -> None:
         if self._ended:
             self._findings.error(
-                "record", "expected the summary after the end of the data", offset=found.offset
+                "record", "expected the summary after the end of the data", offset=record.offset
             )
         waiting, self._waiting = self._waiting, None
         behind_damage, self._behind_damage = self._behind_damage, False
-        if waiting is not None and found.opcode != Opcode.MESSAGE_INDEX:
+        if waiting is not None and record.opcode != Opcode.MESSAGE_INDEX:
             self._findings.error(
                 "message_index", "expected the message index of the chunk", offset=waiting.offset
             )
-        if (self._records == 1) != (found.opcode == Opcode.HEADER):
-            self._findings.error("record", "expected one header, as the first record", offset=found.offset)
-        if found.chunk is not None:
-            self._chunk(found, found.chunk)
-        elif found.attachment is not None:
-            self._attachments.append(found.attachment)
-            self._name(Opcode.ATTACHMENT, found.attachment.name)
-        elif found.opcode == Opcode.MESSAGE_INDEX:
+        if (self._records == 1) != (record.opcode == Opcode.HEADER):
+            self._findings.error("record", "expected one header, as the first record", offset=record.offset)
+        if record.chunk is not None:
+            self._chunk(record, record.chunk)
+        elif record.attachment is not None:
+            self._attachments.append(record.attachment)
+            self._name(Opcode.ATTACHMENT, record.attachment.name)
+        elif record.opcode == Opcode.MESSAGE_INDEX:
             with self._findings.following(behind_damage):
-                self._message_index(found, waiting)
-        elif found.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record = parse_record(found.opcode, found.body, found.offset, self._source.name)
-            self._outside.add((type(record), record.id))
-            self._define(record, found.offset)
-        elif found.opcode == Opcode.DATA_END:
+                self._message_index(record, waiting)
+        elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            definition = parse_record(record.opcode, record.body, record.offset, self._source.name)
+            self._outside.add((type(definition), definition.id))
+            self._define(definition, record.offset)
+        elif record.opcode == Opcode.DATA_END:
             self._ended = True
-            end = found.offset + found.length
+            end = record.offset + record.length
             if self._tail.data_end not in (None, end):
                 self._findings.error("record", "expected the summary after the end of the data", offset=end)
-            if bytes(found.body) != bytes(4):
+            if bytes(record.body) != bytes(4):
                 self._findings.error(
-                    "record", "expected 0 as the CRC of the data section", offset=found.offset
+                    "record", "expected 0 as the CRC of the data section", offset=record.offset
                 )
-        elif found.opcode in (Opcode.HEADER, Opcode.METADATA):
-            self._named(found)
+        elif record.opcode in (Opcode.HEADER, Opcode.METADATA):
+            self._named(record)
         else:
             self._findings.error(
-                "record", f"a record with opcode {found.opcode} is unknown", offset=found.offset
+                "record", f"a record with opcode {record.opcode} is unknown", offset=record.offset
             )
 
-    def _named(self, found: Found) -> None:
+    def _named(self, record: Found) -> None:
         """Header and metadata."""
-        if found.opcode == Opcode.HEADER:
-            header = parse_record(found.opcode, found.body, found.offset, self._source.name)
+        if record.opcode == Opcode.HEADER:
+            header = parse_record(record.opcode, record.body, record.offset, self._source.name)
             if header.profile != PROFILE:
                 why = f"expected the profile {PROFILE!r}, found {header.profile!r:.40}"
-                self._findings.error("record", why, offset=found.offset)
-        elif found.opcode == Opcode.METADATA:
-            record = parse_record(found.opcode, found.body, found.offset, self._source.name)
-            self._metadata.append(MetadataIndex(found.offset, found.length, record.name))
-            self._name(Opcode.METADATA, record.name)
-            if record.name == RECORDING_METADATA:
-                if self._crc(record.metadata, RECORDING_KEYS, "metadata", found.offset):
-                    check_version(record.metadata, self._source.name)
+                self._findings.error("record", why, offset=record.offset)
+        elif record.opcode == Opcode.METADATA:
+            metadata = parse_record(record.opcode, record.body, record.offset, self._source.name)
+            self._metadata.append(MetadataIndex(record.offset, record.length, metadata.name))
+            self._name(Opcode.METADATA, metadata.name)
+            if metadata.name == RECORDING_METADATA:
+                if self._crc(metadata.metadata, RECORDING_KEYS, "metadata", record.offset):
+                    check_version(metadata.metadata, self._source.name)
             elif self._records == 2:
                 self._findings.error(
-                    "metadata", f"expected {RECORDING_METADATA!r} first", offset=found.offset
+                    "metadata", f"expected {RECORDING_METADATA!r} first", offset=record.offset
                 )
 
     def _name(self, opcode: int, name: str) -> None:
@@ -207,28 +209,28 @@ class Structure:
         if isinstance(record, Channel) and is_ours(record.topic):
             self._crc(record.metadata, CHANNEL_KEYS, "layout", offset)
 
-    def _chunk(self, found: Found, chunk: Chunk) -> None:
+    def _chunk(self, record: Found, chunk: Chunk) -> None:
         self._findings.report.chunks += 1
-        if found.repaired:
-            self._findings.error("chunk", found.repaired, offset=found.offset)
+        if record.repaired:
+            self._findings.error("chunk", record.repaired, offset=record.offset)
         try:
             content = chunk_records(chunk.data, "the chunk", chunk.packed)
         except FormatError as err:
-            self._findings.error("chunk", str(err), offset=found.offset)
+            self._findings.error("chunk", str(err), offset=record.offset)
             return
         for schema in content.schemas:
-            self._define(schema, found.offset)
+            self._define(schema, record.offset)
         for channel in content.channels:
-            self._define(channel, found.offset)
-        self._waiting = _Waiting(found.offset, content)
-        self._rows(found, chunk, content)
+            self._define(channel, record.offset)
+        self._waiting = _Waiting(record.offset, content)
+        self._rows(record, chunk, content)
         number, headers = content.channel, content.headers
-        self._table.append(content.row(found.offset, found.length, chunk))
-        at = found.offset + found.length
+        self._table.append(content.row(record.offset, record.length, chunk))
+        at = record.offset + record.length
         self._chunk_indexes.append(
             ChunkIndex(
-                chunk_length=found.length,
-                chunk_start_offset=found.offset,
+                chunk_length=record.length,
+                chunk_start_offset=record.offset,
                 compression=chunk.compression,
                 compressed_size=chunk.packed,
                 message_end_time=int(headers["#log_time"][-1]),
@@ -239,11 +241,11 @@ class Structure:
             )
         )
 
-    def _rows(self, found: Found, chunk: Chunk, content: ChunkRecords) -> None:
+    def _rows(self, record: Found, chunk: Chunk, content: ChunkRecords) -> None:
         """The rows of a chunk: in order, without gap, with the times its header says."""
         headers, number = content.headers, content.channel
         topic = self.channels[number].topic if number in self.channels else f"{number}"
-        place = {"offset": found.offset, "channel": topic}
+        place = {"offset": record.offset, "channel": topic}
         expected = self._counts.get(number, 0)
         if content.first != expected and not (self.missing and content.first > expected):
             self._findings.error("rows", f"expected row {expected}, found row {content.first}", **place)
@@ -265,15 +267,17 @@ class Structure:
         if (chunk.start_time, chunk.end_time) != (int(times[0]), int(times[-1])):
             self._findings.error("chunk", "its header says other times than its messages", **place)
 
-    def _message_index(self, found: Found, waiting: _Waiting | None) -> None:
+    def _message_index(self, record: Found, waiting: _Waiting | None) -> None:
         if waiting is None:
-            self._findings.error("message_index", "expected it behind a good chunk only", offset=found.offset)
+            self._findings.error(
+                "message_index", "expected it behind a good chunk only", offset=record.offset
+            )
             return
-        number, entries = message_index(found.body)
+        number, entries = message_index(record.body)
         content = waiting.records
         if number != content.channel or not np.array_equal(entries, content.index_entries()):
             why = "it says other times or offsets than its chunk has"
-            self._findings.error("message_index", why, offset=found.offset)
+            self._findings.error("message_index", why, offset=record.offset)
 
     # ---- the summary
 
@@ -310,20 +314,20 @@ class Structure:
     def _summary(self, start: int) -> None:
         end = self._source.size - len(MAGIC) - FOOTER_SIZE
         data = self._source.read(start, end - start)
-        found: dict[int, list[Any]] = {}
+        parsed: dict[int, list[Any]] = {}
         groups: dict[int, list[int]] = {}
         for opcode, offset, body in records(data, start, self._source.name):
             if opcode == Opcode.SUMMARY_OFFSET:
                 self._offsets(body, groups, offset)
                 continue
-            found.setdefault(opcode, []).append(parse_record(opcode, body, offset, self._source.name))
+            parsed.setdefault(opcode, []).append(parse_record(opcode, body, offset, self._source.name))
             group = groups.setdefault(opcode, [offset, offset])
             if group[1] != offset:
                 self._findings.error(
                     "summary", f"records with opcode {opcode} are not together", offset=offset
                 )
             group[1] = offset + 9 + len(body)
-        for opcode in sorted(found.keys() - _SUMMARY):
+        for opcode in sorted(parsed.keys() - _SUMMARY):
             why = f"expected no record with opcode {opcode} in the summary"
             self._findings.error("summary", why, offset=groups[opcode][0])
         for opcode, wanted in (
@@ -334,16 +338,22 @@ class Structure:
             (Opcode.METADATA_INDEX, self._metadata),
             (Opcode.STATISTICS, [self._statistics()]),
         ):
-            here = found.get(opcode, [])
-            if _ordered(opcode, here) != _ordered(opcode, wanted):
+            listed = parsed.get(opcode, [])
+            if _ordered(opcode, listed) != _ordered(opcode, wanted):
                 what = Opcode(opcode).name.lower().replace("_", " ")
-                why = f"its {len(here)} {what} records say other than the data, where there are {len(wanted)}"
+                why = (
+                    f"its {len(listed)} {what} records say other than the data, where there are {len(wanted)}"
+                )
                 with self._findings.following(self.missing):
                     self._findings.error("summary", why, offset=groups.get(opcode, [start])[0])
 
     def _offsets(self, body: memoryview, groups: dict[int, list[int]], offset: int) -> None:
-        start, length = int.from_bytes(body[1:9], "little"), int.from_bytes(body[9:17], "little")
-        if groups.get(body[0]) != [start, start + length]:
+        if len(body) != _SUMMARY_OFFSET.size:
+            why = f"a summary offset has {len(body)} bytes, not {_SUMMARY_OFFSET.size}"
+            self._findings.error("summary", why, offset=offset)
+            return
+        opcode, start, length = _SUMMARY_OFFSET.unpack(body)
+        if groups.get(opcode) != [start, start + length]:
             self._findings.error("summary", "a summary offset points elsewhere", offset=offset)
 
     def _statistics(self) -> Statistics:
@@ -361,6 +371,6 @@ class Structure:
         )
 
 
-def _ordered(opcode: int, found: list[Any]) -> list[Any]:
+def _ordered(opcode: int, records: list[Any]) -> list[Any]:
     """Definitions by id: the summary may have them in another order."""
-    return sorted(found, key=lambda r: r.id) if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else found
+    return sorted(records, key=lambda r: r.id) if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else records

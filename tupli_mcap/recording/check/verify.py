@@ -1,4 +1,4 @@
-"""`verify_recording`: everything that can be wrong with a recording. Nothing in it is executed."""
+"""`verify_recording` looks for everything that can be wrong with a recording. Nothing in it is executed."""
 
 from __future__ import annotations
 
@@ -113,8 +113,7 @@ def _note_unfinished(structure: Structure, lost: str, findings: Findings, *, unr
 
 
 def _lost_journal(source: Source) -> tuple[str, bool]:
-    """Why the journal of an unfinished recording is of no use, and whether it is there and cannot be read; "" if it is
-    of use."""
+    """Why the journal of an unfinished recording cannot be used ("" if it can); whether it is there and unreadable."""
     if source.path is None:
         return "there is no journal beside it", False
     try:
@@ -145,7 +144,7 @@ def _contents(source: Source, structure: Structure, findings: Findings) -> None:
         if not damaged:  # else the reader says again what is known, or what follows from it
             findings.error("layout", str(err).removeprefix(f"{source.name}: "))
         return
-    recording._store.claims = None  # which rows differ from the index is said one by one
+    recording.file.store.claims = None  # which rows differ from the index is said one by one
     with recording:
         findings.report.attachments = len(recording.attachments)
         _layout(recording, structure, findings)
@@ -159,27 +158,28 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
     """The definitions in the file are those that the spaces give."""
     if not recording.num_envs:
         return
-    topics = {channel.topic: channel for channel in recording._contents.channels.values()}
+    channels = recording.file.contents.channels
+    topics = {channel.topic: channel for channel in channels.values()}
     info = topics.get(INFO)
-    wanted = Container(-1, recording.name, "none")
+    expected = Container(-1, recording.name, "none")
     vector = recording.num_envs if recording.is_vector else None
     try:
         infos = None if info is None else (InfoCodec.from_metadata(info.metadata).schema()[0], info.metadata)
-        png = png_leaves(recording._contents.channels)
-        register_channels(wanted, recording.name, recording.layout, vector, infos, recording.cameras, png)
+        png = png_leaves(channels)
+        register_channels(expected, recording.name, recording.layout, vector, infos, recording.cameras, png)
     except FormatError as err:
         findings.error("layout", str(err))
         return
-    here = {channel.topic: channel for channel in structure.channels.values()}
-    for channel in wanted.channels.values():
-        found = here.get(channel.topic)
-        schema = None if found is None else structure.schemas.get(found.schema_id)
-        if found is None or schema is None:
+    by_topic = {channel.topic: channel for channel in structure.channels.values()}
+    for channel in expected.channels.values():
+        defined = by_topic.get(channel.topic)
+        schema = None if defined is None else structure.schemas.get(defined.schema_id)
+        if defined is None or schema is None:
             findings.error("layout", "the channel is not defined in the file", channel=channel.topic)
             continue
-        expected = wanted.schemas[channel.schema_id]
-        same = (schema.name, schema.encoding, schema.data) == (expected.name, "ros2msg", expected.data)
-        if not same or found.message_encoding != "cdr":
+        wanted = expected.schemas[channel.schema_id]
+        same = (schema.name, schema.encoding, schema.data) == (wanted.name, "ros2msg", wanted.data)
+        if not same or defined.message_encoding != "cdr":
             findings.error("layout", "its schema is not the one its spaces have", channel=channel.topic)
 
 

@@ -325,7 +325,7 @@ def put(column: Any, places: slice | Array, values: Any) -> None:
 
 
 def _items_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The dtype of a row with each field of several numbers as one item of bytes: NumPy copies it twice as fast."""
+    """The dtype of a row with each field of several numbers as one item of bytes, which NumPy copies faster."""
     fields = [(name, *found[:2]) for name, found in (dtype.fields or {}).items()]
     spec: Any = {
         "names": [name for name, _, _ in fields],

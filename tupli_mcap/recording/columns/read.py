@@ -148,7 +148,7 @@ class StoredSteps(NamedTuple):
     where: str | None
     source: Source
 
-    def channels_of(self, envs: Array, leaf: str | None = None) -> Array:
+    def channels_of(self, envs: Array, leaf: str | None) -> Array:
         """The step channel (or that of an image leaf) of each sub-environment's number in `envs`."""
         if len(envs) and int(envs.max()) >= len(self.channels):
             raise FormatError(

@@ -16,7 +16,7 @@ from tupli_mcap.messages.episodes import record
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.recording import OpenFile
 
 __all__ = ["Assembler"]
 
@@ -59,15 +59,13 @@ class Assembler:
         """The time (ns) of a channel's last row, before which no other one may be."""
         return self._latest.get(channel, 0)
 
-    def copy_first(self, source: Recording, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
+    def copy_first(self, source: OpenFile, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
         """Copies chunks of the first `count` rows of a channel, which has the same id here; returns how many rows."""
         if self.next_row(channel) or count == 0:
             return 0
         if channel in self.container.codecs:  # only in memory they are of constant size
             dtype = None
-        for chunk, packed in first_chunks(
-            source._source, source._store, self.container, channel, count, dtype
-        ):
+        for chunk, packed in first_chunks(source, self.container, channel, count, dtype):
             self.container.place(chunk, packed)
             self._latest[channel] = int(chunk.rows.times[-1])
             self.copied += 1

@@ -15,15 +15,14 @@ from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows
 from tupli_mcap.mcap.records import CHUNK_HEAD
-from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
+from tupli_mcap.recording.recording import OpenFile
 
 __all__ = ["first_chunks"]
 
 
 def first_chunks(
-    source: Source,
-    store: ChunkStore,
+    file: OpenFile,
     container: Container,
     channel: int,
     count: int,
@@ -40,7 +39,7 @@ def first_chunks(
     Raises:
         FormatError: a chunk is damaged.
     """
-    end = 0
+    store, end = file.store, 0
     for chunk in store.chunks(channel):
         row = store.table[chunk]
         end += int(row["rows"])
@@ -50,10 +49,10 @@ def first_chunks(
             return
         data = store.load(chunk, keep=False)
         method = name.replace("none", "")
-        packed = source.read(offset, length)[CHUNK_HEAD.size + len(method) + 8 :]
+        packed = file.source.read(offset, length)[CHUNK_HEAD.size + len(method) + 8 :]
         definitions = container.definitions(channel) if int(row["first"]) == 0 else b""
         size = int(row["uncompressed"])
-        whole = decompress(method, memoryview(packed), size, source.name) if skip else data
+        whole = decompress(method, memoryview(packed), size, store.name) if skip else data
         if skip != len(definitions) or bytes(whole[:skip]) != definitions:
             return
         yield Prepared(_rows(store, chunk, channel, data, dtype), skip, whole, int(row["crc"])), packed

@@ -29,7 +29,7 @@ class NewFrames(Protocol):
 
 
 class EpisodeCopier:
-    """Copies episodes of `source` to `target`, behind those that are there.
+    """Appends episodes of `source` to `target`.
 
     Args:
         channels: the target's ids of the source's channels, where they differ.
@@ -51,23 +51,23 @@ class EpisodeCopier:
         self._source, self._target, self._shift = source, target, shift
         self._channels = channels or {}
         self._cameras, self._new_frames = cameras, frames
-        self._store, self._topics = source._store, source._topics
-        self._held: dict[
-            int, int
-        ] = {}  # times must not decrease, whatever the clock did between two episodes
+        self._file = source.file
+        self._store, self._topics = source.file.store, source.file.topics
+        # by channel, the time of the last new frame: times must not decrease, whatever the clock did
+        self._held: dict[int, int] = {}
 
     def run(self, rows: Array) -> None:
         """Copies the episodes that `rows` of the source's index name."""
         layout = self._source.layout
         firsts = np.zeros(len(rows), dtype=np.int64)
-        for env, channel in enumerate(self._source._step_channels):
-            mine = np.flatnonzero(rows["env"] == env)
-            mine = mine[np.argsort(rows["first_row"][mine], kind="stable")]
-            lengths = rows["length"][mine].astype(np.int64)
-            firsts[mine] = self._target.next_row(self._to(channel)) + np.cumsum(lengths) - lengths
-            spans = _merged([(int(rows["first_row"][i]), int(rows["length"][i])) for i in mine])
+        for env, channel in enumerate(self._file.steps):
+            chosen = np.flatnonzero(rows["env"] == env)
+            chosen = chosen[np.argsort(rows["first_row"][chosen], kind="stable")]
+            lengths = rows["length"][chosen].astype(np.int64)
+            firsts[chosen] = self._target.next_row(self._to(channel)) + np.cumsum(lengths) - lengths
+            spans = _merged([(int(rows["first_row"][i]), int(rows["length"][i])) for i in chosen])
             self._copy(channel, spans, layout.step_message.dtype if layout.constant else None)
-            topics = Topics.of_step(self._source._contents.channels[channel].topic)
+            topics = Topics.of_step(self._file.contents.channels[channel].topic)
             for leaf in layout.images:
                 images = self._topics[topics.image(leaf.name)]
                 self._copy(images, spans, layout.image_messages[leaf.name].dtype)
@@ -83,7 +83,7 @@ class EpisodeCopier:
     def _copy_first(self, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
         if self._shift or self._to(channel) != channel:
             return 0
-        return self._target.copy_first(self._source, channel, count, dtype)
+        return self._target.copy_first(self._file, channel, count, dtype)
 
     def _copy(self, channel: int, spans: list[tuple[int, int]], dtype: np.dtype[Any] | None) -> None:
         """Rows `spans` of a channel of steps or images, renumbered, in chunks of the usual size."""
@@ -91,8 +91,8 @@ class EpisodeCopier:
         if done:
             spans = [(done, spans[0][1] - done), *spans[1:]]
         if dtype is None:
-            found = (m for first, count in spans for m in self._messages(channel, first, count))
-            self._write(channel, found, numbered=True)
+            messages = (m for first, count in spans for m in self._messages(channel, first, count))
+            self._write(channel, messages, numbered=True)
             return
         self._target.add_rows(self._to(channel), self._rows(channel, spans, dtype))
 
@@ -119,8 +119,8 @@ class EpisodeCopier:
         moved = np.flatnonzero(places != np.arange(len(places)))
         done = self._copy_first(channel, int(moved[0]) if len(moved) else len(places), None)
         spans = _merged([(place, 1) for place in places[done:].tolist()])
-        found = (m for first, count in spans for m in self._messages(channel, first, count))
-        self._write(channel, found, numbered=numbered)
+        messages = (m for first, count in spans for m in self._messages(channel, first, count))
+        self._write(channel, messages, numbered=numbered)
 
     def _write(self, channel: int, messages: Iterable[tuple[int, bytes]], *, numbered: bool = False) -> None:
         """Adds messages of a channel (log_time, body); `numbered` ones begin with the number of an episode."""
@@ -186,23 +186,23 @@ class EpisodeCopier:
         source, new = self._source, self._new_frames
         for camera, channels in self._cameras.items():
             for env, (pictures, pairs) in enumerate(channels):
-                mine = rows[rows["env"] == env]
-                mine = mine[np.argsort(mine["first_row"], kind="stable")]
+                episodes = rows[rows["env"] == env]
+                episodes = episodes[np.argsort(episodes["first_row"], kind="stable")]
                 if new is not None and new.camera == camera:
                     for channel in (pictures, pairs):
-                        found = (self._frames_of(new, row, channel, channel == pictures) for row in mine)
-                        self._write(channel, (message for messages in found for message in messages))
+                        drawn = (self._frames_of(new, row, channel, channel == pictures) for row in episodes)
+                        self._write(channel, (message for messages in drawn for message in messages))
                 elif camera in source.cameras:
-                    places = [self._frame_rows(camera, row) for row in mine]
+                    places = [self._frame_rows(camera, row) for row in episodes]
                     joined = np.concatenate(places) if places else np.zeros(0, np.int64)
-                    theirs = source._cameras.channels(camera, env)
+                    theirs = self._file.cameras.channels(camera, env)
                     self._copy_places(theirs[0], joined, numbered=False)
                     self._copy_places(theirs[1], joined, numbered=True)
 
     def _frame_rows(self, camera: str, row: Any) -> Array:
         """Which rows of its channels show an episode."""
         number, length = int(row["episode"]), int(row["length"])
-        return self._source._cameras.rows(camera, int(row["env"]), number, length)[0]
+        return self._file.cameras.rows(camera, int(row["env"]), number, length)[0]
 
     def _frames_of(
         self, new: NewFrames, row: Any, channel: int, pictures: bool
@@ -221,17 +221,17 @@ class EpisodeCopier:
 
     def _infos(self, numbers: Array) -> None:
         channel = self._topics[INFO]
-        everything = self._messages(channel, 0, self._store.count(channel))
-        found = np.array([int.from_bytes(body[:4], "little") for _, body in everything], np.int64)
-        self._copy_places(channel, np.flatnonzero(np.isin(found, numbers)), numbered=True)
+        messages = self._messages(channel, 0, self._store.count(channel))
+        episodes = np.array([int.from_bytes(body[:4], "little") for _, body in messages], np.int64)
+        self._copy_places(channel, np.flatnonzero(np.isin(episodes, numbers)), numbered=True)
 
 
 def _places(rows: Any) -> list[int]:
-    """Where each of some rows comes once the others are gone."""
+    """The new row numbers of some rows, once the others are left out."""
     places = np.empty(len(rows), np.int64)
     places[np.argsort(rows, kind="stable")] = np.arange(len(rows))
-    found: list[int] = places.tolist()
-    return found
+    listed: list[int] = places.tolist()
+    return listed
 
 
 def _in_order(messages: list[tuple[int, bytes]], places: Sequence[int]) -> list[tuple[int, bytes]]:

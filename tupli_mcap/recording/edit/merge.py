@@ -90,19 +90,22 @@ def merge_recordings(
     with contextlib.ExitStack() as stack:
         opened = [stack.enter_context(Recording(source)) for source in sources]
         _check_target(target, opened, overwrite=overwrite)
-        found = sorted((r for r in opened if len(r)), key=lambda r: int(r.index["start_time"].min()))
-        if not found:
+        recordings = sorted((r for r in opened if len(r)), key=lambda r: int(r.index["start_time"].min()))
+        if not recordings:
             raise RecordingError("expected recordings with episodes to merge, found none")
-        _check_alike(found)
-        attachments = _attachments(found)
+        _check_alike(recordings)
+        attachments = _attachments(recordings)
         report = MergeReport(
-            target, len(found), sum(map(len, found)), sum(recording.num_steps for recording in found)
+            target,
+            len(recordings),
+            sum(map(len, recordings)),
+            sum(recording.num_steps for recording in recordings),
         )
         if dry_run:
             return report
         tidy(target.parent)
         with replacing(target) as (fd, _):
-            merged = _merge(found, Container(fd, str(target), compression), attachments)
+            merged = _merge(recordings, Container(fd, str(target), compression), attachments)
     if merged.held:
         warnings.warn(
             f"{merged.held:,} rows of {target} have the time of the row ahead of them, which was later than theirs: "
@@ -126,7 +129,7 @@ def _merge(
     container.define_channels()
     ids = {channel.topic: channel.id for channel in container.channels.values()}
     for recording, rows, shift in turns:
-        channels = {i: ids.get(topic, i) for topic, i in recording._topics.items()}
+        channels = {i: ids.get(topic, i) for topic, i in recording.file.topics.items()}
         cameras = {
             name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
             for name, pairs_of in camera_channels(recording, container).items()
@@ -160,18 +163,18 @@ def _numbered(
 ) -> tuple[list[tuple[Recording, np.ndarray, int]], int]:
     """(recording, rows of its index, what is added to its episodes' numbers) by turn, and the next free number."""
     last = {i: turn for turn, (i, _) in enumerate(turns)}
-    found = []
+    numbered = []
     free, begun = 0, set()
     for turn, (i, places) in enumerate(turns):
         recording = sources[i]
         rows = recording.index[places]
         shift = max(0, free - int(rows["episode"].min())) if i in begun else free
         free = shift + (
-            recording._contents.next_episode if last[i] == turn else int(rows["episode"].max()) + 1
+            recording.file.contents.next_episode if last[i] == turn else int(rows["episode"].max()) + 1
         )
         begun.add(i)
-        found.append((recording, rows, shift))
-    return found, free
+        numbered.append((recording, rows, shift))
+    return numbered, free
 
 
 def _metadata(source: Recording, *, next_episode: int) -> dict[str, str]:
@@ -186,14 +189,15 @@ def _metadata(source: Recording, *, next_episode: int) -> dict[str, str]:
 
 
 def _define_missing(source: Recording, container: Container) -> None:
-    """The channels of infos and cameras that the recordings before have not."""
+    """Adds the channels of infos and cameras that earlier sources do not have."""
     info = None
-    if INFO in source._topics:
-        channel = source._contents.channels[source._topics[INFO]]
-        text = source._contents.schemas[channel.schema_id].data.decode()
+    contents, topics = source.file.contents, source.file.topics
+    if INFO in topics:
+        channel = contents.channels[topics[INFO]]
+        text = contents.schemas[channel.schema_id].data.decode()
         info = text, {key: value for key, value in channel.metadata.items() if key != "crc"}
     vector = source.num_envs if source.is_vector else None
-    png = png_leaves(container.channels)  # as the first one has them, whatever the others have
+    png = png_leaves(container.channels)  # the first recording decides
     register_channels(container, source.name, source.layout, vector, info, source.cameras, png)
 
 
@@ -207,24 +211,24 @@ def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool
 
 def _check_alike(sources: Sequence[Recording]) -> None:
     first = sources[0]
-    description = first.layout.to_metadata()
+    expected = first.layout.to_metadata()
     seen = {(first.uuid, int(number)): first for number in first.index["episode"]}
     rows = sum(recording.num_steps for recording in sources)
     if rows > LAST_ROW:
         raise RecordingError(f"expected at most {LAST_ROW} steps in a recording, found {rows}; merge fewer")
     for other in sources[1:]:
-        found = other.layout.to_metadata()
+        description = other.layout.to_metadata()
         for name in _SPACES:
-            if found[name] != description[name]:
+            if description[name] != expected[name]:
                 raise SpaceError(
                     f"{other.name}: expected the {name} of {first.name}, {getattr(first.layout, name)}, found "
                     f"{getattr(other.layout, name)}; only recordings of the same spaces can be merged"
                 )
-        for name in sorted(description.keys() | found.keys()):
-            if found.get(name) != description.get(name):
+        for name in sorted(expected.keys() | description.keys()):
+            if description.get(name) != expected.get(name):
                 raise SpaceError(
-                    f"{other.name}: expected {name} as in {first.name}, {description.get(name)!s:.200}, found "
-                    f"{found.get(name)!s:.200}; steps of other layouts cannot be in one recording"
+                    f"{other.name}: expected {name} as in {first.name}, {expected.get(name)!s:.200}, found "
+                    f"{description.get(name)!s:.200}; steps of other layouts cannot be in one recording"
                 )
         if (other.is_vector, other.num_envs) != (first.is_vector, first.num_envs):
             raise SpaceError(
@@ -248,13 +252,13 @@ def _envs(recording: Recording) -> str:
 
 
 def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
-    """Those of all recordings, without statements that would no longer hold."""
-    found: dict[str, tuple[str, bytes]] = {}
+    """The attachments of all recordings, without statements that no longer hold."""
+    attachments: dict[str, tuple[str, bytes]] = {}
     digests = {name: digest for recording in sources for name, digest in _digest(recording)}
     if len(set(digests.values())) > 1:
-        one, other = list(digests)[:2]
+        first, other = list(digests)[:2]
         warnings.warn(
-            f"{other} carries another environment than {one}, or another version of it; the first one is kept",
+            f"{other} carries another environment than {first}, or another version of it; the first one is kept",
             UserWarning,
             stacklevel=3,
         )
@@ -264,12 +268,12 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
             if name in STATEMENTS or (name in _ENVIRONMENT and recording is not with_environment):
                 continue
             data = recording.read_attachment(name)
-            if found.setdefault(name, (info.media_type, data))[1] != data and name != "labels.json":
+            if attachments.setdefault(name, (info.media_type, data))[1] != data and name != "labels.json":
                 raise RecordingError(
                     f"{recording.name}: its attachment {name!r} differs from that of a recording before; a merged "
                     "recording can have one of a name only"
                 )
-    return found
+    return attachments
 
 
 def _digest(recording: Recording) -> Iterator[tuple[str, str]]:
@@ -339,7 +343,7 @@ def _groups(recording: Recording, episodes: int | None, max_bytes: int | None) -
 
 
 def _write_part(recording: Recording, part: Part, numbers: list[int], compression: str) -> Part:
-    metadata = _metadata(recording, next_episode=recording._contents.next_episode)
+    metadata = _metadata(recording, next_episode=recording.file.contents.next_episode)
     with replacing(part.path) as (fd, _):
         container = Container(fd, str(part.path), compression)
         copied = write(recording, container, metadata, numbers, {}, signed=False, left_out=STATEMENTS)

@@ -1,4 +1,4 @@
-"""`recover_recording`: everything good in a damaged recording, in a new one; what was lost, said exactly."""
+"""`recover_recording`: saves everything good in a damaged recording in a new one, and says what was lost."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def recover_recording(
         with replacing(goal) as (fd, temporary):
             report = _recover(opened, fd, compression)
             if not _signature_fits(temporary):
-                os.ftruncate(fd, os.lseek(fd, 0, os.SEEK_SET))
+                os.ftruncate(fd, 0)
                 report = _recover(opened, fd, compression, leave_out=SIGNATURE_NAME)
                 report.attachments_lost = [n for n in report.attachments_lost if n != SIGNATURE_NAME]
                 report.notes.append("its signature is left out: it is not of what could be saved")
@@ -304,7 +304,7 @@ def _infos_lost(evidence: Evidence, channels: RecordedChannels) -> int:
 
 
 def _attachments_lost(evidence: Evidence) -> list[str]:
-    """Names of the attachments that are not here, as far as anything tells."""
+    """Names of the attachments that are lost, as far as the file shows."""
     summary = evidence.tail.summary
     known = set() if summary is None else set(summary.attachments)
     known |= {attachment_name(evidence.source, damage) or INDEX_NAME for damage in evidence.damages}
@@ -314,12 +314,12 @@ def _attachments_lost(evidence: Evidence) -> list[str]:
 def _ends(evidence: Evidence) -> list[DamagedPlace]:
     """Damage of the first and the last bytes of the file, from which nothing is taken."""
     source, tail = evidence.source, evidence.tail
-    found = []
+    places = []
     if source.read(0, min(len(MAGIC), source.size)) != MAGIC:
-        found.append(DamagedPlace(0, min(len(MAGIC), source.size), "expected the magic of MCAP"))
+        places.append(DamagedPlace(0, min(len(MAGIC), source.size), "expected the magic of MCAP"))
     if tail.finished and tail.summary is None and not tail.why:
-        found.append(DamagedPlace(source.size, 0, "the footer is damaged or cut off"))
-    return found
+        places.append(DamagedPlace(source.size, 0, "the footer is damaged or cut off"))
+    return places
 
 
 def _places(damages: list[Damage]) -> list[DamagedPlace]:

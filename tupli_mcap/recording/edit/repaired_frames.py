@@ -1,4 +1,4 @@
-"""The frames of a damaged recording: those of steps that are kept, whose picture and whose row are both here."""
+"""The frames of a damaged recording: those of kept steps of which both the picture and its row are left."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["OldCameras", "frames_lost", "kept_frames"]
 
 
 class KeptFrame(NamedTuple):
-    """A picture's message and what its row has to say now."""
+    """A picture's message, and the message of its row with the new numbers; `time_ns` is that of both."""
 
     time_ns: int
     picture: bytes
@@ -42,14 +42,14 @@ class OldCameras(NamedTuple):
     def of(cls, evidence: Evidence, num_envs: int, vector: bool) -> OldCameras:
         """The cameras of which all channels are known, with the schemas they must have."""
         topics = {channel.topic: channel for channel in evidence.channels.values()}
-        found: dict[str, tuple[tuple[int, int], ...]] = {}
+        cameras: dict[str, tuple[tuple[int, int], ...]] = {}
         for name in camera_names({topic: channel.id for topic, channel in topics.items()}):
             pairs = [CameraTopics.of(name, env if vector else None) for env in range(num_envs)]
             known = [(topics.get(pair.camera), topics.get(pair.frame)) for pair in pairs]
             ids = tuple((a.id, b.id) for a, b in known if a is not None and b is not None)
             if len(ids) == num_envs and all(_fits(evidence, *pair) for pair in known):
-                found[name] = ids
-        return cls(tuple(found), tuple(found.values()))
+                cameras[name] = ids
+        return cls(tuple(cameras), tuple(cameras.values()))
 
 
 def _fits(evidence: Evidence, camera: Channel | None, frame: Channel | None) -> bool:
@@ -72,20 +72,20 @@ def kept_frames(
                 numbers, rows["episode"].tolist(), rows["step"].tolist(), rows["#log_time"], strict=True
             )
             for row, number, step, time_ns in values:
-                found = pieces.find(number, step, state=True)
-                if found is not None:
+                place = pieces.find(number, step, state=True)
+                if place is not None:
                     picture = store.message(camera, store.packed(camera, row))
-                    yield KeptFrame(int(time_ns), picture, encode_pair(*found))
+                    yield KeptFrame(int(time_ns), picture, encode_pair(*place))
 
 
 def frames_lost(evidence: Evidence, cameras: OldCameras) -> int:
-    """Frames that are known to have been there and are not here whole."""
+    """How many frames are known to have been recorded, and are not left whole."""
     lost = 0
     for pair in (pair for ids in cameras.ids for pair in ids):
-        here = intersection(*(evidence.ranges(channel) for channel in pair))
+        whole = intersection(*(evidence.ranges(channel) for channel in pair))
         stops = [ranges[-1][1] for ranges in map(evidence.ranges, pair) if ranges]
         if evidence.tail.index is not None:
             table = evidence.tail.index.chunks
             stops += [int(table["rows"][table["channel"] == channel].sum()) for channel in pair]
-        lost += max(stops, default=0) - sum(b - a for a, b in here)
+        lost += max(stops, default=0) - sum(b - a for a, b in whole)
     return lost

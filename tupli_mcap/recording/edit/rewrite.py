@@ -51,7 +51,7 @@ def rewrite_recording(
     metadata = {key: value for key, value in source.metadata.items() if key not in ("journal", "replaced")}
     if benchmark_id is not None:
         metadata["benchmark_id"] = benchmark_id
-    metadata["next_episode"] = str(source._contents.next_episode)
+    metadata["next_episode"] = str(source.file.contents.next_episode)
     metadata["rewritten"] = uuid.uuid4().hex
     same = episodes is None and benchmark_id in (None, source.benchmark_id) and frames is None
     with replacing(target) as (fd, _):
@@ -70,8 +70,13 @@ def write(
     signed: bool,
     left_out: Sequence[str] = (),
 ) -> int:
-    """Writes a recording of some of a source's episodes, other than the attachments `left_out`; returns how many chunks
-    were copied. A signature is kept if the contents are still what was `signed`."""
+    """Writes some of a source's episodes, and its attachments but those `left_out`, to a new recording.
+
+    `signed`: the episodes are still those that were signed; a signature is kept then, if the attachments allow it.
+
+    Returns:
+        How many chunks were copied as they are.
+    """
     kept = {name: info for name, info in source.attachments.items() if name not in attachments}
     if not (signed and stays_signed(source.attachments, attachments)):
         kept.pop(SIGNATURE_NAME, None)
@@ -96,9 +101,9 @@ def write(
 
 def define(source: Recording, target: Assembler) -> None:
     """The source's channels and schemas, with the ids that they have there."""
-    container, contents = target.container, source._contents
+    container, contents = target.container, source.file.contents
     container.schemas, container.channels = dict(contents.schemas), dict(contents.channels)
-    container.codecs = image_codecs(source.layout, contents.channels) if source._step_channels else {}
+    container.codecs = image_codecs(source.layout, contents.channels) if source.file.steps else {}
     container.counts = dict.fromkeys(contents.channels, 0)
 
 
@@ -106,11 +111,11 @@ def camera_channels(
     source: Recording, container: Container, new: NewFrames | None = None
 ) -> dict[str, list[tuple[int, int]]]:
     """By camera, then by sub-environment, the ids of its channels; those of a new camera are added."""
-    cameras = source._cameras
+    cameras = source.file.cameras
     envs = range(source.num_envs)
-    found = {name: [cameras.channels(name, env) for env in envs] for name in cameras.names}
-    if new is not None and new.camera not in found:
+    channels = {name: [cameras.channels(name, env) for env in envs] for name in cameras.names}
+    if new is not None and new.camera not in channels:
         vector = source.num_envs if source.is_vector else None
         where = (container, source.name, source.layout, vector, None, (new.camera,))
-        found[new.camera] = register_channels(*where, png_leaves(source._contents.channels)).cameras
-    return found
+        channels[new.camera] = register_channels(*where, png_leaves(source.file.contents.channels)).cameras
+    return channels

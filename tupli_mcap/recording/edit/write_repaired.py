@@ -52,22 +52,25 @@ class RepairWriter:
 
     def begin(self, next_episode: int | None) -> None:
         """Magic, header, metadata and the attachments that are good. No later episode gets a number that was lost."""
-        container, found = self._container, self._evidence
+        container, evidence = self._container, self._evidence
         metadata = self._metadata_of_recording()
         if next_episode is not None:
             metadata["next_episode"] = str(next_episode)
         self._target.begin(metadata, {}, self._now)
-        for attachment in found.attachments.values():
+        for attachment in evidence.attachments.values():
             offset = container.position
             for at in range(attachment.offset, attachment.offset + attachment.length, _COPY):
-                container.write(found.source.read(at, min(_COPY, attachment.offset + attachment.length - at)))
+                container.write(
+                    evidence.source.read(at, min(_COPY, attachment.offset + attachment.length - at))
+                )
             moved = type(attachment)(**{**attachment.__dict__, "offset": offset})
             container.attachment_indexes.append(moved)
 
     def _metadata_of_recording(self) -> dict[str, str]:
         """The recording's metadata; what is lost or damaged of it is made anew."""
-        known = self._evidence.metadata or {}
-        found = {key: value for key, value in known.items() if key not in ("journal", "replaced")}
+        old = dict(self._evidence.metadata or {})
+        for key in ("journal", "replaced"):
+            old.pop(key, None)
         made = {
             "uuid": uuid.uuid4().hex,
             "format_version": "2" if uses_codecs(self._evidence.channels) else "1",
@@ -75,9 +78,9 @@ class RepairWriter:
             "created_ns": str(self._now),
             "benchmark_id": "",
         }
-        kept = {key: found[key] for key in made if key in found and _METADATA[key].fullmatch(found[key])}
+        kept = {key: old[key] for key in made if key in old and _METADATA[key].fullmatch(old[key])}
         self.metadata_lost = [key for key in made if key not in kept]
-        others = {key: value for key, value in found.items() if key not in made}
+        others = {key: value for key, value in old.items() if key not in made}
         # Rows have other numbers now: a journal of the damaged file must not merge into this one.
         return {**others, **made, **kept, "rewritten": uuid.uuid4().hex}
 
@@ -104,37 +107,39 @@ class RepairWriter:
         self._container.define_channels()
         rows: dict[int, int] = {}  # first row of each episode in the new file
         dtype = layout.step_message.dtype if layout.constant else None
-        of: dict[int, list[PlannedEpisode]] = {}
+        by_env: dict[int, list[PlannedEpisode]] = {}
         for episode in plan.episodes:
-            of.setdefault(episode.run.env, []).append(episode)
+            by_env.setdefault(episode.run.env, []).append(episode)
         for env, channel in enumerate(old.steps):
-            mine = of.get(env, [])
+            episodes = by_env.get(env, [])
             at = 0
-            for episode in mine:
+            for episode in episodes:
                 rows[episode.number] = at
                 at += episode.run.steps
-            self._copy(store, channel, new.steps[env], mine, dtype, patch=True)
+            self._copy(store, channel, new.steps[env], episodes, dtype, patch=True)
             for leaf, ids in zip(layout.images, new.images, strict=True):
                 image = old.images[leaf.name][env]
                 if image is not None:
                     image_type = layout.image_messages[leaf.name].dtype
-                    self._copy(store, image, ids[env], mine, image_type, patch=False)
-        self._events(store, layout, old, new, plan, rows)
+                    self._copy(store, image, ids[env], episodes, image_type, patch=False)
+        self._events(store, old, new, plan, rows)
         if old.info is not None and new.info is not None:
             self._target.add_messages(new.info, self._infos(store, old.info, plan))
         topics = {channel.topic: channel.id for channel in self._container.channels.values()}
         for name, pairs in zip(cameras.names, cameras.ids, strict=True):
             for env, pair in enumerate(pairs):
-                goal = CameraTopics.of(name, env if vector else None)
-                self._frames(store, pair, (topics[goal.camera], topics[goal.frame]), of.get(env, []))
+                new_topics = CameraTopics.of(name, env if vector else None)
+                self._frames(
+                    store, pair, (topics[new_topics.camera], topics[new_topics.frame]), by_env.get(env, [])
+                )
 
     def _frames(
         self, store: PackedStore, old: tuple[int, int], new: tuple[int, int], episodes: list[PlannedEpisode]
     ) -> None:
         """The frames of one camera, which keep their times."""
-        found = partial(kept_frames, self._evidence, store, old, episodes)
-        self._target.add_messages(new[0], ((frame.time_ns, frame.picture) for frame in found()))
-        self._target.add_messages(new[1], ((frame.time_ns, frame.pair) for frame in found()))
+        frames = partial(kept_frames, self._evidence, store, old, episodes)
+        self._target.add_messages(new[0], ((frame.time_ns, frame.picture) for frame in frames()))
+        self._target.add_messages(new[1], ((frame.time_ns, frame.pair) for frame in frames()))
 
     def finish(self) -> None:
         """The index, the summary and the footer."""
@@ -194,7 +199,6 @@ class RepairWriter:
     def _events(
         self,
         store: PackedStore,
-        layout: StepLayout,
         old: RecordedChannels,
         new: Channels,
         plan: Plan,
@@ -220,12 +224,12 @@ class RepairWriter:
                 start_rows[end.episode], end_rows[end.episode], final_rows.get(end.episode, -1),
                 end.episode, end.env, end.end, text,
             )  # fmt: skip
-        told = (
+        messages = (
             (time, start._replace(first_row=rows[e.number]).encode())
             for e in starts
             for time, start, _ in (*e.resets, e.start)
         )
-        self._target.add_messages(new.start, told)
+        self._target.add_messages(new.start, messages)
         self._target.add_messages(new.end, ((e.end.time, moved[e.number].encode()) for e in ends))
         self._target.add_messages(
             new.final_state, ((e.end.time, self._final(e, store, old)) for e in with_final)
@@ -237,21 +241,21 @@ class RepairWriter:
         if episode.whole:
             return text
         try:
-            found = json.loads(text)
+            parsed = json.loads(text)
         except ValueError:
-            found = {}
-        values: dict[str, Any] = found if isinstance(found, dict) else {}
+            parsed = {}
+        metadata: dict[str, Any] = parsed if isinstance(parsed, dict) else {}
         origin: dict[str, Any] = {
             "episode": episode.run.episode,
             "first_step": episode.run.step,
             "length": episode.length,
         }
-        if RECOVERED in values:
-            origin[RECOVERED] = values[RECOVERED]
+        if RECOVERED in metadata:
+            origin[RECOVERED] = metadata[RECOVERED]
         if last and episode.orphan not in ("", "{}"):
             with contextlib.suppress(ValueError):
                 origin["metadata"] = json.loads(episode.orphan)
-        return json.dumps({**values, RECOVERED: origin})
+        return json.dumps({**metadata, RECOVERED: origin})
 
     def _final(self, episode: PlannedEpisode, store: PackedStore, old: RecordedChannels) -> bytes:
         if old.final is None or episode.final is None or episode.final < 0:
@@ -265,6 +269,6 @@ class RepairWriter:
         pieces = NewPlaces(plan.episodes)
         for _, log_time, body in store.all_messages(channel):
             number, step = int.from_bytes(body[:4], "little"), int.from_bytes(body[4:8], "little")
-            found = pieces.find(number, step)
-            if found is not None:
-                yield log_time, b"".join(n.to_bytes(4, "little") for n in found) + bytes(body[8:])
+            place = pieces.find(number, step)
+            if place is not None:
+                yield log_time, b"".join(n.to_bytes(4, "little") for n in place) + bytes(body[8:])

@@ -106,10 +106,10 @@ def take_rows(
 ) -> None:
     """The same of a journal whose channels are known; takes the steps of `channels`, which may be those of the first
     sub-environments."""
-    known = {channel: evidence.stop(channel) for channel in evidence.pieces} if evidence.strict else {}
+    in_file = {channel: evidence.stop(channel) for channel in evidence.pieces} if evidence.strict else {}
     for name in journal.areas:
         if name in EVENT_AREAS or name.startswith(FRAMES_AREA):
-            _take_log(evidence, journal, name, known)
+            _take_log(evidence, journal, name, in_file)
     # under same-step autoreset; and it is not known what else of that step was lost
     evidence.final_lost = journal.torn and bool(journal.info.get("vector"))
     taking = _Steps(evidence, journal, layout, channels)
@@ -163,10 +163,10 @@ def _take_log(
 
 def _take_tables(evidence: Evidence, channel: int, tables: Iterable[Array]) -> None:
     """Takes rows of constant size, completed."""
-    found = [
+    completed = [
         even_rows(channel, int(rows["#sequence"][0]), rows.view(np.uint8).tobytes(), rows) for rows in tables
     ]
-    evidence.add_rows(channel, found)
+    evidence.add_rows(channel, completed)
 
 
 class _Steps:
@@ -202,10 +202,10 @@ class _Steps:
         for rows in tables:
             first = int(rows["#sequence"][0])
             RowDeriver(*self._row_before(channel, first)).fill(rows)
-            begun = self._starts.get((env, int(rows["episode"][0])))
-            if begun is not None and begun <= first:
+            first_row = self._starts.get((env, int(rows["episode"][0])))
+            if first_row is not None and first_row <= first:
                 same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
-                rows["step"][:same] = first - begun + np.arange(same)
+                rows["step"][:same] = first - first_row + np.arange(same)
         _take_tables(evidence, channel, tables)
         stop = evidence.stop(channel)
         finals = {(env, hole.row): hole for hole in committed.finals(layout.state_end) if hole.row <= stop}
@@ -261,11 +261,11 @@ class _Steps:
 
 def _starts(store: PackedStore, channels: RecordedChannels) -> dict[tuple[int, int], int]:
     """First rows of episodes, by sub-environment and number."""
-    found = {}
+    first_rows = {}
     for _, _, body in store.all_messages(channels.start):
         try:
             start = EpisodeStart.decode(body)
         except FormatError:
             continue
-        found[start.env, start.episode] = start.first_row
-    return found
+        first_rows[start.env, start.episode] = start.first_row
+    return first_rows

@@ -41,18 +41,18 @@ def gather(source: Source, tail: Tail) -> Evidence:
         evidence.schemas, evidence.channels = dict(tail.summary.schemas), dict(tail.summary.channels)
     chunks: dict[int, list[_FoundChunk]] = {}
     indexed: ChunkRecords | None = None  # of the last chunk, whose message index comes next
-    for found in Walk(source, known=tail.known_chunks(), end=tail.data_end):
-        if isinstance(found, Damage):
-            evidence.damages.append(found)
-        elif found.chunk is not None:
-            indexed = _take_chunk(evidence, found, found.chunk, chunks)
+    for item in Walk(source, known=tail.known_chunks(), end=tail.data_end):
+        if isinstance(item, Damage):
+            evidence.damages.append(item)
+        elif item.chunk is not None:
+            indexed = _take_chunk(evidence, item, item.chunk, chunks)
         else:
-            if found.opcode == Opcode.MESSAGE_INDEX and indexed is not None:
-                _check_index(evidence, found, indexed)
+            if item.opcode == Opcode.MESSAGE_INDEX and indexed is not None:
+                _check_index(evidence, item, indexed)
             indexed = None
-            _take(evidence, found)
-    for channel, mine in chunks.items():
-        _take_rows(evidence, channel, mine)
+            _take(evidence, item)
+    for channel, found_chunks in chunks.items():
+        _take_rows(evidence, channel, found_chunks)
     evidence.damages.sort(key=lambda damage: damage.offset)
     evidence.good_end = evidence.damages[0].offset if evidence.damages else source.size
     return evidence
@@ -62,91 +62,90 @@ class _FoundChunk(NamedTuple):
     offset: int
     length: int
     piece: Piece
-    repaired: str  # what is wrong in its header
+    repaired: str  # what is wrong with its header
 
 
-def _check_index(evidence: Evidence, found: Found, records: ChunkRecords) -> None:
-    number, entries = message_index(found.body)
+def _check_index(evidence: Evidence, record: Found, records: ChunkRecords) -> None:
+    number, entries = message_index(record.body)
     if number != records.channel or not np.array_equal(entries, records.index_entries()):
-        _add_damage(evidence, found, "the message index says other than its chunk holds")
+        _add_damage(evidence, record, "the message index says other than its chunk holds")
 
 
-def _add_damage(evidence: Evidence, found: Found, why: str) -> None:
-    """What is wrong with a record that is whole."""
-    evidence.damages.append(Damage(found.offset, found.offset + found.length, why, found.opcode))
+def _add_damage(evidence: Evidence, record: Found, why: str) -> None:
+    """Notes as damage what a whole record says wrongly."""
+    evidence.damages.append(Damage(record.offset, record.offset + record.length, why, record.opcode))
 
 
-def _take(evidence: Evidence, found: Found) -> None:
+def _take(evidence: Evidence, record: Found) -> None:
     """Takes a record that is no chunk."""
     name = evidence.source.name
-    if found.attachment is not None:
-        if found.attachment.name != INDEX_NAME:
-            evidence.attachments[found.attachment.name] = found.attachment
-    elif found.opcode == Opcode.HEADER:
-        evidence.profile = parse_record(found.opcode, found.body, found.offset, name).profile
-    elif found.opcode == Opcode.METADATA:
-        record: Metadata = parse_record(found.opcode, found.body, found.offset, name)
-        if record.name == RECORDING_METADATA and evidence.metadata is None:
-            _take_metadata(evidence, record.metadata, found)
-    elif found.opcode == Opcode.SCHEMA:
-        schema: Schema = parse_record(found.opcode, found.body, found.offset, name)
+    if record.attachment is not None:
+        if record.attachment.name != INDEX_NAME:
+            evidence.attachments[record.attachment.name] = record.attachment
+    elif record.opcode == Opcode.HEADER:
+        evidence.profile = parse_record(record.opcode, record.body, record.offset, name).profile
+    elif record.opcode == Opcode.METADATA:
+        metadata: Metadata = parse_record(record.opcode, record.body, record.offset, name)
+        if metadata.name == RECORDING_METADATA and evidence.metadata is None:
+            _take_metadata(evidence, metadata.metadata, record)
+    elif record.opcode == Opcode.SCHEMA:
+        schema: Schema = parse_record(record.opcode, record.body, record.offset, name)
         evidence.schemas.setdefault(schema.id, schema)
-    elif found.opcode == Opcode.CHANNEL:
-        channel: Channel = parse_record(found.opcode, found.body, found.offset, name)
-        if _is_whole(evidence, channel, found):
+    elif record.opcode == Opcode.CHANNEL:
+        channel: Channel = parse_record(record.opcode, record.body, record.offset, name)
+        if _is_whole(evidence, channel, record):
             evidence.channels.setdefault(channel.id, channel)
 
 
-def _take_metadata(evidence: Evidence, values: dict[str, str], found: Found) -> None:
+def _take_metadata(evidence: Evidence, values: dict[str, str], record: Found) -> None:
     try:
         evidence.metadata = check_crc(values, RECORDING_KEYS, "the recording's metadata")
     except FormatError as err:
-        _add_damage(evidence, found, str(err))
+        _add_damage(evidence, record, str(err))
     else:
         check_version(evidence.metadata, evidence.source.name)
 
 
-def _is_whole(evidence: Evidence, channel: Channel, found: Found) -> bool:
+def _is_whole(evidence: Evidence, channel: Channel, record: Found) -> bool:
     """Whether a channel's metadata have the checksum they say."""
     try:
         if is_ours(channel.topic):
             check_crc(channel.metadata, CHANNEL_KEYS, f"the metadata of channel {channel.topic!r:.80}")
     except FormatError as err:
-        _add_damage(evidence, found, str(err))
+        _add_damage(evidence, record, str(err))
         return False
     return True
 
 
 def _take_chunk(
-    evidence: Evidence, found: Found, chunk: Chunk, chunks: dict[int, list[_FoundChunk]]
+    evidence: Evidence, record: Found, chunk: Chunk, chunks: dict[int, list[_FoundChunk]]
 ) -> ChunkRecords | None:
     """Adds a chunk to those of its channel; returns what is in it, None if that is no good."""
     try:
-        records = chunk_records(chunk.data, "the chunk", chunk.packed)
+        content = chunk_records(chunk.data, "the chunk", chunk.packed)
         if not chunk.crc:
             raise FormatError("the chunk has no CRC")
     except FormatError as err:
-        _add_damage(evidence, found, str(err))
+        _add_damage(evidence, record, str(err))
         return None
     if evidence.tail.summary is None:  # these have a CRC, those outside of chunks have none
-        evidence.schemas |= {schema.id: schema for schema in records.schemas}
-        evidence.channels |= {channel.id: channel for channel in records.channels}
-    channel, count, size = records.channel, len(records.headers), len(chunk.data)
-    piece = Piece(records.first, count, records.row(found.offset, found.length, chunk))
-    if found.repaired:
-        claim = ChunkClaim(found.length, size, chunk.compression, chunk.crc)
-        place = RepairedChunk(found.offset, claim, records.skip)
-        piece = evidence.load(place, channel, records.first, count, size - records.skip)
-    mine = chunks.setdefault(channel, [])
-    mine.append(_FoundChunk(found.offset, found.length, piece, found.repaired))
-    return records
+        evidence.schemas |= {schema.id: schema for schema in content.schemas}
+        evidence.channels |= {channel.id: channel for channel in content.channels}
+    channel, count, size = content.channel, len(content.headers), len(chunk.data)
+    piece = Piece(content.first, count, content.row(record.offset, record.length, chunk))
+    if record.repaired:
+        claim = ChunkClaim(record.length, size, chunk.compression, chunk.crc)
+        place = RepairedChunk(record.offset, claim, content.skip)
+        piece = evidence.load(place, channel, content.first, count, size - content.skip)
+    chunks.setdefault(channel, []).append(_FoundChunk(record.offset, record.length, piece, record.repaired))
+    return content
 
 
 def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> None:
-    """Takes the chunks of a channel, in whatever order they lie in the file."""
-    left = set(evidence.add(channel, [chunk.piece for chunk in chunks]))
+    """Takes the chunks of a channel, in any order."""
+    left_out = set(evidence.add(channel, [chunk.piece for chunk in chunks]))
     for chunk in chunks:
-        if chunk.piece in left:
+        if chunk.piece in left_out:
             why = "the chunk holds rows that another one holds"
             evidence.damages.append(Damage(chunk.offset, chunk.offset + chunk.length, why, Opcode.CHUNK))
         elif chunk.repaired:
@@ -154,7 +153,7 @@ def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> N
 
 
 def may_be_recording(source: Source, tail: Tail) -> bool:
-    """Whether the file is to be looked at as one of ours: False if it says that it is something else."""
+    """Whether the file may be one of ours: False if it says that it is something else."""
     if tail.index is not None or source.size < len(MAGIC) + 9:
         return True
     if tail.summary is not None and RECORDING_METADATA in tail.summary.metadata:
@@ -169,6 +168,6 @@ def may_be_recording(source: Source, tail: Tail) -> bool:
 
 
 def is_recording(evidence: Evidence) -> bool:
-    """Whether the file is one of ours, as far as it can be told."""
+    """Whether anything in the file shows that it is one of ours."""
     known = evidence.profile == PROFILE or evidence.metadata is not None or evidence.tail.index is not None
     return known or any("observation_space" in channel.metadata for channel in evidence.channels.values())

@@ -1,4 +1,4 @@
-"""Which episodes there are, from all that is here of them: runs of steps, starts, ends, final states, the index.
+"""Which episodes there are, from all that is left of them: runs of steps, starts, ends, final states, the index.
 
 An episode whose steps are all here is one. Where rows are missing in between, each run of consecutive steps becomes an
 episode: the first keeps the number, only that with the old last step ends as the old one did.
@@ -42,7 +42,7 @@ class Start(NamedTuple):
 
 
 class End(NamedTuple):
-    """The same of an end."""
+    """The end of an episode, in the same way."""
 
     time: int
     end: EpisodeEnd
@@ -50,10 +50,10 @@ class End(NamedTuple):
 
 
 @dataclass
-class Told:
+class EpisodeRecords:
     """What the messages of the episode channels and the index say, by episode.
 
-    `resets` are those without a step before an episode's. `ignored` are ends whose steps are not all here.
+    `resets` are those before an episode that no step followed. `ignored` are ends whose steps are not all left.
     """
 
     starts: dict[int, Start] = field(default_factory=dict)
@@ -65,11 +65,11 @@ class Told:
 
 
 class PlannedEpisode(NamedTuple):
-    """An episode that there is. `whole`: all of it is here.
+    """An episode of the recovered recording. `whole`: all of the old one is left.
 
     `head`, `tail`: its first step was the old one's first, its last one the old one's last. `length`: of the old
     episode, None if not known. `final`: its row in `/final_state` (as packed), RUNNING, IN_A_HOLE, or None if there is
-    none. `orphan`: metadata of the old episode, whose last step is not here. `resets`: without a step, before it.
+    none. `orphan`: metadata of the old episode, whose last step is lost. `resets`: those before it without a step.
     """
 
     number: int
@@ -89,11 +89,11 @@ class PlannedEpisode(NamedTuple):
 class Plan:
     """The episodes in the order of their rows, and what had to be made.
 
-    `here`, `totals`: rows that are kept, and how many there were, by sub-environment.
+    `kept`, `totals`: rows that are kept, and how many there were, by sub-environment.
     """
 
-    told: Told
-    here: dict[int, Ranges]
+    records: EpisodeRecords
+    kept: dict[int, Ranges]
     totals: list[int]
     episodes: list[PlannedEpisode] = field(default_factory=list)
     lost_starts: list[int] = field(default_factory=list)
@@ -103,7 +103,7 @@ class Plan:
 
 
 class NewPlaces:
-    """The episodes that are made of each old one, by the steps that they have of it."""
+    """Finds steps of old episodes in the episodes that were made of them."""
 
     def __init__(self, episodes: Iterable[PlannedEpisode]) -> None:
         self._of: dict[int, list[PlannedEpisode]] = {}
@@ -131,29 +131,29 @@ def final_state(evidence: Evidence, episode: PlannedEpisode) -> bytes:
 
 
 def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channels: RecordedChannels) -> Plan:
-    """Decides what becomes of every row that is here.
+    """Decides which episode each row that is left belongs to.
 
     Raises:
         FormatError: with `evidence.strict`, a step, a start or an end cannot be decoded.
     """
     runs = list(step_runs(evidence, store, layout, channels))
-    here: dict[int, Ranges] = {env: [] for env in range(len(channels.steps))}
+    kept: dict[int, Ranges] = {env: [] for env in range(len(channels.steps))}
     for run in runs:
-        here[run.env].append((run.row, run.stop))
-    told = _read_told(evidence, store, channels)
+        kept[run.env].append((run.row, run.stop))
+    records = _read_records(evidence, store, channels)
     if evidence.strict:
-        _ignore_ends(told, here)
-    _add_index(told, evidence.tail.index)
-    plan = Plan(told, here, _totals(evidence, channels, told))
+        _ignore_ends(records, kept)
+    _add_index(records, evidence.tail.index)
+    plan = Plan(records, kept, _totals(evidence, channels, records))
     return _Planner(evidence, plan, runs, channels, images=bool(layout.images)).run()
 
 
-# ---- what is told
+# ---- what is recorded of them
 
 
-def _read_told(evidence: Evidence, store: PackedStore, channels: RecordedChannels) -> Told:
+def _read_records(evidence: Evidence, store: PackedStore, channels: RecordedChannels) -> EpisodeRecords:
     """Starts, ends and final states that are here; in repair, messages that cannot be decoded are passed over."""
-    told = Told()
+    records = EpisodeRecords()
     for row, time, body in store.all_messages(channels.start):
         try:
             start = EpisodeStart.decode(body)
@@ -161,9 +161,9 @@ def _read_told(evidence: Evidence, store: PackedStore, channels: RecordedChannel
             if evidence.strict:
                 raise
             continue
-        if start.episode in told.starts:
-            told.resets.setdefault(start.episode, []).append(told.starts[start.episode])
-        told.starts[start.episode] = Start(time, start, row)
+        if start.episode in records.starts:
+            records.resets.setdefault(start.episode, []).append(records.starts[start.episode])
+        records.starts[start.episode] = Start(time, start, row)
     for row, time, body in store.all_messages(channels.end):
         try:
             end = EpisodeEnd.decode(body)
@@ -171,30 +171,30 @@ def _read_told(evidence: Evidence, store: PackedStore, channels: RecordedChannel
             if evidence.strict:
                 raise
             continue
-        told.ends[end.episode] = End(time, end, row)
+        records.ends[end.episode] = End(time, end, row)
     for row, _, body in store.all_messages(channels.final):
-        told.finals[int.from_bytes(body[:4], "little")] = row
-    return told
+        records.finals[int.from_bytes(body[:4], "little")] = row
+    return records
 
 
-def _ignore_ends(told: Told, here: dict[int, Ranges]) -> None:
+def _ignore_ends(records: EpisodeRecords, kept: dict[int, Ranges]) -> None:
     """Forgets the ends whose steps are not all here, or whose first row is not their start's."""
-    for number, (_, end, _) in list(told.ends.items()):
-        rows = here.get(end.env, [])
-        start = told.starts[number].start if number in told.starts else end
+    for number, (_, end, _) in list(records.ends.items()):
+        rows = kept.get(end.env, [])
+        start = records.starts[number].start if number in records.starts else end
         begins = (start.env, start.first_row) == (end.env, end.first_row)
         if not begins or end.first_row + end.length > (rows[-1][1] if rows else 0):
-            del told.ends[number]
-            told.ignored.append(number)
+            del records.ends[number]
+            records.ignored.append(number)
 
 
-def _add_index(told: Told, index: EpisodeIndex | None) -> None:
+def _add_index(records: EpisodeRecords, index: EpisodeIndex | None) -> None:
     """Takes the ends that only the index has."""
     if index is None:
         return
     for i, row in enumerate(index.episodes):
-        told.index[int(row["episode"])] = i
-        if int(row["episode"]) in told.ends:
+        records.index[int(row["episode"])] = i
+        if int(row["episode"]) in records.ends:
             continue
         try:
             metadata = index.metadata_text(i)
@@ -204,11 +204,11 @@ def _add_index(told: Told, index: EpisodeIndex | None) -> None:
             int(row["episode"]), int(row["env"]), int(row["first_row"]), int(row["length"]), float(row["return"]),
             int(row["end"]), int(row["final_row"]) >= 0, metadata,
         )  # fmt: skip
-        told.ends[end.episode] = End(int(row["end_time"]), end)
+        records.ends[end.episode] = End(int(row["end_time"]), end)
 
 
-def _totals(evidence: Evidence, channels: RecordedChannels, told: Told) -> list[int]:
-    """Rows that each sub-environment had, as far as anything tells."""
+def _totals(evidence: Evidence, channels: RecordedChannels, records: EpisodeRecords) -> list[int]:
+    """Rows that each sub-environment had, as far as the file shows."""
     totals = [evidence.stop(channel) for channel in channels.steps]
     statistics = evidence.tail.statistics
     for env, channel in enumerate(channels.steps):
@@ -216,7 +216,7 @@ def _totals(evidence: Evidence, channels: RecordedChannels, told: Told) -> list[
         if statistics is not None:
             counts = (statistics.channel_message_counts.get(i, 0) for i in ids if i is not None)
             totals[env] = max(totals[env], *counts)
-    for _, end, _ in told.ends.values():
+    for _, end, _ in records.ends.values():
         if end.env < len(totals):
             totals[end.env] = max(totals[end.env], end.first_row + end.length)
     return totals
@@ -229,14 +229,16 @@ class _Planner:
     def __init__(
         self, evidence: Evidence, plan: Plan, runs: list[StepRun], channels: RecordedChannels, *, images: bool
     ) -> None:
-        self._evidence, self._plan, self._told = evidence, plan, plan.told
+        self._evidence, self._plan, self._records = evidence, plan, plan.records
         self._runs, self._images = runs, images
-        told = self._told
-        known = [run.episode for run in runs] + list(told.starts) + list(told.ends) + list(told.index)
+        records = self._records
+        numbers = (
+            [run.episode for run in runs] + list(records.starts) + list(records.ends) + list(records.index)
+        )
         left_out = (evidence.metadata or {}).get("next_episode", "")
-        self._next = max([*known, int(left_out) - 1 if left_out.isdecimal() else -1]) + 1
+        self._next = max([*numbers, int(left_out) - 1 if left_out.isdecimal() else -1]) + 1
         starts = [] if channels.start is None else evidence.ranges(channels.start)
-        self._starts_whole = all(first == 0 for first, _ in starts)  # none is missing between those here
+        self._starts_whole = all(first == 0 for first, _ in starts)  # none is missing before or between them
         self._taken: set[int] = set()
         # whether there can be no row after the last one that is known
         self._knows_totals = not evidence.tail.finished or evidence.tail.statistics is not None
@@ -249,10 +251,10 @@ class _Planner:
 
     def _length(self, run: StepRun) -> int | None:
         """The steps of the old episode, if that is known."""
-        told = self._told.ends.get(run.episode)
-        if told is None or told.end.env != run.env:
+        old = self._records.ends.get(run.episode)
+        if old is None or old.end.env != run.env:
             return None
-        return told.end.length if told.end.first_row == run.row - run.step else None
+        return old.end.length if old.end.first_row == run.row - run.step else None
 
     def _episode(self, run: StepRun) -> PlannedEpisode:
         length = self._length(run)
@@ -267,28 +269,28 @@ class _Planner:
         final = self._final(run, last=last) if tail else None
         start = self._start(run, number, head=head)
         end = self._end(run, number, length, final is not None, head=head, tail=tail)
-        told = self._told.ends.get(run.episode)
-        resets = self._told.resets.get(number, []) if head else []
+        old_end = self._records.ends.get(run.episode)
+        resets = self._records.resets.get(number, []) if head else []
         return PlannedEpisode(
             number, run, head and tail and number == run.episode, head, tail, length, start, end, final,
-            orphan="" if told is None or tail else told.end.metadata,
+            orphan="" if old_end is None or tail else old_end.end.metadata,
             resets=tuple(reset for reset in resets if reset.start.env == run.env),
         )  # fmt: skip
 
     def _final(self, run: StepRun, *, last: bool) -> int | None:
-        """Where the final state of an episode is whose last step is here."""
-        told = self._told.ends.get(run.episode)
-        if told is not None and not told.end.has_final_state:
+        """Where the final state of an episode is, whose last step is here; a lost one is noted."""
+        old_end = self._records.ends.get(run.episode)
+        if old_end is not None and not old_end.end.has_final_state:
             return None
         ended = run.terminal or run.timeout
-        # without an end, one that is here is that of a step that was not finished
-        unfinished = told is None and not ended and not self._evidence.tail.finished
-        if run.episode in self._told.finals and not unfinished:
-            return self._told.finals[run.episode]
+        # without an end, the final state belongs to a step that was not finished
+        unfinished = old_end is None and not ended and not self._evidence.tail.finished
+        if run.episode in self._records.finals and not unfinished:
+            return self._records.finals[run.episode]
         if ended and not self._images and (run.env, run.stop) in self._evidence.finals:
-            return IN_A_HOLE  # with images, they are where the next ones are by now
-        runs = last and told is None and run.env in self._evidence.states
-        if runs and not (ended and self._evidence.final_lost):
+            return IN_A_HOLE  # with images, the next ones have been written over them
+        is_running = last and old_end is None and run.env in self._evidence.states
+        if is_running and not (ended and self._evidence.final_lost):
             return RUNNING
         self._plan.lost_finals.append(run.episode)
         return None
@@ -296,30 +298,30 @@ class _Planner:
     def _start(self, run: StepRun, number: int, *, head: bool) -> Start:
         if not head:
             return Start(run.first_time, EpisodeStart(number, run.env, 0, False, True, "", "", "{}"))
-        if run.episode in self._told.starts and number == run.episode:
-            told = self._told.starts[run.episode]
-            if told.start.env == run.env:
-                return told
+        if run.episode in self._records.starts and number == run.episode:
+            old = self._records.starts[run.episode]
+            if old.start.env == run.env:
+                return old
         hole = self._evidence.finals.get((run.env, run.row))
         if hole is None or not self._starts_whole:
             self._plan.lost_starts.append(run.episode)
         seed, time = "", run.first_time if hole is None else hole.time_ns
         index = self._evidence.tail.index
-        if index is not None and number in self._told.index:
-            row = index.episodes[self._told.index[number]]
+        if index is not None and number in self._records.index:
+            row = index.episodes[self._records.index[number]]
             seed, time = str(int(row["seed"])) if row["has_seed"] else "", int(row["start_time"])
         return Start(time, EpisodeStart(number, run.env, 0, False, False, seed, "", "{}"))
 
     def _end(
         self, run: StepRun, number: int, length: int | None, has_final: bool, *, head: bool, tail: bool
     ) -> End:
-        told = self._told.ends.get(run.episode) if tail and length is not None else None
+        old = self._records.ends.get(run.episode) if tail and length is not None else None
         how = TERMINAL if run.terminal else TIMEOUT if run.timeout else INTERRUPTED
         metadata, time, total, row = "{}", run.last_time, run.total, None
-        if told is not None:
-            time, metadata, how, row = told.time, told.end.metadata, told.end.end, told.row
+        if old is not None:
+            time, metadata, how, row = old.time, old.end.metadata, old.end.end, old.row
             if head:
-                total = told.end.episode_return
+                total = old.end.episode_return
         elif tail and self._evidence.tail.finished:
             self._plan.lost_ends.append(run.episode)
         return End(time, EpisodeEnd(number, run.env, 0, run.steps, total, how, has_final, metadata), row)

@@ -88,15 +88,15 @@ class Evidence:
     """`pieces` of a channel are in order and do not overlap; `damages` are in the order of the file.
 
     Attributes:
-        strict: as a reader takes it: the file up to its first damage, and what follows without a gap. Anything else is
-            for repair, which also takes what lies behind damage and gaps.
+        strict: only what a reader takes: the file up to its first damage, and rows of the journal that go on with it
+            without a gap. Repair also takes what lies behind damage and gaps.
         good_end: where the good part of the file ends that has no damage in it.
         metadata: of the recording; None where they are lost.
         metadata_indexes: with `strict`: where the file has metadata of any kind.
         states: those of the running steps, by sub-environment.
         finals: what follows the last steps of episodes, by sub-environment and the row after.
         final_lost: after a power loss: a state may be the one after a final state that is not here.
-        left_out, beyond: steps in the journal that may be torn, or are behind missing ones, by channel.
+        left_out, beyond: how many steps in the journal may be torn, or come after missing ones, by channel.
     """
 
     source: Source
@@ -139,11 +139,11 @@ class Evidence:
             self.pieces[channel] = kept
         return left
 
-    def add_rows(self, channel: int, found: Iterable[Rows]) -> None:
+    def add_rows(self, channel: int, batches: Iterable[Rows]) -> None:
         """Takes rows that are in memory."""
         self.add(
             channel,
-            [self.load(rows, channel, rows.first, len(rows.offsets), len(rows.data)) for rows in found],
+            [self.load(rows, channel, rows.first, len(rows.offsets), len(rows.data)) for rows in batches],
         )
 
     def load(self, place: Rows | RepairedChunk, channel: int, first: int, rows: int, size: int) -> Piece:
@@ -153,13 +153,13 @@ class Evidence:
         return Piece(first, rows, entry)
 
     def lacks(self, channel: int, rows: Array) -> Array:
-        """Which of some row numbers (int64) are not here, as a mask."""
+        """Which of some row numbers (int64) are missing, as a mask."""
         ranges = np.array([(-1, -1), *self.ranges(channel)], np.int64)
         stops: Array = ranges[np.searchsorted(ranges[:, 0], rows, side="right") - 1, 1]
         return rows >= stops
 
     def stop(self, channel: int) -> int:
-        """The row after the last one that is here."""
+        """The row after the last one."""
         pieces = self.pieces.get(channel)
         return pieces[-1].stop if pieces else 0
 
@@ -168,14 +168,14 @@ class Evidence:
         return PackedStore(self)
 
     def ranges(self, channel: int) -> list[tuple[int, int]]:
-        """The rows of a channel that are here, as half-open ranges."""
-        found: list[tuple[int, int]] = []
+        """The rows of a channel, as half-open ranges."""
+        ranges: list[tuple[int, int]] = []
         for piece in self.pieces.get(channel, []):
-            if found and found[-1][1] == piece.first:
-                found[-1] = (found[-1][0], piece.stop)
+            if ranges and ranges[-1][1] == piece.first:
+                ranges[-1] = (ranges[-1][0], piece.stop)
             else:
-                found.append((piece.first, piece.stop))
-        return found
+                ranges.append((piece.first, piece.stop))
+        return ranges
 
 
 class RecordedChannels(NamedTuple):
@@ -191,18 +191,18 @@ class RecordedChannels(NamedTuple):
     @classmethod
     def of(cls, evidence: Evidence, layout: StepLayout) -> RecordedChannels:
         """The channels of a recording, by their topics."""
-        found = step_channels(evidence.channels, evidence.source.name)
+        steps = step_channels(evidence.channels, evidence.source.name)
         topics = {channel.topic: channel.id for channel in evidence.channels.values()}
         images = {
-            leaf.name: [topics.get(Topics.of_step(channel.topic).image(leaf.name)) for channel in found]
+            leaf.name: [topics.get(Topics.of_step(channel.topic).image(leaf.name)) for channel in steps]
             for leaf in layout.images
         }
         names = (EPISODE_START, EPISODE_END, FINAL_STATE, INFO)
-        return cls([channel.id for channel in found], images, *(topics.get(name) for name in names))
+        return cls([channel.id for channel in steps], images, *(topics.get(name) for name in names))
 
 
 class PackedStore(ChunkStore):
-    """The rows that are here, as a store without gaps; `packed` says which of its rows a row is."""
+    """The rows that are left, numbered without gaps; `packed` gives the new number of a row."""
 
     def __init__(self, evidence: Evidence) -> None:
         table: list[tuple[int, ...]] = []
@@ -218,7 +218,7 @@ class PackedStore(ChunkStore):
         self._headers: dict[int, Array] = {}  # of the chunks that were last asked for
 
     def packed(self, channel: int, row: int) -> int:
-        """The number here of a row that is here."""
+        """The number in this store of a row that is left."""
         firsts, counts = self._firsts[channel]
         at = bisect.bisect_right(firsts, row) - 1
         return counts[at] + row - firsts[at]

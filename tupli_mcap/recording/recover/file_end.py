@@ -1,4 +1,4 @@
-"""What the end of a file says of the rest: summary and episode index, each with a CRC; either may be missing."""
+"""Reads the summary and the episode index at the end of a file, each by itself: either may be missing or damaged."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Tail:
 
 
 def read_tail(source: Source) -> Tail:
-    """Reads what is there and good; raises nothing for what is not."""
+    """Reads both; raises nothing for what is missing or damaged."""
     tail = Tail(finished=has_summary(source))
     if tail.finished:
         try:
@@ -90,8 +90,8 @@ def _statistics(source: Source, summary: Summary) -> Statistics | None:
     data = source.read(summary.start, source.size - len(MAGIC) - FOOTER_SIZE - summary.start)
     for opcode, position, body in records(data, summary.start, source.name):
         if opcode == Opcode.STATISTICS:
-            found: Statistics = parse_record(opcode, body, position, source.name)
-            return found
+            statistics: Statistics = parse_record(opcode, body, position, source.name)
+            return statistics
     return None
 
 
@@ -128,7 +128,7 @@ def _length_at(source: Source, place: int) -> int:
     if source.read(place, 1) != b"\x09" or length > source.size - place - 9:
         return 0
     try:
-        found = attachment_index(source, place, length)
+        attachment = attachment_index(source, place, length)
     except FormatError:
         return 0
-    return length if (found.name, found.media_type) == (INDEX_NAME, INDEX_MEDIA_TYPE) else 0
+    return length if (attachment.name, attachment.media_type) == (INDEX_NAME, INDEX_MEDIA_TYPE) else 0

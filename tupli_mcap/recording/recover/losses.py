@@ -1,4 +1,4 @@
-"""What is not here of a damaged recording: steps, by episode, as far as anything tells."""
+"""Which steps of a damaged recording are lost, by episode, as far as the rest of it shows."""
 
 from __future__ import annotations
 
@@ -27,34 +27,34 @@ def losses(plan: Plan) -> Losses:
         runs.setdefault(episode.run.episode, []).append(episode.run)
     ended = {episode.run.episode for episode in plan.episodes if episode.tail}
     steps = {}
-    for number in sorted(set(runs) | set(plan.told.ends) | set(plan.told.starts)):
+    for number in sorted(set(runs) | set(plan.records.ends) | set(plan.records.starts)):
         lost = _of_episode(plan, number, runs.get(number, []), ended=number in ended)
         if lost:
             steps[number] = lost
-    here = sum(stop - first for ranges in plan.here.values() for first, stop in ranges)
-    return Losses(steps, sum(plan.totals) - here)
+    kept = sum(stop - first for ranges in plan.kept.values() for first, stop in ranges)
+    return Losses(steps, sum(plan.totals) - kept)
 
 
 def _of_episode(plan: Plan, number: int, runs: list[StepRun], *, ended: bool) -> list[tuple[int, int | None]]:
-    told = plan.told.ends.get(number)
+    end = plan.records.ends.get(number)
     at = 0
     lost: list[tuple[int, int | None]] = []
     for run in sorted(runs, key=lambda run: run.step):
         if run.step > at:
             lost.append((at, run.step))
         at = max(at, run.step + run.steps)
-    if told is not None and told.end.length > at:
-        lost.append((at, told.end.length))
-    if told is None and not ended and (runs or _is_in_a_hole(plan, number)):
+    if end is not None and end.end.length > at:
+        lost.append((at, end.end.length))
+    if end is None and not ended and (runs or _is_in_a_hole(plan, number)):
         lost.append((at, None))
     return lost
 
 
 def _is_in_a_hole(plan: Plan, number: int) -> bool:
-    """Whether an episode of which only the start is here had steps that are not."""
-    start = plan.told.starts[number].start
-    here = plan.here.get(start.env, [])
-    after = bisect.bisect_right(here, (start.first_row, _END))
+    """Whether an episode whose start alone is left had steps."""
+    start = plan.records.starts[number].start
+    kept = plan.kept.get(start.env, [])
+    after = bisect.bisect_right(kept, (start.first_row, _END))
     total = plan.totals[start.env] if start.env < len(plan.totals) else 0
-    behind = after == len(here) and start.first_row >= total
-    return not behind and not (after and start.first_row < here[after - 1][1])
+    behind = after == len(kept) and start.first_row >= total
+    return not behind and not (after and start.first_row < kept[after - 1][1])

@@ -44,7 +44,7 @@ def prefix(source: Source, *, only_metadata: bool = False) -> Evidence:
             waiting = None
         elif waiting is not None or (opcode == Opcode.CHUNK and only_metadata):
             break
-        elif opcode == Opcode.HEADER:  # whatever it says is no part of the recording
+        elif opcode == Opcode.HEADER:  # nothing of the recording depends on it
             evidence.profile = _profile(source, position, length)
         else:
             record = walk.at(position)

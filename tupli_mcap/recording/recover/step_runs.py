@@ -89,17 +89,17 @@ Ranges = list[tuple[int, int]]
 
 def intersection(a: Ranges, b: Ranges) -> Ranges:
     """What two lists of ranges have in common."""
-    found: Ranges = []
+    common: Ranges = []
     i = j = 0
     while i < len(a) and j < len(b):
         low, high = max(a[i][0], b[j][0]), min(a[i][1], b[j][1])
         if low < high:
-            found.append((low, high))
+            common.append((low, high))
         if a[i][1] < b[j][1]:
             i += 1
         else:
             j += 1
-    return found
+    return common
 
 
 def step_runs(
@@ -111,11 +111,11 @@ def step_runs(
         FormatError: as `step_facts`; with `evidence.strict`, a row is no step of the layout.
     """
     for env, channel in enumerate(channels.steps):
-        here = evidence.ranges(channel)
+        ranges = evidence.ranges(channel)
         for ids in channels.images.values():
             image = ids[env]
-            here = intersection(here, [] if image is None else evidence.ranges(image))
-        for first, stop in here:
+            ranges = intersection(ranges, [] if image is None else evidence.ranges(image))
+        for first, stop in ranges:
             last: StepRun | None = None
             row, at = first, store.packed(channel, first)
             # a chunk may hold many of the ranges
@@ -161,7 +161,7 @@ def _goes_on(run: StepRun, following: StepRun) -> bool:
     return together and not (run.terminal or run.timeout)
 
 
-def sum_up(rewards: Array, total: float = 0.0) -> float:
+def sum_up(rewards: Array, total: float) -> float:
     """`total` and the rewards, added one after another as a recorder does."""
     with np.errstate(invalid="ignore", over="ignore"):
         return float(np.cumsum(np.concatenate(((total,), rewards)))[-1])

@@ -86,7 +86,7 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
         return
     store = evidence.store()
     plan = make_plan(evidence, store, layout, channels)
-    beyond = max((number + 1 for number in plan.told.ignored), default=0)
+    beyond = max((number + 1 for number in plan.records.ignored), default=0)
     contents.used_episodes = max(beyond, _beyond_frames(evidence, store))
     episodes = [e for e in plan.episodes if e.head and e.number == e.run.episode]
     made = _Made(store)
@@ -117,7 +117,7 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
 
 
 class _Made:
-    """Messages that are made, behind those of their channels that are there."""
+    """Messages that the writer did not come to write; they follow the others of their channels."""
 
     def __init__(self, store: PackedStore) -> None:
         self._store = store
@@ -174,7 +174,7 @@ def _index(
 
 
 def _left_out(evidence: Evidence, journal: JournalContents, channels: RecordedChannels) -> Iterator[str]:
-    """What a reader has to be told."""
+    """Warnings: how many steps and which events are not here, and why."""
     source = evidence.source
     for channel, steps in evidence.beyond.items():
         if steps and not journal.torn:
@@ -218,9 +218,9 @@ def _missing(source: Source, metadata: Mapping[str, str], err: Exception) -> str
 
 
 def _foreign_journal(source: Source, metadata: Mapping[str, str]) -> str:
-    found = None if source.path is None else recorded_journal(source.path, metadata)
+    journal = None if source.path is None else recorded_journal(source.path, metadata)
     return (
-        f"{source.name} was not finished, and {found} is the journal of another recording: it is left alone, and "
+        f"{source.name} was not finished, and {journal} is the journal of another recording: it is left alone, and "
         "steps not yet in a chunk cannot be recovered"
     )
 

@@ -51,7 +51,7 @@ class EntryPoint(NamedTuple):
 
 
 class CarriedCode(NamedTuple):
-    """An environment in a recording, as the file tells of it (`name`, `classes` and `versions` are claims).
+    """An environment in a recording, as the file describes it (`name`, `classes` and `versions` are claims).
 
     kind: "spec" (its JSON text is `spec`, the code it names `entry_points`), "pickle" (of `size` bytes, whose
         instructions name `imports`; it may import and run anything) or "names" (nothing that rebuilds it).
@@ -119,14 +119,14 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
 
 
 def _entry_points(spec: dict[str, Any]) -> list[EntryPoint]:
-    known = gym.registry.get(str(spec.get("id")))
-    here = None if known is None else str(entry_point_name(known.entry_point))
-    found = [EntryPoint("environment", str(spec.get("entry_point")), here)]
+    registered = gym.registry.get(str(spec.get("id")))
+    here = None if registered is None else str(entry_point_name(registered.entry_point))
+    points = [EntryPoint("environment", str(spec.get("entry_point")), here)]
     wrappers = spec.get("additional_wrappers")
     for wrapper in wrappers if isinstance(wrappers, list) else ():
         name = wrapper.get("entry_point") if isinstance(wrapper, dict) else wrapper
-        found.append(EntryPoint("wrapper", str(name), None))
-    return found
+        points.append(EntryPoint("wrapper", str(name), None))
+    return points
 
 
 def set_trust(path: str | os.PathLike[str], *, trusted: bool) -> CarriedCode:
@@ -162,13 +162,13 @@ def untrust(what: str) -> tuple[str, bool]:
     elif _DIGEST.match(what):
         digest = what
     else:
-        found = [digest for digest in trust.trusted_digests() if digest.startswith(what)]
-        if len(found) != 1:
+        digests = [digest for digest in trust.trusted_digests() if digest.startswith(what)]
+        if len(digests) != 1:
             raise NotFoundError(
-                f"{len(found) or 'no'} trusted environments have a digest that starts with {what!r}; "
+                f"{len(digests) or 'no'} trusted environments have a digest that starts with {what!r}; "
                 "`tupli-mcap trust --list` shows them"
             )
-        (digest,) = found
+        (digest,) = digests
     return digest, trust.untrust(digest)
 
 
@@ -197,7 +197,7 @@ def options_are_trusted(recording: Recording) -> bool:
 
 def _foreign_options(recording: Recording) -> dict[str, str]:
     """The texts of options that hold more than data, and what that is."""
-    found: dict[str, str] = {}
+    foreign: dict[str, str] = {}
     seen = {""}
     for position in range(len(recording)):
         for reset in (*recording.resets_before(position), recording.episode_start(position)):
@@ -205,8 +205,8 @@ def _foreign_options(recording: Recording) -> dict[str, str]:
                 seen.add(reset.options)
                 why = foreign_options(reset.options)
                 if why:
-                    found[reset.options] = why
-    return found
+                    foreign[reset.options] = why
+    return foreign
 
 
 def _options_digest(environment: str, options: Iterable[str]) -> str:

@@ -51,7 +51,7 @@ def sign_recording(path: str | os.PathLike[str], key: signing.SigningKey) -> Sig
         return verify_signature(written)
 
 
-def episodes_alike(one: Recording, other: Recording, numbers: Sequence[int], directory: Path) -> bool:
+def episodes_alike(first: Recording, second: Recording, numbers: Sequence[int], directory: Path) -> bool:
     """Whether the episodes of these numbers are the same in two recordings: steps, events, images, frames, times.
 
     directory: where to write them anew meanwhile, for other episodes may lie between them, in other chunks.
@@ -60,10 +60,10 @@ def episodes_alike(one: Recording, other: Recording, numbers: Sequence[int], dir
         FormatError: one of the recordings is damaged.
         RecordingError: the directory cannot be written to.
     """
-    found = []
-    for recording in (one, other):
+    manifests = []
+    for recording in (first, second):
         with files.private_directory(directory, shown=directory) as private:
             rewrite_recording(recording, private / "episodes", episodes=numbers)
             with Recording(private / "episodes") as written:
-                found.append(manifest_of_episodes(written))
-    return found[0] == found[1]
+                manifests.append(manifest_of_episodes(written))
+    return manifests[0] == manifests[1]
