@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from environments import Sampler, roll, same
 from gymnasium import spaces
+from mcap.records import Channel, Schema
 from mcap.writer import Writer
 
 from tupli_mcap import (
@@ -30,6 +31,7 @@ from tupli_mcap import (
     rewrite_recording,
     write_recording,
 )
+from tupli_mcap.mcap.container import Container
 
 DICT = spaces.Dict(
     {"x": spaces.Box(-1, 1, (2, 2)), "t": spaces.Tuple((spaces.Discrete(3), spaces.MultiBinary(2)))}
@@ -450,3 +452,14 @@ def test_flags_by_hand_are_set_at_the_last_step_only(flag: str, tmp_path: Path) 
         write_recording(tmp_path / "a.mcap", [steps], observation_space=space, action_space=space)
     with Recording(tmp_path / "a.mcap") as recording:
         assert len(recording) == 0
+
+
+def test_new_channels_get_ids_of_their_own() -> None:
+    """Also behind those of a file whose ids have gaps."""
+    container = Container(-1, "r.mcap", "zstd")
+    for schema, channel in ((3, 7), (8, 2)):
+        container.schemas[schema] = Schema(schema, b"", "ros2msg", f"s{schema}")
+        container.channels[channel] = Channel(channel, f"/{channel}", "cdr", {}, schema)
+    assert container.add_schema("new", "") == 9
+    assert container.add_channel("/new", 9, {}) == 8
+    assert len(container.channels) == 3

@@ -186,13 +186,13 @@ class Container:
         )
 
     def add_schema(self, name: str, text: str) -> int:
-        schema = Schema(len(self.schemas) + 1, text.encode(), "ros2msg", name)
+        schema = Schema(max(self.schemas, default=0) + 1, text.encode(), "ros2msg", name)
         self.schemas[schema.id] = schema
         return schema.id
 
     def add_channel(self, topic: str, schema_id: int, metadata: Mapping[str, str]) -> int:
         described = with_crc(metadata) if metadata else {}
-        channel = Channel(len(self.channels) + 1, topic, "cdr", described, schema_id)
+        channel = Channel(max(self.channels, default=0) + 1, topic, "cdr", described, schema_id)
         self.channels[channel.id] = channel
         self.counts[channel.id] = 0
         return channel.id
