@@ -397,8 +397,8 @@ def test_without_a_storage_an_environment_can_be_serialized(tmp_path: Path) -> N
             env.store(name="cart")
         env.storage = storage
         env.store(name="cart")
-    with pytest.raises(StorageError, match="expected a TupliStorage, .* or None, found 'lab'"):
-        TupliEnvWrapper(gym.make("CartPole-v1"), "lab")  # type: ignore[arg-type]
+    with pytest.raises(StorageError, match="expected the directory of a storage, found 'lab.mcap'"):
+        TupliEnvWrapper(gym.make("CartPole-v1"), "lab.mcap")
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])

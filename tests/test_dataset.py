@@ -700,8 +700,9 @@ def test_files_that_are_no_recordings(tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"not this")
     with pytest.raises(FormatError, match=r"bad\.mcap"):
         TupliDataset.from_files(tmp_path / "bad.mcap").preview()
-    with pytest.raises(DatasetError, match=r"expected a storage.*from_files"):
-        TupliDataset("runs/*.mcap")  # type: ignore[arg-type]
+    with pytest.raises(StorageError, match=r"expected the directory of a storage.*tupli_mcap.open"):
+        TupliDataset("runs/*.mcap")
+    assert TupliDataset(tmp_path).storage.root == tmp_path  # type: ignore[union-attr]
 
 
 def test_a_copied_recording_counts_once(tmp_path: Path) -> None:

@@ -228,7 +228,10 @@ def test_too_many_open_files_are_no_missing_recordings(tmp_path: Path) -> None:
     [
         (lambda d: FileStorage(d).open_recording(None), "expected the recording of an episode header"),
         (lambda d: FileStorage(d / "a\0b"), "cannot use the storage .*choose another path"),
-        (lambda d: TupliEnvWrapper(sampler(), "lab"), "storage: expected a TupliStorage"),
+        (
+            lambda d: TupliEnvWrapper(sampler(), 5),
+            "expected a storage, or the path of its directory, found 5",
+        ),
         (lambda d: TupliDataset.from_files(None), "expected paths of recordings"),
         (
             lambda d: RecordEpisodes(sampler(), d / "r.mcap", record_info=5),

@@ -365,3 +365,22 @@ def test_what_is_shown_is_short(runs: Path) -> None:
     assert len(repr(dataset)) < 200 and "not listed yet" in repr(dataset)
     assert "36 episodes" in dataset._repr_html_()
     assert "36 episodes" in repr(dataset)
+
+
+def test_an_episode_gives_pytuplis_tuples(dataset: Dataset) -> None:
+    episode = dataset[2]
+    wanted = tupli_mcap.TupliDataset(episode.recording.path.parent).episodes[2]  # type: ignore[union-attr]
+    assert episode.tuples == wanted.tuples
+    assert ids(dataset)[2] == wanted.id
+
+
+def test_a_step_callback_is_told_the_sub_environment(tmp_path: Path) -> None:
+    envs = gym.make_vec("CartPole-v1", 3, "sync")
+    callback = lambda step: {"env": step.env, "unpacked": len(step)}  # noqa: E731
+    with tupli_mcap.vector.RecordEpisodes(envs, tmp_path / "r.mcap", step_callback=callback) as recorder:
+        recorder.reset(seed=1)
+        for _ in range(40):
+            recorder.step(recorder.action_space.sample())
+    found = [(episode.env, info) for episode in tupli_mcap.open(tmp_path) for info in episode.infos or []]
+    assert {env for env, _ in found} == {0, 1, 2}
+    assert all(info == {"env": env, "unpacked": 6} for env, info in found)

@@ -1,4 +1,17 @@
-"""Record reinforcement-learning episodes as MCAP files, index them into datasets, train on them, hand them on."""
+"""Record reinforcement-learning episodes as MCAP files, index them into datasets, train on them, hand them on.
+
+wrappers, vector           record an environment, or many
+recording                  one file: read, written, recovered, edited, checked, signed
+journal, mcap, messages    what protects the steps of a killed process; the container; what is in it
+spaces, environment        leaves of Gymnasium's spaces; environments as data, and rebuilt
+schema                     the records and filters of PyTupli
+storage, benchmark         a directory of recordings; environments that are stored, and loaded again
+dataset, torch             `open`: episodes wherever they lie; DataLoaders
+viewer, plots              shown by Rerun and Foxglove, live too; drawn without a viewer
+doctor, replay             what is odd in a recording; the same actions once more
+trust, signing             whom this user trusts, and who signed
+cli                        the commands
+"""
 
 from __future__ import annotations
 

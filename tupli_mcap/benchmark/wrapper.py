@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,7 +21,7 @@ from tupli_mcap.environment import Snapshot, build, capture, fingerprint
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, RLTuple
-from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
 from tupli_mcap.storage.texts import first_defect
 from tupli_mcap.wrappers import RecordEpisodes
@@ -72,7 +73,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: the environment; the wrapper never changes it.
-        storage: where the benchmark is kept; None is enough for `serialize_env`.
+        storage: where the benchmark is kept: a storage, or the path of its directory; None is enough for
+            `serialize_env`.
         benchmark_id: the id of the benchmark that `env` was loaded from.
         metadata_callback: called with every recorded step; its last result becomes the episode's metadata.
         rl_tuple_cls: the class of the tuples that the callback is given. Recorded are the values themselves.
@@ -87,7 +89,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        storage: TupliStorage | None,
+        storage: TupliStorage | str | os.PathLike[str] | None,
         benchmark_id: str | None = None,
         metadata_callback: EpisodeMetadataCallback | None = None,
         rl_tuple_cls: type[RLTuple] = RLTuple,
@@ -100,12 +102,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
                 f"expected recording options among {', '.join(_RECORDING_OPTIONS)}, "
                 f"found {', '.join(sorted(unknown))}"
             )
-        if storage is not None and not isinstance(storage, TupliStorage):
-            raise StorageError(
-                f"storage: expected a TupliStorage, such as FileStorage('lab'), or None, found {storage!r:.80}"
-            )
         self._options = RecordOptions(**recording_options)
-        self._storage = storage
+        self._storage = None if storage is None else storage_at(storage)
         self.id = benchmark_id
         self.metadata_callback = metadata_callback
         self.rl_tuple_cls = rl_tuple_cls
@@ -125,8 +123,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         return self._storage
 
     @storage.setter
-    def storage(self, storage: TupliStorage | None) -> None:
-        self._storage = storage
+    def storage(self, storage: TupliStorage | str | os.PathLike[str] | None) -> None:
+        self._storage = None if storage is None else storage_at(storage)
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
@@ -309,7 +307,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     @classmethod
     def load(
         cls,
-        storage: TupliStorage,
+        storage: TupliStorage | str | os.PathLike[str],
         benchmark_id: str | None = None,
         metadata_callback: EpisodeMetadataCallback | None = None,
         rl_tuple_cls: type[RLTuple] = RLTuple,
@@ -327,9 +325,10 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             raise NotFoundError(
                 "which benchmark? pass benchmark_id; storage.list_benchmarks() names them all"
             )
-        serialized = storage.load_benchmark(benchmark_id).serialized
-        env = cls.deserialize_env(serialized, storage, trust=trust)
-        return cls(env, storage, benchmark_id, metadata_callback, rl_tuple_cls, **recording_options)
+        opened = storage_at(storage)
+        serialized = opened.load_benchmark(benchmark_id).serialized
+        env = cls.deserialize_env(serialized, opened, trust=trust)
+        return cls(env, opened, benchmark_id, metadata_callback, rl_tuple_cls, **recording_options)
 
     def publish(self, publish_in: str = "global") -> None:
         """Note that a group may see the benchmark."""

@@ -6,7 +6,7 @@ sources, which     where episodes come from; which of them a word, a number or a
 load               from episodes to whole columns; tuple filters
 statistics, tables what values are like; pandas and Arrow
 tuples, convert    columns as steps and episodes; as what other libraries expect
-access, items/     steps by number; windows, transitions, samplers
+access, items/     `windows`, `transitions`, and samples of them; how they read steps by number
 saved              columns as a directory of `.npy` files
 curate, display    a recording of fewer episodes; datasets as text and HTML
 """

@@ -20,7 +20,7 @@ from tupli_mcap.dataset.saved import save_columns
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
 from tupli_mcap.dataset.tuples import EpisodeItems, Tuples, items_of
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
-from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.base import anew
 
 if TYPE_CHECKING:
@@ -50,17 +50,14 @@ class TupliDataset(RandomAccess):
     thread-safe.
 
     Args:
-        storage: where the episodes are.
+        storage: where the episodes are: a storage, or the path of its directory.
         info: anything the user wants to keep with the dataset.
     """
 
-    def __init__(self, storage: TupliStorage, info: dict[str, Any] | None = None) -> None:
-        if not isinstance(storage, TupliStorage):
-            raise DatasetError(
-                f"expected a storage, such as FileStorage('lab'), found {storage!r:.80}; recordings "
-                "that are in no storage are opened with TupliDataset.from_files(...)"
-            )
-        self._setup(StorageSource(storage), info)
+    def __init__(
+        self, storage: TupliStorage | str | os.PathLike[str], info: dict[str, Any] | None = None
+    ) -> None:
+        self._setup(StorageSource(storage_at(storage)), info)
 
     @classmethod
     def from_files(

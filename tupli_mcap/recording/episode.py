@@ -12,6 +12,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 from tupli_mcap.recording.columns.fields import GymnasiumNames
+from tupli_mcap.schema import RLTuple
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.columns.read import Columns
@@ -21,15 +22,23 @@ if TYPE_CHECKING:
 __all__ = ["Episode", "Episodes", "Step", "item_getter", "reward_getter"]
 
 
-class Step(NamedTuple):
-    """One step: `state` is the observation the action was chosen on; `info` is None where none was recorded."""
-
+class _Step(NamedTuple):
     state: Any
     action: Any
     reward: Any
     terminal: bool
     timeout: bool
     info: dict[str, Any] | None = None
+
+
+class Step(_Step):
+    """One step: `state` is the observation the action was chosen on; `info` is None where none was recorded.
+
+    Attributes:
+        env: the sub-environment that took it, 0 for a single one; no part of the tuple.
+    """
+
+    env: int = 0
 
 
 class Episode(GymnasiumNames):
@@ -159,6 +168,11 @@ class Episode(GymnasiumNames):
     def infos(self) -> list[dict[str, Any] | None] | None:
         """The recorded info of each step (None for a step without); None if the recording has no infos."""
         return self._recording.infos(self._position)
+
+    @property
+    def tuples(self) -> list[RLTuple]:
+        """The steps as PyTupli's tuples; the info is empty where none was recorded."""
+        return [RLTuple.from_env_step(*step[:5], step.info or {}) for step in self]
 
     @property
     def position(self) -> int:

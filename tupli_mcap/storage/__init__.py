@@ -14,6 +14,6 @@ atomic, texts                       whole files, the lock between processes, and
 """
 
 from tupli_mcap.storage.base import TupliStorage, TupliStorageError
-from tupli_mcap.storage.files import FileStorage
+from tupli_mcap.storage.files import FileStorage, storage_at
 
-__all__ = ["FileStorage", "TupliStorage", "TupliStorageError"]
+__all__ = ["FileStorage", "TupliStorage", "TupliStorageError", "storage_at"]

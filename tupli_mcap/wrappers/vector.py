@@ -249,6 +249,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
             if (terminals[i] or timeouts[i]) and self._autoreset.mode == "SameStep":
                 info = final_info_of(infos, i, self.num_envs)
             step = Step(before[i], chosen[i], rewards[i], bool(terminals[i]), bool(timeouts[i]), info)
+            step.env = i
             entries[i] = self._entries(step)
             self._call(i, step)
         return entries

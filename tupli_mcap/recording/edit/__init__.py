@@ -1,9 +1,9 @@
 """New recordings out of others.
 
-assemble                          the new file: numbers its rows, writes chunks, index and summary
-copy_episodes                     episodes of a recording into it, with new numbers
+assemble                          the new file: writes chunks, index and summary
+copy_episodes                     episodes of a recording into it
 copy_chunks                       chunks that can be copied as they are
-merge                             several recordings into one, or one into several
+merge                             several recordings into one, with new numbers; one into several
 rewrite                           a recording with fewer episodes
 attach                            adds attachments
 repair                            `recover_recording`; write_repaired and repaired_frames write what it found

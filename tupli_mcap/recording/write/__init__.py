@@ -5,7 +5,7 @@ rows/                                        the rows that are not in the file, 
 episodes, infos, vector_infos, frames        put what else is recorded into the journal
 writer, areas                                the file and its journal; the journal's areas
 resume                                       goes on in a recording that exists
-rotation                                     several files, one after another
+rotation                                     what the files are called, and when the next one begins
 work                                         the mark of unfinished work, for interruptions
 autoreset                                    when the sub-environments of a vector environment begin anew
 compressing, options, from_values            chunks in a thread; options; recordings of given values

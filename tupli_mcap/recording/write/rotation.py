@@ -61,8 +61,7 @@ class Rotation:
     ) -> None:
         check_place(path)
         self._name = re.sub(r"[^\w.+-]+", "_", name)
-        is_folder = Path(path).is_dir() or os.fspath(path).endswith(os.sep)
-        self._folder = Path(path) if is_folder else None
+        self._folder = Path(path) if _is_folder(path) else None
         self._options, self._format_version = options, format_version
         self._limited, self._max_bytes, self._max_seconds = (
             options.has_limits,
@@ -170,6 +169,13 @@ class Rotation:
             writer = self._open(path, "x")
         self._paths.append(path)
         return writer
+
+
+def _is_folder(path: str | os.PathLike[str]) -> bool:
+    try:
+        return os.fspath(path).endswith(os.sep) or Path(path).is_dir()
+    except OSError as err:
+        raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
 
 
 def _make_folder(path: Path) -> None:
