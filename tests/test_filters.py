@@ -710,10 +710,13 @@ class TestConstruction:
     def test_unknown_keys_are_refused_with_the_known_ones(self) -> None:
         misspelt = (F("metadata.x") == 1) & ~(F("n_tuple") == 1)
         with pytest.raises(
-            FilterError, match=r"'n_tuple'; did you mean 'n_tuples'\?; the keys are .*, steps,"
+            FilterError, match=r"'n_tuple' \(did you mean 'n_tuples'\?\); the keys are .*, steps,"
         ):
             compile_predicate(misspelt, EpisodeHeader)
-        with Catalog(None) as catalog, pytest.raises(FilterError, match="'n_tuple'; did you mean 'n_tuples'"):
+        with (
+            Catalog(None) as catalog,
+            pytest.raises(FilterError, match=r"'n_tuple' \(did you mean 'n_tuples'\?\)"),
+        ):
             catalog.episodes(misspelt)
 
     @given(st.lists(st.text(max_size=4).filter(lambda text: text.isprintable()), min_size=1, max_size=3))

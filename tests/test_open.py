@@ -255,7 +255,7 @@ def test_gymnasiums_names(dataset: Dataset) -> None:
     assert np.array_equal(columns.truncations[:n], episode.truncations)
     assert np.array_equal(columns.next_observations[:n], episode.next_observations)
     assert episode.observations is episode.states and columns.actions is None
-    windows = dataset.windows(4, fields=["observations", "reward"])
+    windows = dataset.windows(4, fields=["observations", "rewards"])
     assert windows[0].states.shape == (4, 4)
     for wrong in ("rewrads", "observatoins", "x"):
         with pytest.raises(TupliError, match="expected fields from"):
@@ -264,7 +264,7 @@ def test_gymnasiums_names(dataset: Dataset) -> None:
             episode.recording.read(fields=[wrong])
         with pytest.raises(TupliError, match="expected fields from"):
             dataset.windows(4, fields=[wrong])
-    with pytest.raises(RecordingError, match="did you mean 'rewards'"):
+    with pytest.raises(RecordingError, match="did you mean .rewards."):
         dataset.read("rewrads")
 
 

@@ -99,9 +99,9 @@ class MissingExtraError(TupliError, ImportError):
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """`; did you mean 'return'?` where one of the known names is like this one, else nothing."""
+    """` (did you mean 'return'?)` where one of the known names is like this one, else nothing."""
     close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def missing_extra(what: str, extra: str) -> MissingExtraError:

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.dataset.items import steps_of
+from tupli_mcap.dataset.items import FIELDS, steps_of
 from tupli_mcap.dataset.items.steps import map_arrays
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.columns.read import FIELDS
 from tupli_mcap.recording.description import describe
 
 __all__ = ["Facts", "UnexpectedError", "judge", "observe"]

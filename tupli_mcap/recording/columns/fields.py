@@ -18,14 +18,6 @@ _OTHER_NAMES = MappingProxyType(
         "next_observations": "next_states",
         "terminations": "terminals",
         "truncations": "timeouts",
-        "observation": "states",
-        "state": "states",
-        "action": "actions",
-        "reward": "rewards",
-        "terminal": "terminals",
-        "timeout": "timeouts",
-        "info": "infos",
-        "time": "times",
     }
 )
 
@@ -33,7 +25,7 @@ _OTHER_NAMES = MappingProxyType(
 def field_names(
     fields: str | Sequence[str], known: Sequence[str] = FIELDS, error: type[Exception] = RecordingError
 ) -> list[str]:
-    """The fields under our names, each once; Gymnasium's names, and singulars, mean the same.
+    """The fields under our names, each once; Gymnasium's names mean the same.
 
     Raises:
         error: one of them is unknown, or they are no names.
