@@ -60,7 +60,7 @@ def scripted(kind: str) -> gym.Env[Any, Any]:
 def test_anywhere(tmp_path: Path, name: str, again: int) -> None:
     """A sample of `python tools/interruptions.py`: once, and again while that is handled."""
     events = 12_000
-    for at in random.Random(f"{name} {again}").sample(range(1, events), 8):
+    for at in random.Random(f"{name} {again}").sample(range(1, events), 4):
         directory = tmp_path / str(at)
         directory.mkdir()
         interrupted(name, directory, at, again, go_on=at % 2 == 1)
