@@ -8,6 +8,7 @@ import pickle
 import random
 import select
 import signal
+import threading
 import time
 import traceback
 import warnings
@@ -97,11 +98,15 @@ def _listen(read: int, pid: int, job: Job) -> tuple[bytes, bool]:
                 at, wanted = now + rng.random() ** 2 * 0.15, 1 << 62
 
 
+_sending = threading.RLock()  # the thread that compresses may tell something while another one does
+
+
 def _send(fd: int, report: tuple[str, Any]) -> None:
     data = pickle.dumps(report, 5)
     view = memoryview(len(data).to_bytes(4, "little") + data)
-    while view:
-        view = view[_write(fd, view) :]
+    with _sending:
+        while view:
+            view = view[_write(fd, view) :]
 
 
 def _reports(data: bytes) -> Any:
