@@ -25,6 +25,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
+import tupli_mcap
 from tupli_mcap import (
     EpisodeData,
     FileStorage,
@@ -994,7 +995,7 @@ class TestSharing:
 # --- the program as a whole ---
 
 
-COMMANDS = list(get_command(app).commands)  # type: ignore[attr-defined]
+COMMANDS = [name for name, command in get_command(app).commands.items() if not command.hidden]  # type: ignore[attr-defined]
 
 
 class TestProgram:
@@ -1010,8 +1011,26 @@ class TestProgram:
 
     def test_everything_that_prints_has_json(self) -> None:
         assert len(COMMANDS) > 20
-        for command in sorted({*COMMANDS} - {"replay"}):  # which shows and writes, and tells little
+        for command in sorted({*COMMANDS} - {"view", "replay", "help", "version"}):  # which show something
             assert "--json" in ok(command, "--help")
+
+    def test_help_on_a_command(self, here: Path) -> None:
+        assert ok("help") == ok("--help")
+        for command in COMMANDS:
+            assert ok("help", command) == ok(command, "--help")
+        assert "there is no command 'lss' (did you mean 'ls'?)" in fails("help", "lss", code=2)
+
+    def test_the_commands_are_in_groups(self, here: Path) -> None:
+        lines = ok("--help").splitlines()
+        titles = [line[:-1] for line in lines if re.fullmatch(r"[A-Z]\w+:", line)]
+        assert titles == ["Options", "Record", "Look", "Check", "Edit", "Share", "Storage", "Help"]
+        assert lines[lines.index("Record:") + 1].startswith("  record ")
+
+    def test_version(self, here: Path) -> None:
+        assert ok("version") == ok("--version") == f"tupli-mcap {tupli_mcap.__version__}\n"
+
+    def test_replay_is_view(self, here: Path) -> None:
+        assert ok("replay", "--help").replace("replay", "view") == ok("view", "--help")
 
     def test_usage_errors(self, here: Path) -> None:
         assert fails("lss", code=2).startswith("No such command 'lss'")

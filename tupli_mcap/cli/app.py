@@ -26,7 +26,7 @@ from tupli_mcap.cli.terminal import (
     stop_writing,
     warnings_in_one_line,
 )
-from tupli_mcap.errors import FilterError, RecordingError, TupliError, UntrustedError
+from tupli_mcap.errors import FilterError, RecordingError, TupliError, UntrustedError, did_you_mean
 
 __all__ = ["app", "main"]
 
@@ -68,6 +68,20 @@ class _Group(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with _before_typer():
             return super().invoke(ctx)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """The commands in groups, by what they are for."""
+        width = max(map(len, _NAMES))
+        limit = formatter.width - 6 - width
+        for title, commands in _COMMANDS.items():
+            found = {name: self.get_command(ctx, name) for name in commands}
+            lines = [
+                (name.ljust(width), command.get_short_help_str(limit))
+                for name, command in found.items()
+                if command is not None
+            ]
+            with formatter.section(title):
+                formatter.write_dl(lines)
 
 
 class _InterruptedError(TupliError):
@@ -151,33 +165,66 @@ def _root(
         say(*context.get_help().split("\n"))
 
 
-_COMMANDS: dict[str, Callable[..., None]] = {
-    "record": record.record,
-    "ls": info.ls,
-    "info": info.info,
-    "episodes": info.episodes,
-    "doctor": doctor.doctor,
-    "plot": render.plot,
-    "list-benchmarks": storage.list_benchmarks,
-    "list-artifacts": storage.list_artifacts,
-    "list-episodes": storage.list_episodes,
-    "compact": storage.compact,
-    "reindex": storage.reindex,
-    "bundle": bundle.bundle,
-    "import": bundle.import_,
-    "export": bundle.export,
-    "trust": trust.trust,
-    "untrust": trust.untrust,
-    "verify": verify.verify,
-    "recover": edit.recover,
-    "merge": edit.merge,
-    "split": edit.split,
-    "filter": edit.filter_,
-    "replay": replay.replay,
-    "render": render.render,
+def _version() -> None:
+    """Print the version."""
+    _print_version(True)
+
+
+def _help(
+    context: typer.Context,
+    command: Annotated[str | None, typer.Argument(metavar="[COMMAND]", help="What to explain.")] = None,
+) -> None:
+    """Explain a command, or list them all."""
+    root = context.find_root()
+    group: Any = root.command
+    if command is None:
+        say(*root.get_help().split("\n"))
+        return
+    found = group.get_command(root, command)
+    if found is None:
+        raise typer.BadParameter(f"there is no command {command!r}{did_you_mean(command, _NAMES)}", context)
+    with found.make_context(command, [], parent=root, resilient_parsing=True) as its:
+        say(*found.get_help(its).split("\n"))
+
+
+_COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
+    "Record": {"record": record.record},
+    "Look": {
+        "ls": info.ls,
+        "info": info.info,
+        "episodes": info.episodes,
+        "view": replay.replay,
+        "plot": render.plot,
+        "render": render.render,
+    },
+    "Check": {"doctor": doctor.doctor, "verify": verify.verify},
+    "Edit": {
+        "filter": edit.filter_,
+        "merge": edit.merge,
+        "split": edit.split,
+        "recover": edit.recover,
+    },
+    "Share": {
+        "bundle": bundle.bundle,
+        "import": bundle.import_,
+        "export": bundle.export,
+        "trust": trust.trust,
+        "untrust": trust.untrust,
+    },
+    "Storage": {
+        "list-benchmarks": storage.list_benchmarks,
+        "list-artifacts": storage.list_artifacts,
+        "list-episodes": storage.list_episodes,
+        "compact": storage.compact,
+        "reindex": storage.reindex,
+    },
+    "Help": {"help": _help, "version": _version},
 }
-for _name, _command in _COMMANDS.items():
-    app.command(_name)(_command)
+_NAMES = [name for commands in _COMMANDS.values() for name in commands]
+for _commands in _COMMANDS.values():
+    for _name, _command in _commands.items():
+        app.command(_name)(_command)
+app.command("replay", hidden=True)(replay.replay)  # as `view` was called
 
 
 def main() -> None:
