@@ -111,7 +111,7 @@ def show(title: str, dataset: TupliDataset) -> None:
 
 def replay(lab: Path, *, window: bool) -> None:
     """The best episode in the viewer; without a display, a file for it and a picture of what it shows."""
-    command = f".venv/bin/tupli-mcap view {lab.relative_to(ROOT.parent)} --episode best"
+    command = f".venv/bin/tupli-mcap view {lab.relative_to(ROOT.parent)} --episodes best"
     if window:
         try:
             viewer.show(lab, "best")

@@ -131,13 +131,13 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
         if total > _MOST_SPLIT:
             raise RecordingError(
                 f"expected at most {_MOST_SPLIT} episodes to show apart, found {total}; "
-                "choose some (--episode), or join them"
+                "choose some (--episodes), or join them"
             )
         yield from _split(chosen)
     elif form == "compare":
         if total > _MOST_COMPARED:
             raise RecordingError(
-                f"expected at most {_MOST_COMPARED} episodes to compare, found {total}; choose some (--episode)"
+                f"expected at most {_MOST_COMPARED} episodes to compare, found {total}; choose some (--episodes)"
             )
         yield _compared(chosen)
     else:
