@@ -8,6 +8,7 @@ import os
 import pty
 import re
 import select
+import shlex
 import shutil
 import signal
 import subprocess
@@ -1025,6 +1026,20 @@ class TestProgram:
         titles = [line[:-1] for line in lines if re.fullmatch(r"[A-Z]\w+:", line)]
         assert titles == ["Options", "Record", "Look", "Check", "Edit", "Share", "Storage", "Help"]
         assert lines[lines.index("Record:") + 1].startswith("  record ")
+
+    @pytest.mark.parametrize("command", COMMANDS)
+    def test_examples_are_meant(self, command: str, here: Path) -> None:
+        """They parse: what a file or an environment says is another matter."""
+        root = get_command(app)
+        lines = ok(command, "--help").splitlines()
+        examples = [line for line in lines if line.startswith("  tupli-mcap ")]
+        assert examples or command == "version"
+        for line in examples:
+            _, name, *words = shlex.split(line)
+            assert name == command
+            context = root.make_context("tupli-mcap", [name])
+            found = root.get_command(context, name)  # type: ignore[attr-defined]
+            assert found.make_context(name, words, parent=context).params
 
     def test_version(self, here: Path) -> None:
         assert ok("version") == ok("--version") == f"tupli-mcap {tupli_mcap.__version__}\n"

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from tupli_mcap.cli import bundle, doctor, edit, info, record, render, replay, storage, trust, verify
 from tupli_mcap.cli.terminal import (
@@ -82,6 +82,17 @@ class _Group(TyperGroup):
             ]
             with formatter.section(title):
                 formatter.write_dl(lines)
+
+
+class _Command(TyperCommand):
+    """Its help ends with examples."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        lines = _EXAMPLES.get("view" if self.name == "replay" else self.name or "", ())
+        if lines:
+            with formatter.section("Examples"):
+                for line in lines:
+                    formatter.write(f"  tupli-mcap {line}\n")
 
 
 class _InterruptedError(TupliError):
@@ -220,11 +231,43 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
     },
     "Help": {"help": _help, "version": _version},
 }
+_EXAMPLES: dict[str, Sequence[str]] = {
+    "record": (
+        "record CartPole-v1 -o run.mcap --steps 10000 --seed 1",
+        "record CartPole-v1 -o run.mcap --num-envs 8 --policy my_agent:act",
+    ),
+    "ls": ("ls", "ls runs/ lab/"),
+    "info": ("info run.mcap",),
+    "episodes": ("episodes run.mcap --filter 'return > 100'", "episodes lab/ --limit 20 --json"),
+    "view": ("view run.mcap", "view run.mcap --episodes best,worst --compare", "view lab/ --web"),
+    "plot": ("plot run.mcap -o report.html", "plot a.mcap b.mcap -o compared.png"),
+    "render": ("render run.mcap -o best.mp4",),
+    "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning"),
+    "verify": ("verify run.mcap", "verify run.mcap --replay --episodes 0,4,10-19"),
+    "filter": ("filter run.mcap 'return > 100 and metadata.success' -o good.mcap",),
+    "merge": ("merge a.mcap b.mcap -o all.mcap",),
+    "split": ("split all.mcap -o part.mcap --episodes 1000",),
+    "recover": ("recover run.mcap", "recover run.mcap --dry-run"),
+    "bundle": (
+        "bundle run.mcap -o bundle.mcap",
+        "bundle 3f2a --storage lab -o bundle.mcap --sign ~/.ssh/id_ed25519",
+    ),
+    "import": ("import bundle.mcap --storage lab --dry-run", "import bundle.mcap --storage lab"),
+    "export": ("export --storage lab --filter 'return > 100' -o good.mcap",),
+    "trust": ("trust run.mcap --show", "trust --key colleague.pub --name colleague"),
+    "untrust": ("untrust run.mcap",),
+    "list-benchmarks": ("list-benchmarks --storage lab",),
+    "list-artifacts": ("list-artifacts --storage lab",),
+    "list-episodes": ("list-episodes --storage lab --filter 'metadata.score > 30'",),
+    "compact": ("compact --storage lab --dry-run",),
+    "reindex": ("reindex --storage lab",),
+    "help": ("help view",),
+}
 _NAMES = [name for commands in _COMMANDS.values() for name in commands]
 for _commands in _COMMANDS.values():
     for _name, _command in _commands.items():
-        app.command(_name)(_command)
-app.command("replay", hidden=True)(replay.replay)  # as `view` was called
+        app.command(_name, cls=_Command)(_command)
+app.command("replay", cls=_Command, hidden=True)(replay.replay)  # as `view` was called
 
 
 def main() -> None:

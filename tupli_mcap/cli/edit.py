@@ -83,7 +83,7 @@ def split(
 def filter_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
     filter_text: Annotated[
-        str, typer.Argument(metavar="FILTER", help="Such as 'metadata.score > -200 and env = 0'.")
+        str, typer.Argument(metavar="FILTER", help="Such as 'return > 100 and metadata.success'.")
     ],
     output: _Output,
     force: _Force = False,

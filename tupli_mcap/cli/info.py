@@ -130,7 +130,7 @@ def episodes(
 ) -> None:
     """List episodes of a recording or a storage.
 
-    Filters compare keys of episodes (n_tuples, end, episode_return, seed, env, ended, metadata.<name>, ...) with
+    Filters compare keys of episodes (steps, return, end, seed, env, ended, metadata.<name>, ...) with
     = != > >= < <= in, and join with and, or, not. Times are "2026-11-23", "2026-11-23 03:31:07", "yesterday",
     "7d ago", ...: a text means all of the time that it names.
     """

@@ -21,7 +21,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON instead.")]
 Limit = Annotated[int | None, typer.Option(min=0, help="Print at most so many.")]
 FilterText = Annotated[
     str | None,
-    typer.Option("--filter", metavar="FILTER", help="Such as 'metadata.score > -200 and env = 0'."),
+    typer.Option("--filter", metavar="FILTER", help="Such as 'return > 100 and metadata.success'."),
 ]
 StoragePath = Annotated[
     Path,

@@ -176,7 +176,10 @@ def plot(
     episode: Annotated[
         str,
         typer.Option(
-            metavar="N|best|worst|...", help="Whose steps to show: a number, best, worst, first, last."
+            "--episodes",
+            "--episode",
+            metavar="N|best|worst|...",
+            help="Whose steps to show: a number, best, worst, first, last.",
         ),
     ] = "best",
     filter_text: FilterText = None,

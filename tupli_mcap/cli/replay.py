@@ -18,7 +18,9 @@ _Sources = Annotated[
 ]
 _Episode = Annotated[
     str | None,
-    typer.Option("--episodes", "--episode", "-e", metavar="WHICH", help="Such as 3,7,9, best, worst, first, last, all."),
+    typer.Option(
+        "--episodes", "--episode", "-e", metavar="WHICH", help="Such as 3,7,9, best, worst, first, last, all."
+    ),
 ]
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Split = Annotated[

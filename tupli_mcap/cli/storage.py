@@ -98,7 +98,7 @@ def list_episodes(
 ) -> None:
     """List the episodes of a storage.
 
-    Filters compare id, benchmark_id, recording, n_tuples, end, episode_return, seed, env, ended,
+    Filters compare id, benchmark_id, recording, steps, return, end, seed, env, ended,
     metadata.<name>, ... with = != > >= < <= in, and join with and, or, not. Times are "2026-11-23",
     "2026-11-23 03:31:07", "yesterday", "7d ago", ...: a text means all of the time that it names.
     """
