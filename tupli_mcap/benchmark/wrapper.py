@@ -68,7 +68,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     An environment is stored as its EnvSpec, which others build without trust, if its id is registered here, its
     arguments are plain data, its wrappers are Gymnasium's or of its own package, it has not been reset, and its
     attributes are those that its classes assign, with the constants and constructor arguments that they assign. Any
-    other is stored as a pickle. A changed value that the constructor computes is not noticed; `verify --replay`
+    other is stored as a pickle. A changed value that the constructor computes is not noticed; `verify --rerun`
     finds it. So change a registered environment by its arguments, a wrapper or a subclass.
 
     Args:

@@ -243,7 +243,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "plot": ("plot run.mcap -o report.html", "plot a.mcap b.mcap -o compared.png"),
     "render": ("render run.mcap -o best.mp4",),
     "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning"),
-    "verify": ("verify run.mcap", "verify run.mcap --replay --episodes 0,4,10-19"),
+    "verify": ("verify run.mcap", "verify run.mcap --rerun --episodes 0,4,10-19"),
     "filter": ("filter run.mcap 'return > 100 and metadata.success' -o good.mcap",),
     "merge": ("merge a.mcap b.mcap -o all.mcap",),
     "split": ("split all.mcap -o part.mcap --episodes 1000",),

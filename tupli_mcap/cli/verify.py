@@ -1,4 +1,4 @@
-"""The command verify: checks files for damage, and with --replay what the environments do now."""
+"""The command verify: checks files for damage, and with --rerun what the environments do now."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ def verify(
         typer.Argument(metavar="PATH", help="Recordings, directories, storages.", readable=False),
     ],
     replay: Annotated[
-        bool, typer.Option("--replay", help="Also replay recordings and compare, bit for bit.")
+        bool,
+        typer.Option("--rerun", "--replay", help="Also take the episodes again and compare, bit for bit."),
     ] = False,
     trust: Annotated[
         bool,
-        typer.Option("--trust", help="With --replay: run the code that the files carry, with all options."),
+        typer.Option("--trust", help="With --rerun: run the code that the files carry, with all options."),
     ] = False,
     episodes: Annotated[
-        str | None, typer.Option(metavar="NUMBERS", help="With --replay: only these, such as 0,4,10-19.")
+        str | None, typer.Option(metavar="NUMBERS", help="With --rerun: only these, such as 0,4,10-19.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -51,12 +52,12 @@ def verify(
     end, without a gap or a step twice. Of a storage, artifacts, benchmarks and the catalog are checked too.
     Nothing is executed, nothing is written. Exit code 1 if something is damaged.
 
-    --replay rebuilds the environment of each recording, takes every episode again with its seed, options and
+    --rerun rebuilds the environment of each recording, takes every episode again with its seed, options and
     actions, and says where something differs. Exit code 1 if something does, or nothing could be checked.
     """
     replays = _Replays(trust, _episode_numbers(episodes)) if replay else None
     if replays is None and (trust or episodes is not None):
-        raise typer.BadParameter("--trust and --episodes go with --replay")
+        raise typer.BadParameter("--trust and --episodes go with --rerun")
     from tupli_mcap.storage.verify import StorageReport, verify_paths
 
     storage_report = StorageReport()
@@ -113,7 +114,7 @@ def _print_verified(report: VerifyReport) -> None:
         print_wrapped(f"→ {advice}{file}", "  ", "    ")
 
 
-# --- with --replay ---
+# --- with --rerun ---
 
 
 def _episode_numbers(text: str | None) -> list[int] | None:

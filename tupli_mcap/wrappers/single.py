@@ -51,7 +51,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         capture_env: what the file says of the environment. "spec": the EnvSpec (id, arguments, wrappers) if it has one,
             the names of its classes, versions of packages. "pickle": its pickle instead of the EnvSpec, code that this
             user's own recordings run without a question. None: nothing, names from its documentation left out too.
-            Whether a spec rebuilds it as it was is found out by `verify --replay`. No other environment is made.
+            Whether a spec rebuilds it as it was is found out by `verify --rerun`. No other environment is made.
         attachments: name -> (media type, bytes), written before the first step instead of what `capture_env` says.
         labels: names for viewers and plots, by leaf: {"state": ["x", "angle"], "action": ["left", "right"]}, one a
             dimension, or one a value of a Discrete. By default what the environment's documentation says.
