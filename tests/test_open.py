@@ -10,9 +10,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from environments import Sampler, roll
 
 import tupli_mcap
-from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, RecordingError, TupliError
+from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, TupliError
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeMetadataCallback
 
@@ -133,11 +134,17 @@ def test_an_index_gives_an_episode_or_a_dataset(dataset: Dataset) -> None:
         ("seed >= 200", lambda e: e.seed >= 200),
     ],
 )
-def test_filters_find_what_a_loop_finds(dataset: Dataset, text: str, test: Callable[[Episode], bool]) -> None:
+def test_filters_find_what_a_loop_finds(
+    runs: Path, dataset: Dataset, text: str, test: Callable[[Episode], bool]
+) -> None:
     wanted = [episode.id for episode in dataset if test(episode)]
     assert 0 < len(wanted) < 36
     assert ids(dataset.filter(text)) == wanted  # listed already
-    assert ids(tupli_mcap.open(dataset._source.storage).filter(text)) == wanted  # type: ignore[attr-defined]
+    assert (
+        ids(tupli_mcap.open(runs).filter(text))
+        == ids(tupli_mcap.open(FileStorage(runs)).filter(text))
+        == wanted
+    )
     assert ids(dataset.filter(test)) == wanted
     shuffled = dataset.sample(36, seed=1)
     assert sorted(ids(shuffled.filter(text))) == sorted(wanted)
@@ -264,7 +271,7 @@ def test_gymnasiums_names(dataset: Dataset) -> None:
             episode.recording.read(fields=[wrong])
         with pytest.raises(TupliError, match="expected fields from"):
             dataset.windows(4, fields=[wrong])
-    with pytest.raises(RecordingError, match="did you mean .rewards."):
+    with pytest.raises(TupliError, match="did you mean .rewards."):
         dataset.read("rewrads")
 
 
@@ -384,3 +391,118 @@ def test_a_step_callback_is_told_the_sub_environment(tmp_path: Path) -> None:
     found = [(episode.env, info) for episode in tupli_mcap.open(tmp_path) for info in episode.infos or []]
     assert {env for env, _ in found} == {0, 1, 2}
     assert all(info == {"env": env, "unpacked": 6} for env, info in found)
+
+
+def test_what_was_saved_beside_its_source_hides_nothing(tmp_path: Path) -> None:
+    """Episodes keep their ids: those that are in both files count once."""
+    record(tmp_path / "run.mcap", 1, 6)
+    tupli_mcap.open(tmp_path / "run.mcap").head(2).save(tmp_path / "best.mcap")
+    with pytest.warns(UserWarning, match="holds 2 episodes of .*best.mcap again"):
+        assert len(tupli_mcap.open(tmp_path)) == 6
+
+
+def test_a_directory_may_hold_other_files(tmp_path: Path) -> None:
+    record(tmp_path / "run.mcap", 1, 3)
+    (tmp_path / "other.mcap").write_bytes(b"not this")
+    with pytest.warns(UserWarning, match=r"other\.mcap.*; it is left out"):
+        assert len(tupli_mcap.open(tmp_path)) == 3
+    with pytest.raises(TupliError, match="other.mcap"):
+        len(tupli_mcap.open(tmp_path / "*.mcap"))
+
+
+def test_what_is_being_recorded_is_there_as_far_as_it_has_come(tmp_path: Path) -> None:
+    with tupli_mcap.RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "run.mcap") as env:
+        env.reset(seed=1)
+        env.step(0)
+        env.step(1)
+        for source in (tmp_path, tmp_path / "run.mcap", [tmp_path]):
+            (episode,) = tupli_mcap.open(source)
+            assert (len(episode), episode.end) == (2, "interrupted")
+
+
+def test_metadata_that_no_episode_has(dataset: Dataset, runs: Path) -> None:
+    for text in ("metadata.sucess", "metadata.sucess > 3", 'metadata.side == "a" and metadata.sucess'):
+        for each in (dataset, tupli_mcap.open(runs), tupli_mcap.open(FileStorage(runs))):
+            with pytest.raises(
+                FilterError, match=r"no episode has metadata.sucess \(did you mean 'success'\?\)"
+            ):
+                len(each.filter(text))
+    with pytest.raises(FilterError, match=r"no episode has metadata.sucess"):
+        dataset.sort("metadata.sucess")
+    assert len(dataset.filter("metadata.count > 1000")) == 0
+
+
+def test_steps_of_an_episode(dataset: Dataset) -> None:
+    episode = dataset[1]
+    steps = list(episode)
+    for i in (0, 3, -1):
+        assert np.array_equal(episode[i].state, steps[i].state)
+        assert episode[i][1:] == steps[i][1:]
+    with pytest.raises(IndexError, match="expected a step from 0 to"):
+        episode[len(episode)]
+    with pytest.raises(TupliError, match="expected a step's number or a slice"):
+        episode["states"]  # type: ignore[call-overload]
+
+
+def test_an_episode_is_the_same_however_it_was_opened(dataset: Dataset, runs: Path) -> None:
+    again = tupli_mcap.open(runs / "b.mcap")
+    assert again[2] == dataset[14] != dataset[15]
+    assert again[2] in list(dataset) and len({again[2], dataset[14]}) == 1
+
+
+def test_statistics_of_what_follows_have_a_name_of_their_own(dataset: Dataset) -> None:
+    found = dataset.stats(["states", "next_states"])
+    assert set(found) == {"state", "next_state"}
+    next_states = dataset.read(["next_states"]).next_states
+    np.testing.assert_allclose(
+        found["next_state"].mean, next_states.mean(axis=0, dtype=np.float64), rtol=1e-6
+    )
+    for field in ("terminals", "times", "infos"):
+        with pytest.raises(TupliError, match="expected fields from states, actions, rewards, next_states"):
+            dataset.stats([field])
+
+
+def test_what_cannot_be_saved_there(dataset: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(TupliError, match="is a directory; give the path of a file"):
+        dataset.save(tmp_path)
+    copy = dataset.head(5).save(tmp_path / "copy.mcap")
+    with pytest.raises(TupliError, match="is one of the recordings themselves"):
+        tupli_mcap.open(copy).head(1).save(copy, overwrite=True)
+    assert len(tupli_mcap.open(copy)) == 5
+
+
+def test_tables_fit_each_other(dataset: Dataset) -> None:
+    pytest.importorskip("pandas")
+    found = dataset.sort("return", descending=True).head(4)
+    steps, episodes = found.to_pandas(), found.to_pandas("episodes")
+    joined = steps.merge(episodes, on="episode", suffixes=("", "_of_episode"))
+    assert len(joined) == found.n_steps
+    assert (joined["id"] == joined["id_of_episode"]).all()
+    assert episodes["seed"].tolist() == [episode.seed for episode in found]
+    assert str(episodes["seed"].dtype) == "Int64"
+
+
+def test_images_come_to_arrow(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    space = gym.spaces.Dict(
+        {"cam": gym.spaces.Box(0, 255, (4, 5, 3), np.uint8), "x": gym.spaces.Box(-1, 1, (2,))}
+    )
+    with tupli_mcap.RecordEpisodes(Sampler(space, gym.spaces.Discrete(2)), tmp_path / "r.mcap") as env:
+        roll(env, 12)
+    dataset = tupli_mcap.open(tmp_path)
+    table = dataset.to_arrow()
+    cams = dataset.read(["states"]).states["cam"]
+    assert np.array_equal(np.array(table.column("state['cam']").to_pylist(), np.uint8), cams)
+    assert set(dataset.stats()) == {"state['x']", "action", "reward"}
+
+
+def test_tensors_are_recorded_as_arrays(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    value = torch.tensor([0.125, -1 / 3], requires_grad=True)
+    with tupli_mcap.RecordEpisodes(
+        gym.make("CartPole-v1"), tmp_path / "r.mcap", step_callback=lambda step: {"logp": value}
+    ) as env:
+        env.reset(seed=1)
+        env.step(0)
+    (info,) = tupli_mcap.open(tmp_path)[0].infos or []
+    assert info is not None and np.array_equal(info["logp"], value.detach().numpy())

@@ -69,25 +69,33 @@ def dumps(value: Any, *, fallback: Fallback | None = None) -> str:
 
 
 def dumps_any(value: Any) -> str:
-    """Return `dumps` of any value at all: what has no exact form is stored as its `repr`.
+    """Return `dumps` of any value at all: a tensor is stored as an array, what else has no exact form as its `repr`.
 
     An object without a `repr` becomes the name of its type, an entry of a dict that is nested too deep (or in
     itself) the `repr` of the entry.
     """
     try:
-        return dumps(value, fallback=shown)
+        return dumps(value, fallback=_nearest)
     except ValueError:
         if type(value) is not dict:
             return dumps(shown(value))
-    return dumps({key: _shallow(item) for key, item in value.items()}, fallback=shown)
+    return dumps({key: _shallow(item) for key, item in value.items()}, fallback=_nearest)
 
 
 def _shallow(value: Any) -> Any:
     try:
-        dumps([value], fallback=shown)
+        dumps([value], fallback=_nearest)
     except ValueError:
         return shown(value)
     return value
+
+
+def _nearest(value: Any) -> Any:
+    """An array of what holds one (a tensor of PyTorch or JAX), else what `shown` returns."""
+    try:
+        return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value.__array__())
+    except Exception:  # noqa: BLE001 (somebody else's code, and nothing depends on it)
+        return shown(value)
 
 
 def shown(value: Any) -> str:

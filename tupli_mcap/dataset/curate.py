@@ -74,8 +74,13 @@ def save(dataset: Dataset, target: Path, *, overwrite: bool) -> Path:
         chosen.setdefault(header.recording, []).append(header.episode)
     if not chosen:
         raise DatasetError("expected episodes to save, found none")
+    if target.is_dir():
+        raise DatasetError(f"{target} is a directory; give the path of a file (.mcap)")
     if target.exists() and not overwrite:
         raise DatasetError(f"{target} exists; choose another path, or overwrite it")
+    sources = [dataset._recordings.get(name).path for name in chosen]
+    if target.exists() and any(source is not None and target.samefile(source) for source in sources):
+        raise DatasetError(f"{target} is one of the recordings themselves; save to another path")
     target.parent.mkdir(parents=True, exist_ok=True)
     if len(chosen) == 1:
         ((name, numbers),) = chosen.items()

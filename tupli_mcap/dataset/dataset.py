@@ -18,14 +18,16 @@ from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.load import read_columns
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, OpenRecordings, Source, StorageSource
-from tupli_mcap.dataset.statistics import FieldStatistics, statistics_of
+from tupli_mcap.dataset.statistics import STATISTICAL, FieldStatistics, statistics_of
+from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.recording import Episode, Recording
-from tupli_mcap.recording.columns.fields import FIVE, field_names
+from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
 from tupli_mcap.recording.columns.read import Columns
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter
-from tupli_mcap.schema.facts import filter_keys, path_in
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate, parse_filter
+from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.storage import FileStorage, TupliStorage
+from tupli_mcap.storage.listing import find_recordings, is_storage
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,8 +50,11 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
         ds = tupli_mcap.open("runs/")
         best = ds.filter("return > 100").sort("return", descending=True).head(10)
 
+    Files are looked into when the episodes are needed, and errors of theirs come then.
+
     Raises:
-        RecordingError: there is no such file, it is none of these, or it cannot be opened.
+        RecordingError: there is no such file.
+        DatasetError: it is none of these.
         StorageError: the directory may not be looked at.
     """
     if isinstance(source, Dataset):
@@ -60,9 +65,13 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
         return Dataset(FilesSource([_place_of(source)]))
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
-        if "://" not in name and Path(name).expanduser().is_dir():
-            return Dataset(StorageSource(FileStorage(Path(name).expanduser())))
-        return Dataset(FilesSource(source))
+        folder = Path(name).expanduser()
+        if "://" in name or not folder.is_dir():
+            return Dataset(FilesSource(source))
+        files = _files_in(folder)
+        if is_storage(folder) or not files:
+            return Dataset(StorageSource(FileStorage(folder)))
+        return Dataset(FilesSource(files, of_directory=True))
     if not isinstance(source, Iterable):
         raise DatasetError(
             f"expected a path, a pattern, a URL, a storage, or a list of those, found {source!r:.80}"
@@ -77,9 +86,7 @@ def _place_of(recording: Recording) -> str:
 
 
 def _files_in(source: Openable) -> Sequence[str]:
-    """The recordings of one item of a list."""
-    from tupli_mcap.storage.listing import find_recordings
-
+    """The recordings of one source."""
     if isinstance(source, Recording):
         return [_place_of(source)]
     if isinstance(source, str | os.PathLike):
@@ -122,6 +129,8 @@ class Dataset(RandomAccess):
     def _headers(self) -> Sequence[EpisodeHeader]:
         if self._listed is None:
             self._listed = self._source.episodes(None, self._filter)
+            if not self._listed and self._filter is not None:
+                self._check_metadata(self._filter, self._source.episodes(None, None))
         return self._listed
 
     def __len__(self) -> int:
@@ -193,7 +202,8 @@ class Dataset(RandomAccess):
                 `Episode`. Keys are those of `Dataset.keys`.
 
         Raises:
-            FilterError: the test names an unknown key, compares it with what it can never be, or is none of these.
+            FilterError: the test names an unknown key, also of the metadata; compares one with what it can never be; or
+                is none of these.
         """
         if callable(test) and not isinstance(test, BaseFilter):
             return self._of([header for header in self._headers if test(self._episode(header))])
@@ -205,7 +215,21 @@ class Dataset(RandomAccess):
             made._filter = wanted if self._filter is None else self._filter & wanted
             return made
         matches = compile_predicate(wanted, EpisodeHeader)
-        return self._of([header for header in self._listed if matches(header)])
+        found = [header for header in self._listed if matches(header)]
+        if not found:
+            self._check_metadata(wanted, self._listed)
+        return self._of(found)
+
+    def _check_metadata(self, wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
+        """Raises FilterError if a filter that is true of no episode names metadata that none of them has."""
+        known = {key for header in among for key in header.metadata}
+        for comparison in comparisons(wanted) if among else ():
+            name, *inside = path_in(comparison.key or "", EpisodeHeader)
+            if name == "metadata" and inside and inside[0] not in known:
+                raise FilterError(
+                    f"no episode has {comparison.key}{did_you_mean(inside[0], known)}; "
+                    f"their metadata have {', '.join(sorted(known)) or 'no keys'}"
+                )
 
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
         """The episodes in the order of a key ("return", "steps", "metadata.score"), or of a function of an `Episode`.
@@ -213,19 +237,24 @@ class Dataset(RandomAccess):
         Equal ones stay in their order; those that have no such value come last.
 
         Raises:
-            FilterError: an unknown key, or values that have no order among each other.
+            FilterError: an unknown key, also of the metadata.
+            DatasetError: values that have no order among each other.
         """
         if callable(key):
             values = [key(self._episode(header)) for header in self._headers]
-        else:
+        elif isinstance(key, str):
             values = [self._value(header, key) for header in self._headers]
+        else:
+            raise DatasetError(
+                f"expected a key to sort by, such as 'return', or a function, found {key!r:.80}"
+            )
+        if values and isinstance(key, str) and all(value is None for value in values):
+            self._check_metadata(F(key) == True, self._headers)  # noqa: E712 - an expression
         places = [i for i, value in enumerate(values) if value is not None and value == value]
         try:
             ordered = sorted(places, key=lambda i: values[i], reverse=descending)
-        except TypeError as err:
+        except (TypeError, ValueError) as err:
             raise DatasetError(f"cannot sort by {key!r}: {err}") from err
-        if descending:  # `sorted` keeps equal ones in their order both ways
-            ordered = sorted(places, key=lambda i: values[i], reverse=True)
         rest = sorted(set(range(len(values))) - set(places))
         return self._of([self._headers[i] for i in [*ordered, *rest]])
 
@@ -244,13 +273,14 @@ class Dataset(RandomAccess):
         Which side an episode is on depends on its id and the seed alone: it stays there when others are added.
 
         Args:
-            by: a key ("run", "metadata.task", "seed"): episodes with the same value stay together.
+            by: a key ("run", "metadata.task", "seed"): episodes with the same value stay together. Of a few values, all
+                may come to one side: look at both.
 
         Raises:
             DatasetError: the fraction is not between 0 and 1.
             FilterError: an unknown key.
         """
-        if not 0 <= fraction <= 1:
+        if not isinstance(fraction, int | float | np.number) or not 0 <= fraction <= 1:
             raise DatasetError(f"expected a fraction from 0 to 1, found {fraction!r:.80}")
         parts: tuple[list[EpisodeHeader], list[EpisodeHeader]] = ([], [])
         for header in self._headers:
@@ -263,7 +293,7 @@ class Dataset(RandomAccess):
     def keys(self) -> list[str]:
         """What filters, `sort` and `split` may name: the facts about episodes, and the metadata that some have."""
         own = {"metadata." + key for header in self._headers for key in header.metadata}
-        return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own)
+        return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own | {"run"})
 
     def _value(self, header: EpisodeHeader, key: str) -> Any:
         if key == "run":
@@ -284,7 +314,7 @@ class Dataset(RandomAccess):
             DatasetError: an unknown field.
             SpaceError: the steps of two recordings do not fit into one array; the message says which.
         """
-        wanted = field_names(fields)
+        wanted = field_names(fields, FIELDS, DatasetError)
         names = list(dict.fromkeys(header.recording for header in self._headers))
         place = {name: i for i, name in enumerate(names)}
         order = np.argsort([place[header.recording] for header in self._headers], kind="stable")
@@ -322,7 +352,7 @@ class Dataset(RandomAccess):
         fields: Sequence[str] | None = None,
         seed: int | None = None,
     ) -> Any:
-        """A PyTorch `DataLoader` of batches of tensors.
+        """A PyTorch `DataLoader` of batches: dicts of tensors (`batch["states"]`, shape (batch, length, ...)).
 
         Args:
             length: of windows of steps that follow each other within an episode; without it, single transitions.
@@ -344,12 +374,12 @@ class Dataset(RandomAccess):
     ) -> Mapping[str, FieldStatistics]:
         """Count, mean, std, min, max and quantiles of each leaf (`state`, `state['arm']`, `action`, `reward`).
 
-        Steps are read a block at a time; what was found is kept.
+        Steps are read a block at a time. Images, and leaves of variable size (texts, graphs), have no statistics.
 
         Raises:
-            DatasetError: an unknown field, or there is no step.
+            DatasetError: a field without numbers, or there is no step.
         """
-        return statistics_of(self, field_names(fields))
+        return statistics_of(self, field_names(fields, STATISTICAL, DatasetError))
 
     # ---- out
 
@@ -372,8 +402,11 @@ class Dataset(RandomAccess):
     def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Writes the episodes to a new recording, with all that belongs to them, in the order of their times.
 
+        Of one recording, episodes keep their ids; of several, they get new ones.
+
         Raises:
-            RecordingError: there is no episode, the target exists (and not `overwrite`) or cannot be written.
+            DatasetError: there is no episode, the target exists (and not `overwrite`), or it is one of the sources.
+            RecordingError: it cannot be written.
             SpaceError: two recordings have different spaces.
         """
         return curate.save(self, Path(target), overwrite=overwrite)
@@ -384,6 +417,11 @@ class Dataset(RandomAccess):
         if self._listed is None:
             return f"<Dataset of {self._source!r}: not listed yet>"
         return f"<Dataset of {self._source!r}: {len(self):,} episodes, {self.n_steps:,} steps>"
+
+    def __str__(self) -> str:
+        """As `repr`, of episodes that have been listed."""
+        _ = self._headers
+        return repr(self)
 
     def _repr_html_(self) -> str:
         return display.html("Dataset", display.Facts(repr(self._source), self._headers, None, {}))

@@ -112,12 +112,16 @@ class FilesSource:
     Args:
         files: a path, a pattern ("runs/*.mcap", "**" for any depth), a URL, or several of those; a pattern's
             files are taken in the order of their names.
+        of_directory: those of a directory, where other files may lie: what is no recording is left out with a warning.
 
     Raises:
         RecordingError: nothing was given, a pattern matches nothing, or a path does not exist.
     """
 
-    def __init__(self, files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> None:
+    def __init__(
+        self, files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], *, of_directory: bool = False
+    ) -> None:
+        self._of_directory = of_directory
         if not isinstance(files, str | os.PathLike | Iterable):
             raise RecordingError(
                 f"expected paths of recordings, a pattern or a URL, found {files!r:.80}; give some"
@@ -133,9 +137,8 @@ class FilesSource:
     def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
         matches = compile_predicate(filter, BenchmarkHeader)
         found: dict[tuple[str, str], BenchmarkHeader] = {}
-        for name in self.names:
-            with Recording(name) as recording:
-                header = _benchmark_header(recording)
+        for recording in self._each():
+            header = _benchmark_header(recording)
             if matches(header):
                 found.setdefault((header.id, header.metadata.name), header)
         return list(found.values())
@@ -150,13 +153,13 @@ class FilesSource:
         matches = compile_predicate(episode_filter, EpisodeHeader)
         files: dict[str, str] = {}  # episode id -> file
         found: list[EpisodeHeader] = []
-        for name in self.names:
+        for recording in self._each():
+            name = recording.name
+            if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
+                continue
             notes = None if "://" in name else Notes.read(Path(name))
-            with Recording(name) as recording:
-                if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
-                    continue
-                deleted = set() if notes is None else notes.about(recording.metadata).deleted
-                headers = list(episode_headers(recording, name, deleted))
+            deleted = set() if notes is None else notes.about(recording.metadata).deleted
+            headers = list(episode_headers(recording, name, deleted))
             if seen is not None:
                 seen[name] = recording
             copies = [header for header in headers if header.id in files]
@@ -170,6 +173,19 @@ class FilesSource:
             found += [header for header in new if episode_filter is None or matches(header)]
         return found
 
+    def _each(self) -> Iterator[Recording]:
+        """The recordings, one after the other open."""
+        for name in self.names:
+            try:
+                recording = Recording(name)
+            except TupliError as err:
+                if not self._of_directory:
+                    raise
+                warnings.warn(f"{err}; it is left out", stacklevel=4)
+                continue
+            with recording:
+                yield recording
+
     def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
         """Files have no SQL: what every episode is tried against."""
         return f"every episode: benchmark {benchmark_filter}, episode {episode_filter}"
@@ -178,7 +194,7 @@ class FilesSource:
         return Recording(recording, cache_bytes=_CACHE_BYTES)
 
     def __repr__(self) -> str:
-        return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} files"
+        return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} recordings"
 
 
 def _expand(item: str | os.PathLike[str]) -> Sequence[str]:

@@ -18,8 +18,9 @@ from tupli_mcap.spaces.leaves import Leaf
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
 
-__all__ = ["QUANTILES", "FieldStatistics", "statistics_of"]
+__all__ = ["QUANTILES", "STATISTICAL", "FieldStatistics", "statistics_of"]
 
+STATISTICAL = ("states", "actions", "rewards", "next_states")
 QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 _SAMPLED = 1 << 16  # steps that quantiles are of, at even distances
 _BLOCK = 1 << 16  # steps
@@ -52,18 +53,29 @@ def statistics_of(dataset: Dataset, fields: Sequence[str]) -> dict[str, FieldSta
     layout, total = steps.layout, len(steps)
     leaves = [(field, leaf) for field in fields for leaf in field_leaves(field, layout) or ()]
     leaves = [(field, leaf) for field, leaf in leaves if leaf.kind != "variable" and not leaf.apart]
-    known = {leaf.path: ElementStatistics(leaf, layout.dtypes[leaf.name]) for _, leaf in leaves}
+    names = [_name(field, leaf) for field, leaf in leaves]
+    known = {
+        name: ElementStatistics(leaf, layout.dtypes[leaf.name])
+        for name, (_, leaf) in zip(names, leaves, strict=True)
+    }
     sampled = np.unique(np.linspace(0, total - 1, min(total, _SAMPLED)).round().astype(np.int64))
     samples: dict[str, list[Array]] = {path: [] for path in known}
     for first in range(0, total, _BLOCK):
         rows = np.arange(first, min(first + _BLOCK, total))
         columns = steps.read(list(dict.fromkeys(field for field, _ in leaves)), rows)
         here = sampled[(sampled >= rows[0]) & (sampled <= rows[-1])] - first
-        for field, leaf in leaves:
+        for name, (field, leaf) in zip(names, leaves, strict=True):
             values = leaf.get(columns[field]).reshape(len(rows), leaf.size)
-            known[leaf.path].add(np.ascontiguousarray(values.T))
-            samples[leaf.path].append(values[here])
-    return {leaf.path: _of(leaf, known[leaf.path], np.concatenate(samples[leaf.path])) for _, leaf in leaves}
+            known[name].add(np.ascontiguousarray(values.T))
+            samples[name].append(values[here])
+    return {
+        name: _of(leaf, known[name], np.concatenate(samples[name]))
+        for name, (_, leaf) in zip(names, leaves, strict=True)
+    }
+
+
+def _name(field: str, leaf: Leaf) -> str:
+    return f"next_{leaf.path}" if field == "next_states" else leaf.path
 
 
 def _of(leaf: Leaf, known: ElementStatistics, sample: Array) -> FieldStatistics:

@@ -43,6 +43,11 @@ def arrow(dataset: Dataset, level: Level) -> pa.Table:
         import pyarrow
     except ImportError as err:
         raise missing_extra("an Arrow table needs pyarrow", "arrow") from err
+    for name in frame.columns:
+        if frame[name].dtype == object:  # arrays of several dimensions have to be lists
+            frame[name] = [
+                value.tolist() if isinstance(value, np.ndarray) else value for value in frame[name]
+            ]
     return pyarrow.Table.from_pandas(frame, preserve_index=False)
 
 
@@ -50,17 +55,24 @@ def _episode_columns(dataset: Dataset) -> dict[str, Any]:
     headers = dataset._headers
     columns: dict[str, Any] = {
         "id": [header.id for header in headers],
+        "episode": np.arange(len(headers)),  # as in the table of steps
         "recording": [header.recording for header in headers],
-        "episode": np.array([header.episode for header in headers], np.int64),
+        "number": np.array([header.episode for header in headers], np.int64),
         "env": np.array([header.env for header in headers], np.int64),
         "steps": dataset.lengths,
         "return": dataset.returns,
         "end": [header.end for header in headers],
-        "seed": [header.seed for header in headers],
+        "seed": _whole_numbers([header.seed for header in headers]),
         "ended": np.array([header.created_at.removesuffix("+00:00") for header in headers], "datetime64[ns]"),
         "benchmark_id": [header.benchmark_id for header in headers],
     }
     return columns | _metadata_columns([header.metadata for header in headers])
+
+
+def _whole_numbers(values: list[int | None]) -> Any:
+    """Integers, some of which are not known; without a loss, which floats would be."""
+    fits = all(value is None or -(2**63) <= value < 2**63 for value in values)
+    return import_pandas().array(values, dtype="Int64") if fits else values
 
 
 def _metadata_columns(items: list[dict[str, Any]]) -> dict[str, list[Any]]:
@@ -86,7 +98,7 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
         columns |= _named(found.actions, recording.layout, recording.labels, "action")
         columns |= _named(found.rewards, recording.layout, recording.labels, "reward")
     columns |= {"terminal": found.terminals, "timeout": found.timeouts}
-    repeated = {"id", "seed", *(key for key in episodes if key.startswith("metadata."))}
+    repeated = {"id", "env", "seed", *(key for key in episodes if key.startswith("metadata."))}
     for key in episodes:
         if key in repeated:
             values = pandas.Series(episodes[key])

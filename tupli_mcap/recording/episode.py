@@ -55,14 +55,41 @@ class Episode(GymnasiumNames):
     def __len__(self) -> int:
         return int(self._row["length"])
 
-    def __getitem__(self, steps: slice) -> Columns:
-        """The columns (without `next_states`) of some consecutive steps; only their rows are copied."""
+    @overload
+    def __getitem__(self, steps: int) -> Step: ...
+    @overload
+    def __getitem__(self, steps: slice) -> Columns: ...
+    def __getitem__(self, steps: int | slice) -> Step | Columns:
+        """A step, or the columns (without `next_states`) of some consecutive ones; only their rows are copied.
+
+        Raises:
+            IndexError: there is no such step.
+            RecordingError: it is no number, and no slice of consecutive steps.
+        """
+        if isinstance(steps, int | np.integer) and not isinstance(steps, bool):
+            return self._step(int(steps))
+        if not isinstance(steps, slice):
+            raise RecordingError(f"expected a step's number or a slice, found {steps!r:.80}")
         start, stop, stride = steps.indices(len(self))
         if stride != 1:
             raise RecordingError(
                 f"expected consecutive steps, found a stride of {stride}; slice the columns instead"
             )
         return self._recording.read_steps(self._position, start, max(start, stop))
+
+    def _step(self, number: int) -> Step:
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"expected a step from 0 to {len(self) - 1}, found {number}")
+        number %= len(self)
+        infos = None if self.infos is None else self.infos[number : number + 1]
+        return next(self._steps(self[number : number + 1], infos))
+
+    def __eq__(self, other: object) -> bool:
+        """Whether it is the same episode, however it was opened."""
+        return isinstance(other, Episode) and self.id == other.id
+
+    def __hash__(self) -> int:
+        return hash(self.id)
 
     @property
     def id(self) -> str:
@@ -199,12 +226,14 @@ class Episode(GymnasiumNames):
         return self._recording.frames(self._position)
 
     def __iter__(self) -> Iterator[Step]:
-        columns, infos = self._columns, self.infos
+        return self._steps(self._columns, self.infos)
+
+    def _steps(self, columns: Columns, infos: Sequence[dict[str, Any] | None] | None) -> Iterator[Step]:
         layout = self._recording.layout
         state = item_getter(layout.observation_space, columns.states)
         action = item_getter(layout.action_space, columns.actions)
         reward = reward_getter(layout.reward_space, columns.rewards)
-        for i in range(len(self)):
+        for i in range(len(columns)):
             yield Step(
                 state(i),
                 action(i),

@@ -27,11 +27,20 @@ __all__ = [
     "RecordingStamp",
     "compactable",
     "find_recordings",
+    "is_storage",
     "list_recordings",
     "scan",
     "stamp_of",
     "with_tuples",
 ]
+
+
+_PARTS = ("benchmarks", "artifacts", "recordings", "storage.json")
+
+
+def is_storage(root: Path) -> bool:
+    """Whether a directory has been used as a storage, and is not only one of recordings."""
+    return any((root / part).exists() for part in _PARTS)
 
 
 class RecordingStamp(NamedTuple):

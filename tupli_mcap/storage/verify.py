@@ -21,14 +21,13 @@ from tupli_mcap.storage.artifacts import ArtifactFiles
 from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.files import FileStorage
-from tupli_mcap.storage.listing import scan
+from tupli_mcap.storage.listing import is_storage, scan
 from tupli_mcap.storage.sidecar import DELETING, Notes, sidecar_path
 from tupli_mcap.storage.texts import is_hash
 
 __all__ = ["StorageReport", "verify_paths", "verify_storage"]
 
 _PIECE = 1 << 20
-_PARTS = ("benchmarks", "artifacts", "recordings", "storage.json")
 
 
 @dataclass
@@ -160,10 +159,10 @@ def _directory(root: Path) -> Iterator[VerifyReport]:
     """A report on the files beside the recordings, if there are any to speak of."""
     report = VerifyReport(str(root), kind="storage")
     findings = Findings(report)
-    is_storage = any((root / part).exists() for part in _PARTS)
-    for check in (_leftovers, *((_artifacts, _benchmarks) if is_storage else ())):
+    is_whole = is_storage(root)
+    for check in (_leftovers, *((_artifacts, _benchmarks) if is_whole else ())):
         _guarded(check, root, findings)
-    if is_storage or report.problems:
+    if is_whole or report.problems:
         yield report
 
 
