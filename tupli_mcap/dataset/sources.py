@@ -194,7 +194,7 @@ class FilesSource:
         return Recording(recording, cache_bytes=_CACHE_BYTES)
 
     def __repr__(self) -> str:
-        return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} recordings"
+        return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} files"
 
 
 def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
