@@ -17,6 +17,8 @@ from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, TupliErr
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeMetadataCallback
 
+METADATA = ["metadata.side", "metadata.count", "metadata.success"]
+
 
 class Notes(EpisodeMetadataCallback):
     """Metadata that differ from episode to episode."""
@@ -247,10 +249,13 @@ def test_reading_gives_the_episodes_in_their_order(dataset: Dataset, seed: int) 
     assert found.n_steps == first == len(columns)
 
 
-def test_no_episode_has_no_steps(dataset: Dataset) -> None:
+def test_no_episode_has_no_steps(dataset: Dataset, tmp_path: Path) -> None:
     none = dataset.filter("steps > 100000")
     assert len(none) == none.n_steps == len(none.read()) == 0
+    assert (none.read().states.shape, none.read().states.dtype) == ((0, 4), np.float32)
     assert none.to_pandas("episodes").empty and none.to_pandas().empty
+    assert list(none.to_pandas()) == list(dataset.head(1).to_pandas().drop(columns=METADATA))
+    assert len(tupli_mcap.open(tmp_path).read()) == 0  # of no recording at all
 
 
 def test_gymnasiums_names(dataset: Dataset) -> None:

@@ -121,6 +121,6 @@ def _number(value: object, header: EpisodeHeader, expression: F) -> float:
         found = "nothing" if value is MISSING else f"{value!r:.80}"
         raise SamplingError(
             f"expected a number as {expression.key} of every episode, found {found} for {header.id}; "
-            "leave such episodes out with with_episode_filter(...)"
+            "leave such episodes out by a filter"
         )
     return float(value)

@@ -187,6 +187,13 @@ class Dataset(RandomAccess):
             raise DatasetError(f"{header.recording} has no episode {header.episode} any more; open it again")
         return episode
 
+    @property
+    def example(self) -> Recording | None:
+        """One of the recordings, for its spaces and labels; of a dataset that filters left empty, one they left out.
+        None where there is none at all."""
+        headers = self._headers or self._source.episodes(None, None)
+        return self._recordings.get(headers[0].recording) if headers else None
+
     def _of(self, headers: Sequence[EpisodeHeader]) -> Dataset:
         made = Dataset(self._source, headers)
         made._recordings = self._recordings
@@ -315,6 +322,8 @@ class Dataset(RandomAccess):
             SpaceError: the steps of two recordings do not fit into one array; the message says which.
         """
         wanted = field_names(fields, FIELDS, DatasetError)
+        if not self._headers and (example := self.example) is not None:
+            return example.read([], wanted)
         names = list(dict.fromkeys(header.recording for header in self._headers))
         place = {name: i for i, name in enumerate(names)}
         order = np.argsort([place[header.recording] for header in self._headers], kind="stable")

@@ -92,8 +92,8 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
         "step": np.arange(len(of_episode)) - starts,
         "time": found.times.astype("datetime64[ns]"),
     }
-    if len(dataset):
-        recording = dataset[0].recording
+    recording = dataset.example
+    if recording is not None:
         columns |= _named(found.states, recording.layout, recording.labels, "state")
         columns |= _named(found.actions, recording.layout, recording.labels, "action")
         columns |= _named(found.rewards, recording.layout, recording.labels, "reward")

@@ -60,7 +60,7 @@ def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
     if gone.any():
         raise NotFoundError(
             f"{recording.name}: episode {listed.numbers[int(np.argmax(gone))]} was listed, but is not there as it "
-            "was: the file has been changed since; call load() to list the episodes anew"
+            "was: the file has been changed since; open it again, or list the episodes anew with load()"
         )
     return positions
 
