@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 
@@ -17,18 +17,14 @@ from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 __all__ = [
     "EPISODE_TOPICS",
     "StepClaims",
-    "StepsAt",
     "check_chunks",
     "check_episodes",
     "check_rows",
 ]
 
 EPISODE_TOPICS = (EPISODE_START, EPISODE_END, FINAL_STATE)
-StepsAt = Callable[[Array], tuple[Array, Array]]
-"""What the steps at some rows say: `episode` and `step` as one number (`<u8`), and the two flags as one (`<u2`)."""
 
 _U32 = 2**32 - 1
-_GOES_ON = 2  # what the flags of a step say that does not end its episode, see `_end_of`
 _CHUNK_FIXED = 9 + 40  # of a Chunk record, before and after the name of its compression
 _NAMED = np.array([_CHUNK_FIXED + len(name.replace("none", "")) for name in COMPRESSIONS], np.uint64)
 _RATIOS = np.array([MAX_RATIO[name] for name in COMPRESSIONS], np.uint64)
@@ -135,7 +131,7 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
 
 
 class StepClaims:
-    """What the episode index says of the rows of a step channel: where episodes end, and how.
+    """What the episode index says of the rows of a step channel: where episodes end.
 
     The index is held against the last row of each episode and of each chunk. Such a row says how many steps of its
     episode came before it, so this finds every boundary that is not where the rows have it. Threads and stores may
@@ -151,9 +147,9 @@ class StepClaims:
         self._index, self._env, self._chunks = index, env, chunks
 
     @cached_property
-    def _claims(self) -> tuple[Array, Array, Array, dict[int, slice]]:
-        """The rows that are looked at, counted within their chunk; the `episode` and `step`, and the end, that each
-        should say; by the first row of a chunk, which of them are its.
+    def _claims(self) -> tuple[Array, Array, dict[int, slice]]:
+        """The rows that are looked at, counted within their chunk; the `episode` and `step` that each should say; by
+        the first row of a chunk, which of them are its.
         """
         index = self._index
         mine = index["env"] == self._env
@@ -161,10 +157,10 @@ class StepClaims:
             index = index[mine]
         # field by field: NumPy takes far longer for rows of many fields
         firsts, lengths = index["first_row"].astype(np.int64), index["length"].astype(np.int64)
-        episodes, how = index["episode"].astype(np.int64), np.ascontiguousarray(index["end"])
+        episodes = index["episode"].astype(np.int64)
         if (firsts[1:] < firsts[:-1]).any():
             order = np.argsort(firsts, kind="stable")
-            firsts, lengths, episodes, how = firsts[order], lengths[order], episodes[order], how[order]
+            firsts, lengths, episodes = firsts[order], lengths[order], episodes[order]
         rows, numbers = firsts + lengths - 1, episodes + (lengths - 1 << 32)
 
         chunks = self._chunks[self._chunks["rows"] > 0]
@@ -174,47 +170,33 @@ class StepClaims:
         goes_on = at < len(rows)
         goes_on[goes_on] = (firsts[at[goes_on]] <= last[goes_on]) & (rows[at[goes_on]] != last[goes_on])
         at, last = at[goes_on], last[goes_on]
-        numbers = np.insert(numbers, at, episodes[at] + (last - firsts[at] << 32))
-        rows, how = np.insert(rows, at, last), np.insert(how, at, _GOES_ON)
+        numbers = np.insert(numbers, at, episodes[at] + (last - firsts[at] << 32)).astype("<u8")
+        rows = np.insert(rows, at, last)
 
         bounds = rows.searchsorted(np.append(starts, starts[-1:] + counts[-1:]))
         rows -= np.repeat(starts, np.diff(bounds))
         of_chunk = map(slice, bounds[:-1].tolist(), bounds[1:].tolist())
-        return rows, numbers, how, dict(zip(starts.tolist(), of_chunk, strict=True))
+        return rows, numbers, dict(zip(starts.tolist(), of_chunk, strict=True))
 
-    def check(self, first: int, steps_at: StepsAt, where: str) -> None:
+    def check(self, first: int, numbers_at: Callable[[Array], Array], where: str) -> None:
         """Holds the rows of a chunk against the index.
 
         Args:
             first: the number of its first row.
-            steps_at: what its rows say; 0 is the first row.
+            numbers_at: gives `episode` and `step` of some of its rows as one number (`<u8`); 0 is the first row.
             where: the file, and what of it is read.
 
         Raises:
-            FormatError: a row is of another episode or step, or the flags of an episode's last row say another end.
+            FormatError: a row is of another episode or step.
         """
-        rows, numbers, how, of_chunk = self._claims
+        rows, numbers, of_chunk = self._claims
         mine = of_chunk[first]
-        places, expected, ends = rows[mine], numbers[mine], how[mine]
-        found, flags = steps_at(places)
+        expected = numbers[mine]
+        found = numbers_at(rows[mine])
         if found.tobytes() != expected.tobytes():
-            i = int(np.argmax(found != expected.view(found.dtype)))
+            i = int(np.argmax(found != expected))
             one, other = int(found[i]), int(expected[i])
             raise FormatError(
-                f"{where}: expected step {other >> 32} of episode {other & _U32} in row {first + places[i]} as the "
-                f"episode index says, found step {one >> 32} of episode {one & _U32}; recover it into a new file"
+                f"{where}: expected step {other >> 32} of episode {other & _U32} in row {first + rows[mine][i]} as "
+                f"the episode index says, found step {one >> 32} of episode {one & _U32}; recover it into a new file"
             )
-        told = _end_of()[flags]
-        if told.tobytes() != ends.tobytes():
-            i = int(np.argmax(told != ends))
-            raise FormatError(
-                f"{where}: expected the end {ends[i]} of episode {int(expected[i]) & _U32} as the episode index says, "
-                f"found other flags in row {first + places[i]}; recover it into a new file"
-            )
-
-
-@cache
-def _end_of() -> Array:
-    """The end that the bytes of `terminal` and `timeout` say: 0 terminal, 1 timeout, 2 interrupted."""
-    flags = np.arange(1 << 16)
-    return np.where(flags & 0xFF, 0, np.where(flags, 1, 2)).astype(np.uint8)

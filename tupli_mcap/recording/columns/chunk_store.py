@@ -39,7 +39,7 @@ _MESSAGE_HEAD = np.dtype(
         "itemsize": 15,
     }
 )
-_U2, _U4, _U8 = np.dtype("<u2"), np.dtype("<u4"), np.dtype("<u8")
+_U4, _U8 = np.dtype("<u4"), np.dtype("<u8")
 _SEQUENCE_AT = 11  # in a record
 _LEAST_STEP = BODY + 8 + 2  # bytes of a step's record: episode and step, terminal and timeout
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
@@ -145,19 +145,6 @@ def _are_rows(data: Any, rows: int, size: int, channel: int) -> bool:
         heads, rests = _heads.__wrapped__(rows, size - 9, channel)
     found = heads.startswith(np.ndarray(rows, _HEAD, data, 0, (size,)).tobytes())
     return found and rests.startswith(np.ndarray(rows, _REST, data, 7, (size,)).tobytes())
-
-
-def _steps_of_rows(data: Any, size: int, places: Array) -> tuple[Array, Array]:
-    """`StepsAt` for rows of constant size."""
-    count = len(data) // size
-    numbers = np.ndarray(count, _U8, data, BODY, (size,))[places]
-    return numbers, np.ndarray(count, _U2, data, size - 2, (size,))[places]
-
-
-def _steps_of_records(data: Any, starts: Array, stops: Array, places: Array) -> tuple[Array, Array]:
-    """`StepsAt` for records of variable size."""
-    numbers = np.ndarray(len(data) - 7, _U8, data, 0, (1,))[starts[places] + BODY]
-    return numbers, np.ndarray(len(data) - 1, _U2, data, 0, (1,))[stops[places] - 2]
 
 
 def _check_sequence(sequences: Array, first: int, where: str) -> None:
@@ -373,7 +360,7 @@ class ChunkStore:
         if claims is None or not n:
             _check_sequence(np.ndarray(n, _U4, data, _SEQUENCE_AT, (size,)), first, where)
         else:
-            claims.check(first, functools.partial(_steps_of_rows, data, size), where)
+            claims.check(first, np.ndarray(n, _U8, data, BODY, (size,)).__getitem__, where)
         self._held[i] = True  # its CRC says that it stays the same
 
     def _hold_records(self, i: int, data: Any, records: Array) -> None:
@@ -381,10 +368,11 @@ class ChunkStore:
         first, where = int(self.table["first"][i]), f"{self._source.name}: chunk {i}"
         claims = None if self.claims is None else self.claims.get(int(self.table["channel"][i]))
         if claims is not None and len(records):
-            starts, stops = records[:, 0], records[:, 1]
-            if int((stops - starts).min()) < _LEAST_STEP:
+            starts = records[:, 0]
+            if int((records[:, 1] - starts).min()) < _LEAST_STEP:
                 raise FormatError(f"{where} holds messages that are no steps")
-            claims.check(first, functools.partial(_steps_of_records, data, starts, stops), where)
+            numbers = np.ndarray(len(data) - 7, _U8, data, 0, (1,))
+            claims.check(first, lambda places: numbers[starts[places] + BODY], where)
         self._held[i] = True
 
     def _decoded(self, i: int, codec: Decoder, *, keep: bool) -> KeptChunk:
