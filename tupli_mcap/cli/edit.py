@@ -91,7 +91,7 @@ def split(
 
 def tag(
     files: Annotated[
-        list[str], typer.Argument(metavar="FILE... KEY=VALUE...", help="Recordings, and what to say.")
+        list[str], typer.Argument(metavar="FILE|KEY=VALUE", help="Recordings, and what to say.")
     ],
     episodes: Annotated[
         str | None,
