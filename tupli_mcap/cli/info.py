@@ -298,10 +298,18 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),
         ("steps", f"{d.steps:,}{_spread_text(d.lengths, d.episodes, ' an episode')}"),
         *([("return", _spread_text(d.returns, d.episodes).removeprefix(", "))] if d.returns else []),
+        *([] if d.made_of is None else [("made of", _made_of_text(d.made_of))]),
         *([] if d.success is None else [("success", f"{d.success:.0%} of the episodes that say it")]),
         *([("metadata", ", ".join(d.metadata_keys))] if d.metadata_keys else []),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
+
+
+def _made_of_text(made_of: dict[str, Any]) -> str:
+    facts = [f"{made_of.get(key)!s:.200}" for key in ("query", "function") if made_of.get(key)]
+    names = [str(one.get("name", "")) if isinstance(one, dict) else "" for one in made_of["sources"]]
+    listed = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    return f"{listed} by {made_of.get('how', '')!s:.40}{''.join(f' {fact}' for fact in facts)}"
 
 
 def _run_facts(run: dict[str, Any]) -> list[tuple[str, str]]:

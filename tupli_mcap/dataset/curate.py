@@ -4,19 +4,27 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.recording import Recording, merge_recordings, rewrite_recording
+from tupli_mcap.recording import (
+    Episode,
+    Recording,
+    merge_recordings,
+    relabel_recording,
+    rewrite_recording,
+    say_made_of,
+)
 from tupli_mcap.schema import BaseFilter, parse_filter
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
 
-__all__ = ["FilterReport", "filter_recording", "save"]
+__all__ = ["FilterReport", "filter_recording", "relabel", "save"]
 
 
 class FilterReport(NamedTuple):
@@ -63,7 +71,9 @@ def filter_recording(
         report = FilterReport(target, len(rows), steps, left_out)
         if dry_run:
             return report
-        rewrite_recording(recording, target, episodes=rows["episode"].tolist(), compression=compression)
+        said = say_made_of([recording], "filter", query=str(wanted))
+        numbers = rows["episode"].tolist()
+        rewrite_recording(recording, target, episodes=numbers, attachments=said, compression=compression)
     return report._replace(size=target.stat().st_size)
 
 
@@ -84,7 +94,9 @@ def save(dataset: Dataset, target: Path, *, overwrite: bool) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     if len(chosen) == 1:
         ((name, numbers),) = chosen.items()
-        rewrite_recording(dataset._recordings.get(name), target, episodes=sorted(numbers))
+        source = dataset._recordings.get(name)
+        said = say_made_of([source], "filter", **_query_of(dataset))
+        rewrite_recording(source, target, episodes=sorted(numbers), attachments=said)
         return target
     with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
         parts = []
@@ -93,3 +105,28 @@ def save(dataset: Dataset, target: Path, *, overwrite: bool) -> Path:
             rewrite_recording(dataset._recordings.get(name), parts[-1], episodes=sorted(numbers))
         merge_recordings(parts, target, overwrite=overwrite)
     return target
+
+
+def relabel(
+    dataset: Dataset,
+    function: Callable[[Episode], Any],
+    target: Path,
+    fields: Sequence[str],
+    *,
+    overwrite: bool,
+) -> Path:
+    """See `Dataset.map`."""
+    if target.exists() and not overwrite:
+        raise DatasetError(f"{target} exists; choose another path, or overwrite it")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    names = list(dict.fromkeys(header.recording for header in dataset._headers))
+    with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
+        chosen = save(dataset, Path(folder) / target.name, overwrite=False)
+        with Recording(chosen) as recording:
+            sources = [dataset._recordings.get(name) for name in names]
+            relabel_recording(recording, target, function, fields, sources=sources)
+    return target
+
+
+def _query_of(dataset: Dataset) -> dict[str, str]:
+    return {} if dataset._filter is None else {"query": str(dataset._filter)}

@@ -429,6 +429,30 @@ class Dataset(RandomAccess):
         """
         return curate.save(self, Path(target), overwrite=overwrite)
 
+    def map(
+        self,
+        function: Callable[[Episode], Any],
+        target: str | os.PathLike[str],
+        *,
+        fields: Sequence[str] = ("rewards",),
+        overwrite: bool = False,
+    ) -> Path:
+        """Writes the episodes to a new recording, with new values of some fields; all else of them is kept.
+
+        `ds.map(lambda episode: episode.rewards - 1, "relabelled.mcap")` gives other rewards.
+
+        Args:
+            function: from an `Episode` to its new column (a value for each step, nested as the space is); with several
+                fields, to a dict of columns.
+            fields: "rewards", "actions", or both.
+
+        Raises:
+            DatasetError: there is no episode, or the target exists (and not `overwrite`).
+            RecordingError: the function gives something else than the recording's dtype holds exactly; values are of
+                variable size; or the target cannot be written.
+        """
+        return curate.relabel(self, function, Path(target), fields, overwrite=overwrite)
+
     # ---- looking
 
     def __repr__(self) -> str:

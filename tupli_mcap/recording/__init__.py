@@ -26,7 +26,9 @@ from tupli_mcap.recording.run import Run
 if TYPE_CHECKING:
     from tupli_mcap.recording.check.verify import Problem, VerifyReport, verify_recording
     from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation
+    from tupli_mcap.recording.edit.made_of import made_of, say_made_of
     from tupli_mcap.recording.edit.merge import MergeReport, Part, merge_recordings, split_recording
+    from tupli_mcap.recording.edit.relabel import relabel_recording
     from tupli_mcap.recording.edit.repair import RecoveryReport, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording
     from tupli_mcap.recording.write.from_values import EpisodeData, write_recording
@@ -41,9 +43,12 @@ _HOMES = {
     "VerifyReport": "check.verify",
     "annotate_episodes": "edit.annotate",
     "edit_run": "edit.annotate",
+    "made_of": "edit.made_of",
     "merge_recordings": "edit.merge",
     "recover_recording": "edit.repair",
+    "relabel_recording": "edit.relabel",
     "rewrite_recording": "edit.rewrite",
+    "say_made_of": "edit.made_of",
     "split_recording": "edit.merge",
     "undo_annotation": "edit.annotate",
     "verify_recording": "check.verify",
@@ -67,9 +72,12 @@ __all__ = [
     "annotate_episodes",
     "edit_run",
     "journal_path",
+    "made_of",
     "merge_recordings",
     "recover_recording",
+    "relabel_recording",
     "rewrite_recording",
+    "say_made_of",
     "split_recording",
     "undo_annotation",
     "verify_recording",

@@ -14,6 +14,7 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents
+from tupli_mcap.recording.edit.made_of import made_of
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
 
@@ -63,7 +64,8 @@ class RecordingDescription:
         an episode.
     compression: bytes of messages for one byte of chunks in the file; None without a chunk.
     ends: episodes by how they ended. environment: the name its benchmark says, None if it carries none.
-    run: what is known of the run. metadata_keys: those that episodes have. success: see `success_rate`.
+    run: what is known of the run. made_of: of which recordings it was made; None if it was recorded.
+    metadata_keys: those that episodes have. success: see `success_rate`.
     signed_by: the fingerprint of the key that its signature names, unchecked; None if it is not signed.
     """
 
@@ -79,6 +81,7 @@ class RecordingDescription:
     environment: str | None
     signed_by: str | None
     run: dict[str, Any]
+    made_of: dict[str, Any] | None
     metadata_keys: list[str]
     success: float | None
     num_envs: int
@@ -119,6 +122,7 @@ def describe(recording: Recording) -> RecordingDescription:
         environment=recording.benchmark.record.name if carried else None,
         signed_by=claimed_signer(recording),
         run={key: value for key, value in vars(recording.run).items() if value},
+        made_of=made_of(recording),
         metadata_keys=_metadata_keys(recording),
         success=success_rate(recording, np.arange(len(rows))),
         num_envs=recording.num_envs,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, 
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.recording import Recording
 
-__all__ = ["EpisodeCopier", "NewFrames"]
+__all__ = ["EpisodeCopier", "NewFrames", "NewValues"]
 
 
 class NewFrames(Protocol):
@@ -28,6 +28,17 @@ class NewFrames(Protocol):
         ...
 
 
+class NewValues(NamedTuple):
+    """Values in place of those that were recorded.
+
+    columns: by step channel and leaf (ROS name), a value for each of the channel's rows. returns: of episodes, by
+    number.
+    """
+
+    columns: Mapping[int, Mapping[str, Array]]
+    returns: Mapping[int, float]
+
+
 class EpisodeCopier:
     """Appends episodes of `source` to `target`.
 
@@ -36,6 +47,7 @@ class EpisodeCopier:
         shift: added to the numbers of the episodes.
         cameras: by camera, then by sub-environment, the ids of its channels.
         frames: of a camera, in place of the source's.
+        values: of steps of constant layout, in place of the source's.
     """
 
     def __init__(
@@ -47,7 +59,9 @@ class EpisodeCopier:
         channels: Mapping[int, int] | None = None,
         shift: int = 0,
         frames: NewFrames | None = None,
+        values: NewValues | None = None,
     ) -> None:
+        self._values = values or NewValues({}, {})
         self._source, self._target, self._shift = source, target, shift
         self._channels = channels or {}
         self._cameras, self._new_frames = cameras, frames
@@ -81,7 +95,7 @@ class EpisodeCopier:
         return self._channels.get(channel, channel)
 
     def _copy_first(self, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
-        if self._shift or self._to(channel) != channel:
+        if self._shift or self._to(channel) != channel or channel in self._values.columns:
             return 0
         return self._target.copy_first(self._file, channel, count, dtype)
 
@@ -98,12 +112,18 @@ class EpisodeCopier:
 
     def _rows(self, channel: int, spans: Iterable[tuple[int, int]], dtype: np.dtype[Any]) -> Iterator[Array]:
         """Rows of constant size, with the new numbers of their episodes."""
+        new = self._values.columns.get(channel, {})
         for first, count in spans:
             for span in self._store.spans(channel, first, count):
                 part: Array = self._store.rows(span.chunk, dtype, keep=False)[span.begin : span.end]
-                if self._shift and "episode" in (dtype.names or ()):
+                renumbered = self._shift and "episode" in (dtype.names or ())
+                if renumbered or new:
                     part = np.frombuffer(bytearray(part.tobytes()), dtype)
+                if renumbered:
                     part["episode"] += np.uint32(self._shift)
+                for name, column in new.items():
+                    part[name] = column[first : first + len(part)]
+                first += len(part)
                 yield part
 
     def _messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
@@ -156,7 +176,8 @@ class EpisodeCopier:
                 starts.append((start_time, start._replace(episode=number, first_row=int(first)).encode()))
             ((end_time, body),) = self._messages(topics[EPISODE_END], int(row["end_row"]), 1)
             end = EpisodeEnd.decode(memoryview(body))
-            end = end._replace(episode=end.episode + self._shift, first_row=int(first))
+            total = self._values.returns.get(end.episode, end.episode_return)
+            end = end._replace(episode=end.episode + self._shift, first_row=int(first), episode_return=total)
             final = -1
             if row["final_row"] >= 0:
                 final = begins[FINAL_STATE] + final_places[len(finals)]

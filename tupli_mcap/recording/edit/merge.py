@@ -24,6 +24,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.carry_runs import carry_runs
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier
+from tupli_mcap.recording.edit.made_of import MADE_OF_NAME, say_made_of
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
 from tupli_mcap.recording.file_series import series
@@ -125,7 +126,8 @@ def _merge(
     now, first = time.time_ns(), sources[0]
     turns, next_episode = _numbered(sources, _turns(sources))
     target = Assembler(container)
-    target.begin(_metadata(first, next_episode=next_episode), {**attachments, **carry_runs(turns)}, now)
+    said = {**carry_runs(turns), **say_made_of(sources, "merge")}
+    target.begin(_metadata(first, next_episode=next_episode), {**attachments, **said}, now)
     define(first, target)
     for recording in sources[1:]:
         _define_missing(recording, container)
@@ -268,7 +270,7 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
     with_environment = next((r for r in sources if _ENVIRONMENT[0] in r.attachments), None)
     for recording in sources:
         for name, info in recording.attachments.items():
-            if name in (*STATEMENTS, RUN_NAME, ANNOTATIONS_NAME) or (
+            if name in (*STATEMENTS, RUN_NAME, ANNOTATIONS_NAME, MADE_OF_NAME) or (
                 name in _ENVIRONMENT and recording is not with_environment
             ):
                 continue

@@ -15,7 +15,7 @@ from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.carry_runs import carry_runs
-from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames
+from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, NewValues
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
@@ -70,6 +70,7 @@ def write(
     *,
     signed: bool,
     left_out: Sequence[str] = (),
+    values: NewValues | None = None,
 ) -> int:
     """Writes some of a source's episodes, and its attachments but those `left_out`, to a new recording.
 
@@ -96,7 +97,7 @@ def write(
     cameras = camera_channels(source, container, frames) if source.num_envs else {}
     container.define_channels()
     if source.num_envs:
-        EpisodeCopier(source, target, cameras, frames=frames).run(rows)
+        EpisodeCopier(source, target, cameras, frames=frames, values=values).run(rows)
     target.finish(now)
     return target.copied
 

@@ -1,0 +1,149 @@
+"""Recordings with other rewards or actions, and what a recording says that it was made of."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import jsonschema
+import numpy as np
+import pytest
+from gymnasium import spaces
+from typer.testing import CliRunner
+
+import tupli_mcap
+from tupli_mcap import RecordEpisodes, Recording, RecordingError
+from tupli_mcap.cli.app import app
+from tupli_mcap.dataset import DatasetError
+from tupli_mcap.recording import made_of, merge_recordings, verify_recording
+from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
+
+SCHEMA = Path(__file__).parent.parent / "schemas" / "made_of.schema.json"
+
+
+def record(path: Path, seeds: int = 4, env: Any = None, **options: Any) -> Path:
+    with RecordEpisodes(env or gym.make("CartPole-v1"), path, chunk_size=500, **options) as recorded:
+        recorded.action_space.seed(1)
+        for seed in range(seeds):
+            recorded.reset(seed=seed)
+            ended = False
+            while not ended:
+                _, _, terminal, timeout, _ = recorded.step(recorded.action_space.sample())
+                ended = terminal or timeout
+    return path
+
+
+def test_rewards_change_and_all_else_stays(tmp_path: Path) -> None:
+    source = record(tmp_path / "r.mcap", record_info=True, name="ppo", metadata={"lr": 1})
+    ds = tupli_mcap.open(source)
+    ds[1].annotate(good=True)
+    new = tupli_mcap.open(source).map(lambda episode: np.arange(len(episode)) - 0.5, tmp_path / "new.mcap")
+    before, after = Recording(source), Recording(new)
+    for old, made in zip(before.episodes, after.episodes, strict=True):
+        np.testing.assert_array_equal(made.rewards, np.arange(len(old)) - 0.5)
+        assert made.return_ == sum(np.arange(len(old)) - 0.5)
+        for name in ("states", "actions", "terminals", "timeouts", "next_states"):
+            np.testing.assert_array_equal(getattr(made, name), getattr(old, name))
+        assert (made.seed, made.metadata, made.end, made.start_time, made.infos) == (
+            old.seed, old.metadata, old.end, old.start_time, old.infos,
+        )  # fmt: skip
+        assert made.run == old.run
+    np.testing.assert_array_equal(after.read(fields=["times"]).times, before.read(fields=["times"]).times)
+    assert after.uuid != before.uuid
+    assert verify_recording(new).ok
+    said = made_of(after)
+    jsonschema.validate(said, json.loads(SCHEMA.read_text()))
+    assert said is not None
+    assert (said["how"], said["fields"], said["sources"][0]["uuid"]) == ("map", ["rewards"], before.uuid)
+    assert "test_rewards_change_and_all_else_stays" in said["function"]
+    assert "made of" in CliRunner().invoke(app, ["info", str(new)]).output
+
+
+def test_actions_and_rewards_of_some_episodes_of_several_recordings(tmp_path: Path) -> None:
+    paths = [record(tmp_path / f"{i}.mcap", name=f"w{i}") for i in range(2)]
+    ds = tupli_mcap.open(paths).filter("seed >= 2")
+    new = ds.map(
+        lambda episode: {"actions": 1 - episode.actions, "rewards": episode.rewards * 2},
+        tmp_path / "deep" / "new.mcap",
+        fields=["actions", "rewards"],
+    )
+    after = tupli_mcap.open(new)
+    assert len(after) == 4
+    np.testing.assert_array_equal(after.read().actions, 1 - ds.read().actions)
+    np.testing.assert_array_equal(after.returns, 2 * ds.returns)
+    assert [episode.run.name for episode in after] == ["w0", "w0", "w1", "w1"]
+    said = made_of(Recording(new))
+    assert said is not None
+    assert [Path(one["name"]).name for one in said["sources"]] == ["0.mcap", "1.mcap"]
+    assert verify_recording(new).ok
+
+
+def test_of_a_vector_environment_with_a_dict_of_actions(tmp_path: Path) -> None:
+    class Arm(gym.Env[Any, Any]):
+        observation_space = spaces.Box(-1, 1, (2,), np.float32)
+        action_space = spaces.Dict(grip=spaces.Discrete(2), joint=spaces.Box(-1, 1, (3,), np.float32))
+        t = 0
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            super().reset(seed=seed)
+            self.t = 0
+            return np.zeros(2, np.float32), {}
+
+        def step(self, action: Any) -> Any:
+            self.t += 1
+            return np.full(2, self.t / 10, np.float32), 1.0, self.t == 4, False, {}
+
+    env = gym.vector.SyncVectorEnv([Arm] * 2)
+    with RecordVectorEpisodes(env, tmp_path / "v.mcap") as recorded:
+        recorded.reset(seed=0)
+        recorded.action_space.seed(0)
+        for _ in range(15):
+            recorded.step(recorded.action_space.sample())
+
+    def still(episode: Any) -> Any:
+        return {**episode.actions, "joint": np.zeros_like(episode.actions["joint"])}
+
+    new = tupli_mcap.open(tmp_path / "v.mcap").map(still, tmp_path / "n.mcap", fields=["actions"])
+    before, after = tupli_mcap.open(tmp_path / "v.mcap").read(), tupli_mcap.open(new).read()
+    assert not after.actions["joint"].any()
+    np.testing.assert_array_equal(after.actions["grip"], before.actions["grip"])
+    np.testing.assert_array_equal(after.states, before.states)
+    assert verify_recording(new).ok
+
+
+@pytest.mark.parametrize(
+    ("function", "fields"),
+    [
+        (lambda episode: episode.rewards[1:], ["rewards"]),
+        (lambda episode: ["a"] * len(episode), ["rewards"]),
+        (lambda episode: np.full(len(episode), 0.5), ["actions"]),
+        (lambda episode: episode.states, ["states"]),
+        (lambda episode: episode.rewards, ["rewards", "actions"]),
+    ],
+)
+def test_refuses_what_does_not_fit(function: Any, fields: list[str], tmp_path: Path) -> None:
+    source = record(tmp_path / "r.mcap")
+    with pytest.raises(RecordingError):
+        tupli_mcap.open(source).map(function, tmp_path / "n.mcap", fields=fields)
+    assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
+
+
+def test_replaces_nothing_by_itself(tmp_path: Path) -> None:
+    source = record(tmp_path / "r.mcap")
+    with pytest.raises(DatasetError, match="exists"):
+        tupli_mcap.open(source).map(lambda episode: episode.rewards, source)
+
+
+def test_says_of_which_recordings_it_was_made(tmp_path: Path) -> None:
+    paths = [record(tmp_path / f"{i}.mcap") for i in range(2)]
+    merge_recordings(paths, tmp_path / "all.mcap")
+    some = tupli_mcap.open(tmp_path / "all.mcap").filter("seed = 1").save(tmp_path / "some.mcap")
+    said = made_of(Recording(some))
+    assert said is not None
+    jsonschema.validate(said, json.loads(SCHEMA.read_text()))
+    assert (said["how"], said["earlier"][0]["how"]) == ("filter", "merge")
+    assert len(said["earlier"][0]["sources"]) == 2
+    assert "seed" in said["query"]
+    assert made_of(Recording(paths[0])) is None
