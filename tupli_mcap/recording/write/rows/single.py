@@ -29,7 +29,8 @@ CHUNKS_PER_HALF = 2
 class SingleRows:
     """The step rows of one environment.
 
-    `put` and `put_state` are the generated encoders; `channel` is the MCAP channel, `sink` takes full chunks.
+    `put`, `put_state` and `put_whole` are the generated encoders; `channel` is the MCAP channel, `sink` takes full
+    chunks; `block` says which of the area's blocks is this environment's.
     """
 
     def __init__(
@@ -44,13 +45,17 @@ class SingleRows:
         deriver: RowDeriver | None = None,
         *,
         sealed: bool = False,
+        block: int = 0,
     ) -> None:
         self._sealed = sealed
         self._layout = layout
         self._dtype = layout.step_message.dtype
         self._area = area = journal.row_area(name)
         self._buffer = buffer = journal.buffer(name)
-        self._sequence: Array = np.frombuffer(buffer, self._dtype)["#sequence"].reshape(2, area.rows + 1)
+        rows = np.frombuffer(buffer, self._dtype).reshape(2, area.channels, area.rows + 1)
+        self._sequence: Array = rows["#sequence"][:, block]
+        first_half = block * area.block
+        self._starts = (first_half, first_half + area.half)  # of the halves of this block
         self._channel = channel
         self._sink = sink
         self._half = 0
@@ -64,6 +69,7 @@ class SingleRows:
         self.put = encoder.put
         self.put_state = encoder.put_state
         self.put_next = encoder.put_next
+        self.put_whole = encoder.put_whole
         self._offset = encoder.offset
         # where derived episodes go; None while none are derived
         self._events: EpisodeLog | None = None
@@ -108,7 +114,7 @@ class SingleRows:
     def start_deriving(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
         """From here on episodes are derived and go to `events`, with the final state of the one that has just ended."""
         self._events = events
-        self._derived = (self._offset() - self._half * self._area.half) // self._area.row_size
+        self._derived = (self._offset() - self._starts[self._half]) // self._area.row_size
         self._episodes.begin([None])
         self._episodes.wait_for(ended, time.time_ns())
         events.expect_end(started)
@@ -125,7 +131,7 @@ class SingleRows:
         events = self._events
         if events is None:
             return None
-        half = self._half * self._area.half
+        half = self._starts[self._half]
         row = (self._offset() - half) // self._area.row_size
         self._derive(half, row, {0: self.pending_state()} if over else None)
         self._events = None
@@ -146,35 +152,36 @@ class SingleRows:
         start = self._offset()
         return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
 
-    def _seal(self, offset: int) -> None:
+    def _seal(self, offset: int, *, alone: bool = False) -> None:
         end = offset + self._area.row_size
-        seal(self._buffer, offset, end, self._buffer[end + STATE : end + self._state_end])
+        running = b"" if alone else self._buffer[end + STATE : end + self._state_end]
+        seal(self._buffer, offset, end, running)
 
     def _switch(self) -> None:
         """The half is full: go on in the other one, then write this one as a chunk."""
         area, half = self._area, self._half
         # before the other half's last row goes, whose hole may be here
-        self._derive(half * area.half, area.rows)
-        spare = half * area.half + area.rows * area.row_size
+        self._derive(self._starts[half], area.rows)
+        spare = self._starts[half] + area.rows * area.row_size
         self._half = 1 - half
         # a power loss may leave a part of what is written over these rows, and not the chunk they are in
         self._sequence[self._half] = HOLE
-        start = self._half * area.half
+        start = self._starts[self._half]
         self._buffer[start : start + self._state_end] = self._buffer[spare : spare + self._state_end]
         flushed, self._flushed = self._flushed, 0
         self._go_to(self._half)
         self._derived = 0
-        self._emit(half * area.half, flushed, area.rows)
+        self._emit(self._starts[half], flushed, area.rows)
 
     def _go_to(self, half: int) -> None:
         """The next row is the first one of a half, behind the last one of the other."""
         area = self._area
-        start, spare = half * area.half, area.rows * area.row_size
-        self._encoder.move(start, area.half - start + spare - area.row_size, start + spare)
+        start, other, spare = self._starts[half], self._starts[1 - half], area.rows * area.row_size
+        self._encoder.move(start, other + spare - area.row_size, start + spare)
 
     def flush(self) -> None:
         """Writes the rows of the running half that are not in the file yet."""
-        start = self._half * self._area.half
+        start = self._starts[self._half]
         rows = (self._offset() - start) // self._area.row_size
         flushed, self._flushed = self._flushed, rows
         self._derive(start, rows)
