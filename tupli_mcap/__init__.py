@@ -74,6 +74,7 @@ if TYPE_CHECKING:
         TupliStorage as TupliStorage,
     )
     from tupli_mcap.wrappers import (
+        EpisodeWriter as EpisodeWriter,
         RecordEpisodes as RecordEpisodes,
     )
 
@@ -94,7 +95,7 @@ _HOMES = {
         "FilterNE FilterOR RLTuple"
     ),
     "storage": "FileStorage TupliStorage",
-    "wrappers": "RecordEpisodes",
+    "wrappers": "EpisodeWriter RecordEpisodes",
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 _MODULES = (
