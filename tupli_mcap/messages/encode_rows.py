@@ -76,8 +76,9 @@ class RowEncoder:
     for what cannot be stored exactly, and nothing has changed then.
 
     `offset()` is where the running row is in the buffer, `count()` the sequence of the next step, `total()` the return
-    so far. `move(start, last, end)` makes the row at `start` the running one, behind the row at `last`; when the one at
-    `end` has been started, `switch` is called. `begin(prefix)`: another episode; what its rows hold before their state.
+    so far. `skip(rows, total)` goes on behind rows that somebody else has committed, with another return so far.
+    `move(start, last, end)` makes the row at `start` the running one, behind the row at `last`; when the one at `end`
+    has been started, `switch` is called. `begin(prefix)`: another episode; what its rows hold before their state.
     """
 
     put: Callable[[Any, Any, Any, Any, Any], None]
@@ -87,6 +88,7 @@ class RowEncoder:
     offset: Callable[[], int]
     count: Callable[[], int]
     total: Callable[[], Any]
+    skip: Callable[[int, Any], None]
     move: Callable[[int, int, int], None]
     begin: Callable[[bytes], None]
     state_end: int  # bytes of a row up to the end of its state
@@ -316,6 +318,14 @@ def encoder():
         if offset == end:
             switch()
 
+    def skip(rows, new_total):
+        nonlocal offset, sequence, total
+        sequence += rows
+        total = new_total
+        offset += rows * {size}
+        if offset == end:
+            switch()
+
     def move(new_start, new_last, new_end):
         nonlocal offset, start, last, end
         offset = start = new_start
@@ -326,8 +336,8 @@ def encoder():
         prefix, total = new_prefix, 0.0
 
     return dict(
-        put=put, put_state=put_state, put_next=put_next, put_whole=put_whole, move=move, begin=begin,
-        offset=lambda: offset, count=lambda: sequence, total=lambda: total,
+        put=put, put_state=put_state, put_next=put_next, put_whole=put_whole, skip=skip, move=move,
+        begin=begin, offset=lambda: offset, count=lambda: sequence, total=lambda: total,
     )
 """
 

@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import Array, arrays_at
 from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
@@ -24,6 +25,7 @@ from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.options import Mode, RecordOptions
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.rows.contract import StepStore
+from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.rows.variable import final_encoder
 from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
@@ -196,10 +198,7 @@ class EpisodeWriter:
             StepError: no episode is running, or a value cannot be stored exactly; nothing of this step is recorded, and
                 the episode goes on.
         """
-        stream = self._stream(env)
-        if not stream.is_running or stream.over is not None:
-            ended = "the step before has ended the episode" if stream.is_running else "no episode is running"
-            raise StepError(f"{ended}{_in(self._num_envs, env)}; call begin() first")
+        stream = self._ready(env)
         entries = entries_of(info, "info") if info else None
         with _Whole(self._work, self._writer):
             stream.put(state, action, reward, terminal, timeout)
@@ -207,6 +206,41 @@ class EpisodeWriter:
                 stream.put_info(entries)
             self._writer.flush_if_due()
             self._writer.sync_step()
+
+    def steps(
+        self,
+        states: Any,
+        actions: Any,
+        rewards: Any,
+        terminals: Any = None,
+        timeouts: Any = None,
+        *,
+        infos: Sequence[Mapping[str, Any]] | None = None,
+        env: int = 0,
+    ) -> None:
+        """Records several steps of the running episode, which lie along the first axis of all arrays (NumPy's).
+
+        Args:
+            terminals, timeouts: by default false; only the last step may have one of them set.
+            infos: a dict for each step.
+
+        Raises:
+            StepError: as `step`; also for flags before the last step, and for arrays of unequal length.
+        """
+        stream = self._ready(env)
+        n = len(rewards)
+        flags = _flags(terminals, n, "terminals"), _flags(timeouts, n, "timeouts")
+        early = np.flatnonzero((flags[0] | flags[1])[:-1])
+        if len(early):
+            raise StepError(f"expected no flag before the last step, {n - 1}, found one at step {early[0]}")
+        if infos is not None and len(infos) != n:
+            raise StepError(f"infos: expected one for each of {n} steps, found {len(infos)}")
+        entries = [entries_of(info, "info") for info in infos or ()]
+        if n:
+            with _Whole(self._work, self._writer):
+                stream.put_many(states, actions, rewards, *flags, entries)
+                self._writer.flush_if_due()
+                self._writer.sync_step()
 
     def end(
         self, final_state: Any = None, *, metadata: Mapping[str, Any] | None = None, env: int = 0
@@ -266,6 +300,13 @@ class EpisodeWriter:
             more = "; pass num_envs for several streams" if self._num_envs is None else ""
             raise StepError(f"env: expected a stream from 0 to {len(streams) - 1}, found {env!r:.40}{more}")
         return streams[env]
+
+    def _ready(self, env: int) -> _Stream:
+        stream = self._stream(env)
+        if not stream.is_running or stream.over is not None:
+            ended = "the step before has ended the episode" if stream.is_running else "no episode is running"
+            raise StepError(f"{ended}{_in(self._num_envs, env)}; call begin() first")
+        return stream
 
     def _running(self, env: int) -> _Stream:
         stream = self._stream(env)
@@ -385,6 +426,29 @@ class _Stream:
         if is_first:
             writer.take_place()
 
+    def put_many(
+        self,
+        states: Any,
+        actions: Any,
+        rewards: Any,
+        terminals: Array,
+        timeouts: Array,
+        infos: Sequence[Mapping[str, Any]],
+    ) -> None:
+        """Records several steps."""
+        columns = (states, actions, rewards)
+        for i in range(len(rewards)):
+            store = self._store
+            if self._episode and not infos and isinstance(store, SingleRows) and store.can_put_many:
+                rest = [arrays_at(column, slice(i, None)) for column in columns]
+                store.put_many(rest[0], rest[1], rest[2], terminals[i:], timeouts[i:], self._episode.number)
+                self.over = TERMINAL if terminals[-1] else TIMEOUT if timeouts[-1] else None
+                break
+            state, action, reward = (arrays_at(column, i) for column in columns)
+            self.put(state, action, reward, bool(terminals[i]), bool(timeouts[i]))
+            if infos:
+                self.put_info(infos[i])
+
     def put_info(self, info: Mapping[str, Any]) -> None:
         """Records the info of the step just put."""
         if self._episode is not None and self._store is not None:
@@ -414,6 +478,13 @@ class _Stream:
 
 def _in(num_envs: int | None, env: int) -> str:
     return "" if num_envs is None else f" in stream {env}"
+
+
+def _flags(given: Any, n: int, name: str) -> Array:
+    flags: Array = np.zeros(n, np.bool_) if given is None else np.asarray(given)
+    if flags.shape != (n,) or not (flags.dtype == np.bool_ or np.isin(flags, (0, 1)).all()):
+        raise StepError(f"{name}: expected {n} flags, found {shorten(given)}")
+    return flags.astype(np.bool_)
 
 
 def _metadata(given: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP, HOLE, ImageSink, m
 from tupli_mcap.messages.episodes import EpisodeEnd
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
+from tupli_mcap.spaces.exact import exact_array, leaf_value
 
 __all__ = ["CHUNKS_PER_HALF", "SingleRows"]
 
@@ -52,8 +53,9 @@ class SingleRows:
         self._dtype = layout.step_message.dtype
         self._area = area = journal.row_area(name)
         self._buffer = buffer = journal.buffer(name)
-        rows = np.frombuffer(buffer, self._dtype).reshape(2, area.channels, area.rows + 1)
-        self._sequence: Array = rows["#sequence"][:, block]
+        rows: Array = np.frombuffer(buffer, self._dtype).reshape(2, area.channels, area.rows + 1)
+        self._rows = rows[:, block]
+        self._sequence: Array = self._rows["#sequence"]
         first_half = block * area.block
         self._starts = (first_half, first_half + area.half)  # of the halves of this block
         self._channel = channel
@@ -63,6 +65,10 @@ class SingleRows:
         self._flushed = 0  # rows of the running half that are in the file
         self._deriver = deriver or RowDeriver()
         self._header = layout.step_message.header(channel)
+        self._hole = layout.step_message.header(channel, HOLE)
+        self._heads = np.dtype(
+            {"names": ["head"], "formats": [f"V{BODY}"], "offsets": [0], "itemsize": area.row_size}
+        )
         encoder = self._encoder = make_row_encoder(
             layout, buffer, channel, first, images, self._switch, self._seal if sealed else None
         )
@@ -97,6 +103,58 @@ class SingleRows:
 
     def _prefix(self, episode: int) -> bytes:
         return self._header + EPISODE_AND_STEP.pack(episode, 0)
+
+    # ---- many steps at once
+
+    @property
+    def can_put_many(self) -> bool:
+        """True if `put_many` may be called."""
+        return not self._sealed and not self._layout.images
+
+    def put_many(
+        self, states: Any, actions: Any, rewards: Any, terminals: Array, timeouts: Array, episode: int
+    ) -> None:
+        """As `put_whole` of several steps of an episode, which lie along the first axis of all arrays.
+
+        Raises:
+            StepError: something cannot be stored exactly; nothing is recorded.
+        """
+        n, layout = len(terminals), self._layout
+        columns = [("terminal", terminals), ("timeout", timeouts)]
+        for root, leaves in ((states, layout.state), (actions, layout.action), (rewards, layout.reward)):
+            for leaf in leaves:
+                value = exact_array(
+                    leaf_value(root, leaf), layout.dtypes[leaf.name], (n, *leaf.shape), leaf.path
+                )
+                if leaf.size:
+                    columns.append((leaf.name, value))
+        amounts = np.asarray(rewards, np.float64).reshape(n, -1).sum(axis=1)
+        totals = np.cumsum(np.append(float(self.total), amounts))[
+            1:
+        ]  # one after the other, as steps add them
+        begin = 0
+        while begin < n:
+            begin = self._put_rows(columns, begin, n, totals, episode)
+
+    def _put_rows(
+        self, columns: Sequence[tuple[str, Array]], begin: int, end: int, totals: Array, episode: int
+    ) -> int:
+        """Writes as many of the steps as the half has room for; returns how far it came."""
+        area, size = self._area, self._area.row_size
+        first = (self._offset() - self._starts[self._half]) // size
+        count = min(end - begin, area.rows - first)
+        rows = self._rows[self._half, first : first + count]
+        rows.view(self._heads)["head"] = np.frombuffer(self._hole, f"V{BODY}")
+        for name, values in columns:
+            rows[name] = values[begin : begin + count]
+        rows["episode"] = episode
+        rows["#log_time"] = time.time_ns()
+        after = self._offset() + count * size
+        self._buffer[after : after + BODY] = bytes(BODY)  # nobody knows the state there
+        sequence = self._encoder.count()
+        rows["#sequence"] = np.arange(sequence, sequence + count)
+        self._encoder.skip(count, float(totals[begin + count - 1]))
+        return begin + count
 
     # ---- episodes derived from rows
 
