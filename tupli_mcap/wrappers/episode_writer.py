@@ -165,7 +165,7 @@ class EpisodeWriter:
             stream.end()
             if self._rotation.is_due(self._writer) and not self._streams.is_running:
                 self._go_on()
-                stream = self._stream(env)
+                stream = self._streams.streams[env]
             stream.begin(facts, entries)
 
     def _go_on(self) -> None:
