@@ -13,10 +13,12 @@ row j its own after its state: whoever reads the journal takes no state of a row
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from struct import Struct
+from types import CodeType
 from typing import Any, Protocol
 
 import numpy as np
@@ -187,10 +189,16 @@ def make_row_encoder(
         diagnose=lambda action, state, reward, err: _diagnose(layout, action, state, reward, err),
         view=np.frombuffer(buffer, np.uint8),
     )
-    exec(compile(text, "<tupli_mcap row encoder>", "exec"), namespace)
+    exec(_compiled(text), namespace)
     # a name in its own globals would keep the buffer until garbage is collected
     encoder = namespace.pop("encoder")
     return RowEncoder(**encoder(), state_end=layout.state_end, source=text)
+
+
+@functools.lru_cache(maxsize=8)
+def _compiled(text: str) -> CodeType:
+    """The code of a source, which is the same for all streams of a recording."""
+    return compile(text, "<tupli_mcap row encoder>", "exec")
 
 
 def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:

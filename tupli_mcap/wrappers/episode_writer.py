@@ -104,7 +104,7 @@ class EpisodeWriter:
         self._rotation = Rotation(path, options, format_version(spaces, image_format))
         self._work = Work()
         self._discarded: dict[Path, list[int]] = {}
-        self._compression = compression
+        self._compression, self._is_plain = compression, options.is_plain
         writer = self._rotation.open_first()
         try:
             self._record_to(writer)
@@ -200,12 +200,22 @@ class EpisodeWriter:
         """
         stream = self._ready(env)
         entries = entries_of(info, "info") if info else None
-        with _Whole(self._work, self._writer):
+        work = self._work
+        work.state = BEGUN
+        try:
             stream.put(state, action, reward, terminal, timeout)
             if entries:
                 stream.put_info(entries)
-            self._writer.flush_if_due()
-            self._writer.sync_step()
+            if not self._is_plain:
+                self._writer.flush_if_due()
+                self._writer.sync_step()
+        except StepError:
+            work.state = DONE
+            raise
+        except BaseException as err:
+            self._writer.stop(err)
+            raise
+        work.finish()
 
     def steps(
         self,
@@ -296,6 +306,8 @@ class EpisodeWriter:
         if self._work.state or self._writer.closed:
             self._work.refuse()
         streams = self._streams.streams
+        if env.__class__ is int and 0 <= env < len(streams):
+            return streams[env]
         if isinstance(env, bool) or not isinstance(env, int | np.integer) or not 0 <= env < len(streams):
             more = "; pass num_envs for several streams" if self._num_envs is None else ""
             raise StepError(f"env: expected a stream from 0 to {len(streams) - 1}, found {env!r:.40}{more}")
