@@ -6,6 +6,7 @@ import copy
 import gc
 import os
 import random
+import sys
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -187,7 +188,7 @@ def _agree(found: list[Told], expected: list[Told], env: int, after: Any) -> boo
     return True
 
 
-def _die(script: Script, space: Any, moment: Moment, rng: random.Random, path: Path, **options: Any) -> int:
+def _die(script: Any, space: Any, moment: Moment, rng: random.Random, path: Path, **options: Any) -> int:
     """Runs a script in a process that is killed; returns how many calls had returned."""
     read_end, write_end = os.pipe()
     gc.collect()
@@ -207,6 +208,69 @@ def _die(script: Script, space: Any, moment: Moment, rng: random.Random, path: P
     os.close(read_end)
     os.waitpid(pid, 0)
     return done
+
+
+def test_a_killed_process_loses_none_of_many_steps(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    states, rewards = rng.random((500, 3)).astype(np.float32), rng.random(500)
+    parts = np.split(np.arange(500), np.cumsum(rng.integers(1, 60, 9)))
+
+    class Parts:
+        def run(self, writer: EpisodeWriter, told: Any) -> None:
+            for part in parts:
+                if part[0] == 0:
+                    writer.begin()
+                writer.steps(states[part], np.full(len(part), 4), rewards[part])
+                told()
+
+    for seed in range(12):
+        path = tmp_path / f"{seed}.mcap"
+        moment = Moment("by hand", ("SingleRows._put_rows",), times=9)
+        done = _die(Parts(), BOX, moment, random.Random(seed), path)
+        assert done < len(parts)
+        (told,) = read(path) or [None]
+        if told is None and not done:
+            continue
+        assert len(told.steps) >= (parts[done - 1][-1] + 1 if done else 1)
+        assert told.final is None
+        np.testing.assert_array_equal([step[0] for step in told.steps], states[: len(told.steps)])
+        np.testing.assert_array_equal([step[2] for step in told.steps], rewards[: len(told.steps)])
+
+
+@pytest.mark.parametrize("call", ["step", "begin", "end", "discard"])
+def test_what_interrupts_a_call_loses_no_step(tmp_path: Path, call: str) -> None:
+    """Ctrl-C at any line: closing finishes the file from its journal."""
+    for seed in range(8):
+        path, rng = tmp_path / f"{seed}.mcap", random.Random(seed)
+        script, returned = Script(TEXT if seed % 2 else BOX, 2, seed), []
+        writer = EpisodeWriter(path, TEXT if seed % 2 else BOX, ACTIONS, num_envs=2, chunk_size=700)
+        left, occurrence = rng.randint(1, 60), rng.randint(1, 5)
+
+        def trace(frame: Any, event: str, arg: Any) -> Any:
+            nonlocal left, occurrence
+            if event == "call":
+                occurrence -= frame.f_code.co_qualname == f"EpisodeWriter.{call}"
+                return trace if occurrence <= 0 and "tupli_mcap" in frame.f_code.co_filename else None
+            left -= event == "line"
+            if left == 0:
+                raise KeyboardInterrupt
+            return trace
+
+        before = sys.gettrace()
+        sys.settrace(trace)
+        with pytest.raises(KeyboardInterrupt):
+            script.run(writer, lambda: returned.append(None))  # noqa: B023 - called at once
+        sys.settrace(before)
+        writer.close()
+        count = len(returned)
+        expected = [
+            script.episodes(count + more, closed=closed) for more in (0, 1) for closed in (False, True)
+        ]
+        kept = [[one for one in told if "discarded" not in one.metadata] for told in expected]
+        found = read(path) if path.exists() else []
+        after = script.calls[count][2][0] if script.calls[count][0] == "step" else None
+        assert any(_agree(found, told, script.calls[count][1], after) for told in [*expected, *kept]), seed
+        assert not path.exists() or verify_recording(path).problems == []
 
 
 def test_the_state_after_the_last_step_is_not_made_up(tmp_path: Path) -> None:
