@@ -144,9 +144,10 @@ class SingleRows:
         first = (self._offset() - self._starts[self._half]) // size
         count = min(end - begin, area.rows - first)
         rows = self._rows[self._half, first : first + count]
-        rows.view(self._heads)["head"] = np.frombuffer(self._hole, f"V{BODY}")
         for name, values in columns:
             rows[name] = values[begin : begin + count]
+        # behind the values: the first row with a header is the running one, whose state is taken
+        rows.view(self._heads)["head"] = np.frombuffer(self._hole, f"V{BODY}")
         rows["episode"] = episode
         rows["#log_time"] = time.time_ns()
         after = self._offset() + count * size
