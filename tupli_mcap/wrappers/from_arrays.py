@@ -19,6 +19,10 @@ __all__ = ["write_rollout"]
 
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
+_CHUNK: Final = 256 * 1024
+_MANY: Final = (
+    16  # streams up to which chunks are as large as those of one: they all have room in the journal
+)
 _CHOOSE: Final = (
     'pass autoreset="next-step" if the step after an end is a reset, whose action was ignored, "same-step" if the step '
     'that ends an episode already resets, "disabled" if you have reset between the steps'
@@ -119,6 +123,7 @@ def write_rollout(
     with EpisodeWriter(
         path, observations, actions, reward_space=reward_space, num_envs=count, labels=labels,
         attachments=attachments, compression=compression, mode=mode, benchmark_id=benchmark_id,
+        chunk_size=_CHUNK * min(count or 1, _MANY),
     ) as writer:  # fmt: skip
         for part in parts:
             _write(writer, part)
