@@ -27,7 +27,7 @@ import zstandard
 from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation, TransformObservation
 
-from tupli_mcap import RecordEpisodes, jsonvalue, vector as recorded_vector
+from tupli_mcap import EpisodeWriter, RecordEpisodes, jsonvalue, vector as recorded_vector
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.recording import (
     EpisodeData,
@@ -558,6 +558,28 @@ def unfinished_holes(path: Path) -> list[Log]:
     return expected(env)
 
 
+def unfinished_streams(path: Path, space: gym.Space[Any], observe: Observe) -> list[Log]:
+    """What a killed writer of two streams leaves: nobody knows the state after the last step."""
+    env = Played(space, observe, ENDS)
+    roll(env, env, [3, 4, 2], action)
+    episodes = expected(env)
+    with tempfile.TemporaryDirectory() as directory, mock.patch(BOOT_ID, return_value=""):
+        live = Path(directory, path.name)
+        options: dict[str, Any] = {"compression": "none", "chunk_size": 400, "capture": "none"}
+        with EpisodeWriter(live, space, env.action_space, num_envs=2, **options) as writer:
+            for k, episode in enumerate(episodes):
+                writer.begin(seed=episode["seed"], options=episode["options"], metadata={"k": k}, env=k % 2)
+                for step in zip(*(episode[name] for name in COLUMNS[:5]), strict=True):
+                    writer.step(*step, env=k % 2)
+                if k < 2:
+                    writer.end(episode["final_state"], env=k % 2)
+            keep(live, path)
+    for k, episode in enumerate(episodes):
+        told = {"reset_info": {}, "env": k % 2, "infos": [None] * len(episode["states"])}
+        episode |= told | ({"metadata": {"k": k}} if k < 2 else {"final_state": None})
+    return [episodes[0], episodes[2], episodes[1]]
+
+
 def words(episode: int, t: int) -> str:
     return "w" * t + str(episode)
 
@@ -597,6 +619,8 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "stacked_last": lambda path: stacked(path, -1),
     "png_stacks": png_stacks,
     "named": named,
+    "unfinished_streams": lambda path: unfinished_streams(path, POLE, pole),
+    "unfinished_streams_variable": lambda path: unfinished_streams(path, spaces.Text(20), words),
     "described": described,
 }
 

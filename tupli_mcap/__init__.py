@@ -74,7 +74,9 @@ if TYPE_CHECKING:
         TupliStorage as TupliStorage,
     )
     from tupli_mcap.wrappers import (
+        EpisodeWriter as EpisodeWriter,
         RecordEpisodes as RecordEpisodes,
+        write_rollout as write_rollout,
     )
 
 # Where each public name lives; imported on first use, so that `import tupli_mcap` stays quick.
@@ -94,7 +96,7 @@ _HOMES = {
         "FilterNE FilterOR RLTuple"
     ),
     "storage": "FileStorage TupliStorage",
-    "wrappers": "RecordEpisodes",
+    "wrappers": "EpisodeWriter RecordEpisodes write_rollout",
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 _MODULES = (

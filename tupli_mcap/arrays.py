@@ -1,12 +1,30 @@
-"""What arrays are called in annotations."""
+"""What arrays are called in annotations, and those that are nested in dicts and tuples."""
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "DType"]
+__all__ = ["Array", "DType", "arrays_at", "map_arrays"]
 
 Array = np.ndarray[Any, Any]
 DType = np.dtype[Any]
+
+
+def map_arrays(tree: Any, function: Callable[[Any], Any]) -> Any:
+    """The arrays of nested dicts and tuples, each through a function; None stays None."""
+    if tree is None:
+        return None
+    if isinstance(tree, Mapping):
+        return {key: map_arrays(value, function) for key, value in tree.items()}
+    if isinstance(tree, tuple):
+        return tuple(map_arrays(value, function) for value in tree)
+    return function(tree)
+
+
+def arrays_at(tree: Any, place: Any) -> Any:
+    """What the arrays of nested dicts and tuples have at a place: an index, a slice, or a tuple of these."""
+    return map_arrays(tree, operator.itemgetter(place))

@@ -155,11 +155,14 @@ class CommittedRows:
         return row
 
     def following(self, sequence: int, state_end: int) -> bytes | None:
-        """The state in the row that was running when the one with `sequence` was committed; None if it is not here."""
+        """The state in the row that was running when the one with `sequence` was committed; None if it is not here, or
+        was not known yet."""
         found = self._find(sequence)
         if found is None:
             return None
         half, place = self._halves[found], self._places[found]
+        if self.rows["#opcode"][half, place + 1] != 5:
+            return None
         state = self._bytes[half, place + 1, STATE:state_end].tobytes()
         if self._torn:
             sealed = int(self.rows["#publish_time"][half, place]) >> 32

@@ -7,14 +7,18 @@ has the recorded type, and otherwise calls an exact (slow) cast that refuses wha
 
 A row is a complete MCAP Message record. One `struct` call writes the end of row j (action, reward, flags) and the start
 of row j+1 (record header and the new observation); one more writes sequence and log_time of row j, which commits it.
+Where the observation after a step comes with the next step only (`put_whole`), row j+1 gets a header of zeros, and
+row j its own after its state: whoever reads the journal takes no state of a row without a header.
 """
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from struct import Struct
+from types import CodeType
 from typing import Any, Protocol
 
 import numpy as np
@@ -58,27 +62,35 @@ class ImageSink(Protocol):
         """The image of a reset: replaces the running row's."""
         ...
 
+    def advance(self) -> None:
+        """The running row's step is committed: the next row runs, and nobody knows its image yet."""
+        ...
+
 
 @dataclass
 class RowEncoder:
     """Writes rows into a buffer, and knows where the next one goes.
 
     `put(action, state, reward, terminal, timeout)` writes and commits a step; `put_state(state)` starts a row.
+    `put_whole(state, action, reward, terminal, timeout)` does both, and leaves the state after the step unknown.
     `put_next(episode, state)` leaves the running row, which holds the final state, as a hole, and starts the row after
     it, the first one of `episode`; the hole's time is now, but not before the last step's. All of them raise StepError
     for what cannot be stored exactly, and nothing has changed then.
 
     `offset()` is where the running row is in the buffer, `count()` the sequence of the next step, `total()` the return
-    so far. `move(start, last, end)` makes the row at `start` the running one, behind the row at `last`; when the one at
-    `end` has been started, `switch` is called. `begin(prefix)`: another episode; what its rows hold before their state.
+    so far. `skip(rows, total)` goes on behind rows that somebody else has committed, with another return so far.
+    `move(start, last, end)` makes the row at `start` the running one, behind the row at `last`; when the one at `end`
+    has been started, `switch` is called. `begin(prefix)`: another episode; what its rows hold before their state.
     """
 
     put: Callable[[Any, Any, Any, Any, Any], None]
     put_state: Callable[[Any], None]
     put_next: Callable[[int, Any], None]
+    put_whole: Callable[[Any, Any, Any, Any, Any], None]
     offset: Callable[[], int]
     count: Callable[[], int]
     total: Callable[[], Any]
+    skip: Callable[[int, Any], None]
     move: Callable[[int, int, int], None]
     begin: Callable[[bytes], None]
     state_end: int  # bytes of a row up to the end of its state
@@ -126,6 +138,8 @@ class _Code:
     put: list[str]
     put_state: list[str]
     put_next: list[str]
+    put_whole: list[str]
+    advance: list[str]
     amount: str
     names: dict[str, Any]
 
@@ -145,12 +159,13 @@ def make_row_encoder(
     first: int,
     images: Sequence[ImageSink],
     switch: Callable[[], None],
-    seal: Callable[[int], None] | None = None,
+    seal: Callable[..., None] | None = None,
 ) -> RowEncoder:
     """Generates the encoder of a constant layout for the messages of `channel`, from sequence `first`, into `buffer`.
 
     `images` has a sink for each image leaf; `switch` is called when the row after the last one has been started;
-    `seal`, if given, with the offset of each committed row. `move` and `begin` come before the first step.
+    `seal`, if given, with the offset of each committed row, and `alone=True` if no state follows it. `move` and `begin`
+    come before the first step.
 
     Raises:
         SpaceError: the layout has more than 4,096 leaves.
@@ -164,6 +179,7 @@ def make_row_encoder(
         first=first,
         header=layout.step_message.header(channel),
         numbers=EPISODE_AND_STEP.pack,
+        unknown=bytes(PREFIX),
         time_at=_TIME.unpack_from,
         switch=switch,
         seal=seal,
@@ -173,10 +189,16 @@ def make_row_encoder(
         diagnose=lambda action, state, reward, err: _diagnose(layout, action, state, reward, err),
         view=np.frombuffer(buffer, np.uint8),
     )
-    exec(compile(text, "<tupli_mcap row encoder>", "exec"), namespace)
+    exec(_compiled(text), namespace)
     # a name in its own globals would keep the buffer until garbage is collected
     encoder = namespace.pop("encoder")
     return RowEncoder(**encoder(), state_end=layout.state_end, source=text)
+
+
+@functools.lru_cache(maxsize=8)
+def _compiled(text: str) -> CodeType:
+    """The code of a source, which is the same for all streams of a recording."""
+    return compile(text, "<tupli_mcap row encoder>", "exec")
 
 
 def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
@@ -184,12 +206,13 @@ def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
     tail = _tail(source, layout)
     state = _Source(source.names)
     head = _head(state, layout)
-    puts, firsts = [], []
+    puts, firsts, advance = [], [], []
     for i, leaf in enumerate(layout.images):
         check = source.bind("check", images[i].check)
         state.lines.append(f"image{i} = {check}({_access(source, 'state', leaf.keys)})")
         puts.append(f"{source.bind('put_image', images[i].put)}(image{i})")
         firsts.append(f"{source.bind('put_first', images[i].put_first)}(image{i})")
+        advance.append(f"{source.bind('advance', images[i].advance)}()")
     flags = [_flag(source, "terminal"), _flag(source, "timeout")]
     next_stores = [line.replace("offset +", f"offset + {size} +") for line in head.stores]
     args = ", ".join([*tail.args, *head.args])
@@ -197,10 +220,18 @@ def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
         *flags, *source.lines, *state.lines, f"pack(buffer, offset + {tail.start}, {args})",
         *tail.stores, *next_stores, *puts,
     ]  # fmt: skip
+    ends = ", ".join([*tail.args[:-1], "unknown"])
+    put_whole = [
+        *flags, *source.lines, *state.lines, f"pack_end(buffer, offset + {tail.start}, {ends})", *tail.stores,
+        f"pack_values({', '.join(['buffer', f'offset + {PREFIX}', *head.args])})", *head.stores, *firsts,
+        f"buffer[offset:offset + {PREFIX}] = prefix",
+    ]  # fmt: skip
     amount = "reward"
     if layout.reward_space is not None:
         amount = "amount"
-        put.append(f"amount = {source.bind('total', layout.reward_total)}(reward)")
+        line = f"amount = {source.bind('total', layout.reward_total)}(reward)"
+        put.append(line)
+        put_whole.append(line)
     first_row, next_row = ", ".join(["prefix", *head.args]), ", ".join(["started", *head.args])
     put_state = [*state.lines, f"pack_state(buffer, offset, {first_row})", *head.stores, *firsts]
     put_next = [*state.lines, f"pack_state(buffer, offset + {size}, {next_row})", *next_stores]
@@ -208,8 +239,10 @@ def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
         source.names,
         pack=Struct(f"<{tail.format}{head.format}").pack_into,
         pack_state=Struct(f"<{PREFIX}s{head.format}").pack_into,
+        pack_values=Struct(f"<{head.format}").pack_into,
+        pack_end=Struct(f"<{tail.format}").pack_into,
     )
-    return _Code(put, put_state, put_next, amount, names)
+    return _Code(put, put_state, put_next, put_whole, advance, amount, names)
 
 
 def _tail(source: _Source, layout: StepLayout) -> _Packed:
@@ -278,6 +311,29 @@ def encoder():
         if offset == end:
             switch()
 
+    def put_whole(state, action, reward, terminal, timeout):
+        nonlocal offset, sequence, total
+        try:
+{whole_lines}\
+        except Exception as err:
+            raise diagnose(action, state, reward, err) from err
+        commit(buffer, offset + {sequence}, sequence, time_ns())
+{committed_alone}\
+        sequence += 1
+        total += {amount}
+        offset += {size}
+{advance}\
+        if offset == end:
+            switch()
+
+    def skip(rows, new_total):
+        nonlocal offset, sequence, total
+        sequence += rows
+        total = new_total
+        offset += rows * {size}
+        if offset == end:
+            switch()
+
     def move(new_start, new_last, new_end):
         nonlocal offset, start, last, end
         offset = start = new_start
@@ -288,8 +344,8 @@ def encoder():
         prefix, total = new_prefix, 0.0
 
     return dict(
-        put=put, put_state=put_state, put_next=put_next, move=move, begin=begin,
-        offset=lambda: offset, count=lambda: sequence, total=lambda: total,
+        put=put, put_state=put_state, put_next=put_next, put_whole=put_whole, skip=skip, move=move,
+        begin=begin, offset=lambda: offset, count=lambda: sequence, total=lambda: total,
     )
 """
 
@@ -297,8 +353,8 @@ def encoder():
 def _render(code: _Code, size: int, *, is_sealed: bool) -> str:
     """The source."""
 
-    def block(lines: Sequence[str]) -> str:
-        return "".join(f"            {line}\n" for line in lines)
+    def block(lines: Sequence[str], indent: int = 12) -> str:
+        return "".join(f"{' ' * indent}{line}\n" for line in lines)
 
     return _ENCODER.format(
         lines=block(code.put),
@@ -306,6 +362,9 @@ def _render(code: _Code, size: int, *, is_sealed: bool) -> str:
         amount=code.amount,
         first_lines=block(code.put_state),
         next_lines=block(code.put_next),
+        whole_lines=block(code.put_whole),
+        committed_alone="        seal(offset, alone=True)\n" if is_sealed else "",
+        advance=block(code.advance, 8),
         size=size,
         sequence=SEQUENCE_OFFSET,
         log_time=SEQUENCE_OFFSET + 4,

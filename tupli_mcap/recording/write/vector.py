@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,12 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.infos import InfoRecorder
 from tupli_mcap.recording.write.rows.contract import BatchStore
-from tupli_mcap.recording.write.rows.variable import Encoder, each_of, leaf_encoders
+from tupli_mcap.recording.write.rows.variable import each_of, final_encoder
 from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.vector_infos import check_infos, final_states, info_of, reset_info_of
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
 from tupli_mcap.spaces.exact import decide_dtype, leaf_value, shorten
-from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["VectorRecorder"]
 
@@ -74,7 +73,7 @@ class VectorRecorder:
         self._texts = ["{}"] * num_envs
         self._was_reset = False
         self._refused = False
-        self._final_encoders: list[tuple[Leaf, Encoder]] | None = None
+        self._final_encoder: Callable[[Any], bytes] | None = None
         self._final_rows: dict[int, int] = {}  # of final states that are in no row of steps
         self._late: list[tuple[int, int]] = []  # ends that wait for the batch after them
 
@@ -414,13 +413,10 @@ class VectorRecorder:
 
     def _encode_final(self, state: Any) -> bytes:
         """A final state that is in no row, as it follows `episode` and `env` in `/final_state`."""
-        if self._final_encoders is None:
-            layout = self._writer.layout
-            self._final_encoders = leaf_encoders(layout, layout.final_leaves)  # type: ignore[arg-type, union-attr]
-        out = bytearray(8)
-        for leaf, encode in self._final_encoders:
-            encode(leaf_value(state, leaf), out, 0)
-        return bytes(out[8:])
+        if self._final_encoder is None:
+            assert self._writer.layout is not None
+            self._final_encoder = final_encoder(self._writer.layout)
+        return self._final_encoder(state)
 
     def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
         of = reset_info_of if self._autoreset.mode == "SameStep" else info_of

@@ -93,6 +93,7 @@ class RecordingWriter:
         self._stores: Stores | None = None
         self.rows: StepStore | None = None
         self.vector: BatchStore | None = None
+        self.streams: Sequence[StepStore] = ()
         self._durable = options.durability != "os"
         self.syncs_steps = self._sealed = options.durability == "step"
         self.images: list[list[ImageRows]] = []
@@ -186,10 +187,15 @@ class RecordingWriter:
         num_envs: int,
         *,
         vector: bool,
+        apart: bool = False,
         info_schema: tuple[str, Mapping[str, str]] | None = None,
     ) -> None:
-        """Fixes the layout: registers the channels, makes the journal and the row stores."""
+        """Fixes the layout: registers the channels, makes the journal and the row stores.
+
+        `apart`: sub-environments of a `vector` recording do not step together.
+        """
         self.layout = layout
+        self._apart = apart
         self.num_envs = num_envs
         if self.index.count:  # of an earlier session
             self.lost_streams = set(range(num_envs))
@@ -242,7 +248,7 @@ class RecordingWriter:
         has_infos = self.channels.info is not None
         return plan_areas(
             self._laid(), self.num_envs, self.options.chunk_size, step_capacity,
-            vector=self.is_vector, infos=has_infos, frames=bool(self.channels.cameras),
+            vector=self.is_vector and not self._apart, infos=has_infos, frames=bool(self.channels.cameras),
         )  # fmt: skip
 
     def _laid(self) -> StepLayout:
@@ -261,9 +267,11 @@ class RecordingWriter:
         self.journal.publish(durable=self._durable, replaced=self.replaced)
         file = ToFile(self.add_chunk, self._start_chunks, self._grow, self._durable, self._sealed)
         self._stores = stores = Stores(
-            layout, channels, self.container, self.journal, self.index, file, vector=self.is_vector
-        )
+            layout, channels, self.container, self.journal, self.index, file, vector=self.is_vector,
+            apart=self._apart,
+        )  # fmt: skip
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
+        self.streams = stores.streams
         self.events, self.infos, self.frames = stores.events, stores.infos, stores.frames
 
     # ---- episodes
@@ -508,7 +516,7 @@ class RecordingWriter:
             if self._stores is not None:
                 self._stores.let_go()
                 self._stores = self.rows = self.vector = self.events = self.infos = None
-                self.images, self.frames = [], []
+                self.images, self.frames, self.streams = [], [], ()
             if self.journal is not None:
                 self.journal.close()
         finally:

@@ -83,6 +83,12 @@ class StepStore(Protocol):
         """Starts the running row over: the state of a reset."""
         ...
 
+    @property
+    def put_whole(self) -> Put:
+        """Writes and commits the running row (state, action, reward, terminal, timeout); the state after it is not
+        known. StepError as `put`."""
+        ...
+
     def begin_episode(self, episode: int) -> None:
         """The rows from the running one on belong to `episode`."""
         ...

@@ -92,6 +92,11 @@ class ImageRows:
 
     def put(self, image: Array) -> None:
         """Writes the image of the state that follows the running row's; every step before must be committed."""
+        self.advance()
+        self.put_first(image)
+
+    def advance(self) -> None:
+        """Goes on to the next row, which has no image yet; every step before must be committed."""
         if self._due is not None:
             self._write_due(self._start_chunks)
         self._row += 1
@@ -99,7 +104,6 @@ class ImageRows:
         self._start += self._row_size
         if self._row == self._full:
             self._switch()
-        self.put_first(image)
 
     def put_first(self, image: Array) -> None:
         """Overwrites the running row: the image of a reset."""

@@ -19,6 +19,7 @@ from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP, HOLE, ImageSink, m
 from tupli_mcap.messages.episodes import EpisodeEnd
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
+from tupli_mcap.spaces.exact import exact_array, leaf_value
 
 __all__ = ["CHUNKS_PER_HALF", "SingleRows"]
 
@@ -29,7 +30,8 @@ CHUNKS_PER_HALF = 2
 class SingleRows:
     """The step rows of one environment.
 
-    `put` and `put_state` are the generated encoders; `channel` is the MCAP channel, `sink` takes full chunks.
+    `put`, `put_state` and `put_whole` are the generated encoders; `channel` is the MCAP channel, `sink` takes full
+    chunks; `block` says which of the area's blocks is this environment's.
     """
 
     def __init__(
@@ -44,13 +46,18 @@ class SingleRows:
         deriver: RowDeriver | None = None,
         *,
         sealed: bool = False,
+        block: int = 0,
     ) -> None:
         self._sealed = sealed
         self._layout = layout
         self._dtype = layout.step_message.dtype
         self._area = area = journal.row_area(name)
         self._buffer = buffer = journal.buffer(name)
-        self._sequence: Array = np.frombuffer(buffer, self._dtype)["#sequence"].reshape(2, area.rows + 1)
+        rows: Array = np.frombuffer(buffer, self._dtype).reshape(2, area.channels, area.rows + 1)
+        self._rows = rows[:, block]
+        self._sequence: Array = self._rows["#sequence"]
+        first_half = block * area.block
+        self._starts = (first_half, first_half + area.half)  # of the halves of this block
         self._channel = channel
         self._sink = sink
         self._half = 0
@@ -58,12 +65,17 @@ class SingleRows:
         self._flushed = 0  # rows of the running half that are in the file
         self._deriver = deriver or RowDeriver()
         self._header = layout.step_message.header(channel)
+        self._hole = layout.step_message.header(channel, HOLE)
+        self._heads = np.dtype(
+            {"names": ["head"], "formats": [f"V{BODY}"], "offsets": [0], "itemsize": area.row_size}
+        )
         encoder = self._encoder = make_row_encoder(
             layout, buffer, channel, first, images, self._switch, self._seal if sealed else None
         )
         self.put = encoder.put
         self.put_state = encoder.put_state
         self.put_next = encoder.put_next
+        self.put_whole = encoder.put_whole
         self._offset = encoder.offset
         # where derived episodes go; None while none are derived
         self._events: EpisodeLog | None = None
@@ -92,6 +104,59 @@ class SingleRows:
     def _prefix(self, episode: int) -> bytes:
         return self._header + EPISODE_AND_STEP.pack(episode, 0)
 
+    # ---- many steps at once
+
+    @property
+    def can_put_many(self) -> bool:
+        """True if `put_many` may be called."""
+        return not self._sealed and not self._layout.images
+
+    def put_many(
+        self, states: Any, actions: Any, rewards: Any, terminals: Array, timeouts: Array, episode: int
+    ) -> None:
+        """As `put_whole` of several steps of an episode, which lie along the first axis of all arrays.
+
+        Raises:
+            StepError: something cannot be stored exactly; nothing is recorded.
+        """
+        n, layout = len(terminals), self._layout
+        columns = [("terminal", terminals), ("timeout", timeouts)]
+        for root, leaves in ((states, layout.state), (actions, layout.action), (rewards, layout.reward)):
+            for leaf in leaves:
+                value = exact_array(
+                    leaf_value(root, leaf), layout.dtypes[leaf.name], (n, *leaf.shape), leaf.path
+                )
+                if leaf.size:
+                    columns.append((leaf.name, value))
+        amounts = np.asarray(rewards, np.float64).reshape(n, -1).sum(axis=1)
+        totals = np.cumsum(np.append(float(self.total), amounts))[
+            1:
+        ]  # one after the other, as steps add them
+        begin = 0
+        while begin < n:
+            begin = self._put_rows(columns, begin, n, totals, episode)
+
+    def _put_rows(
+        self, columns: Sequence[tuple[str, Array]], begin: int, end: int, totals: Array, episode: int
+    ) -> int:
+        """Writes as many of the steps as the half has room for; returns how far it came."""
+        area, size = self._area, self._area.row_size
+        first = (self._offset() - self._starts[self._half]) // size
+        count = min(end - begin, area.rows - first)
+        rows = self._rows[self._half, first : first + count]
+        for name, values in columns:
+            rows[name] = values[begin : begin + count]
+        # behind the values: the first row with a header is the running one, whose state is taken
+        rows.view(self._heads)["head"] = np.frombuffer(self._hole, f"V{BODY}")
+        rows["episode"] = episode
+        rows["#log_time"] = time.time_ns()
+        after = self._offset() + count * size
+        self._buffer[after : after + BODY] = bytes(BODY)  # nobody knows the state there
+        sequence = self._encoder.count()
+        rows["#sequence"] = np.arange(sequence, sequence + count)
+        self._encoder.skip(count, float(totals[begin + count - 1]))
+        return begin + count
+
     # ---- episodes derived from rows
 
     @property
@@ -108,7 +173,7 @@ class SingleRows:
     def start_deriving(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
         """From here on episodes are derived and go to `events`, with the final state of the one that has just ended."""
         self._events = events
-        self._derived = (self._offset() - self._half * self._area.half) // self._area.row_size
+        self._derived = (self._offset() - self._starts[self._half]) // self._area.row_size
         self._episodes.begin([None])
         self._episodes.wait_for(ended, time.time_ns())
         events.expect_end(started)
@@ -125,7 +190,7 @@ class SingleRows:
         events = self._events
         if events is None:
             return None
-        half = self._half * self._area.half
+        half = self._starts[self._half]
         row = (self._offset() - half) // self._area.row_size
         self._derive(half, row, {0: self.pending_state()} if over else None)
         self._events = None
@@ -146,35 +211,36 @@ class SingleRows:
         start = self._offset()
         return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
 
-    def _seal(self, offset: int) -> None:
+    def _seal(self, offset: int, *, alone: bool = False) -> None:
         end = offset + self._area.row_size
-        seal(self._buffer, offset, end, self._buffer[end + STATE : end + self._state_end])
+        running = b"" if alone else self._buffer[end + STATE : end + self._state_end]
+        seal(self._buffer, offset, end, running)
 
     def _switch(self) -> None:
         """The half is full: go on in the other one, then write this one as a chunk."""
         area, half = self._area, self._half
         # before the other half's last row goes, whose hole may be here
-        self._derive(half * area.half, area.rows)
-        spare = half * area.half + area.rows * area.row_size
+        self._derive(self._starts[half], area.rows)
+        spare = self._starts[half] + area.rows * area.row_size
         self._half = 1 - half
         # a power loss may leave a part of what is written over these rows, and not the chunk they are in
         self._sequence[self._half] = HOLE
-        start = self._half * area.half
+        start = self._starts[self._half]
         self._buffer[start : start + self._state_end] = self._buffer[spare : spare + self._state_end]
         flushed, self._flushed = self._flushed, 0
         self._go_to(self._half)
         self._derived = 0
-        self._emit(half * area.half, flushed, area.rows)
+        self._emit(self._starts[half], flushed, area.rows)
 
     def _go_to(self, half: int) -> None:
         """The next row is the first one of a half, behind the last one of the other."""
         area = self._area
-        start, spare = half * area.half, area.rows * area.row_size
-        self._encoder.move(start, area.half - start + spare - area.row_size, start + spare)
+        start, other, spare = self._starts[half], self._starts[1 - half], area.rows * area.row_size
+        self._encoder.move(start, other + spare - area.row_size, start + spare)
 
     def flush(self) -> None:
         """Writes the rows of the running half that are not in the file yet."""
-        start = self._half * self._area.half
+        start = self._starts[self._half]
         rows = (self._offset() - start) // self._area.row_size
         flushed, self._flushed = self._flushed, rows
         self._derive(start, rows)

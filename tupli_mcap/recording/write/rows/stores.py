@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -36,10 +36,12 @@ class Stores:
         index: is told of every episode that ends.
         file: where rows go.
         vector: steps of sub-environments.
+        apart: which do not step together.
 
     Attributes:
         rows: of a single environment.
-        vector: of sub-environments.
+        vector: of sub-environments that step together.
+        streams: of a single environment, or of sub-environments that step apart, each its own.
         images: by image leaf, then by sub-environment.
         events: starts, ends and final states.
         infos: None where none are recorded.
@@ -56,6 +58,7 @@ class Stores:
         file: ToFile,
         *,
         vector: bool,
+        apart: bool = False,
     ) -> None:
         self._layout, self._journal, self._container, self._file = layout, journal, container, file
         self._steps: list[RowStore] = []
@@ -63,13 +66,16 @@ class Stores:
         self.images = [self._images(*of) for of in zip(layout.images, channels.images, strict=True)]
         self.rows: SingleRows | StepLog | None = None
         self.vector: VectorRows | StepLogs | None = None
-        if not layout.constant:
-            logs = [self._step_log(i, channel) for i, channel in enumerate(channels.steps)]
-            self.rows, self.vector = (None, StepLogs(layout, logs)) if vector else (logs[0], None)
-        elif vector:
+        self.streams: Sequence[SingleRows | StepLog] = ()
+        if layout.constant and vector and not apart:
             self.vector = self._vector_rows(channels.steps)
         else:
-            self.rows = self._single_rows(*channels.steps)
+            make = self._single_rows if layout.constant else self._step_log
+            self.streams = [make(i, channel) for i, channel in enumerate(channels.steps)]
+            if not vector:
+                (self.rows,) = self.streams
+            elif not apart:
+                self.vector = StepLogs(layout, self.streams)  # type: ignore[arg-type]
         self.infos = None if channels.info is None else self._log("info", [channels.info])
         self.frames = [self._log(f"{FRAMES_AREA}{i}", pair) for i, pair in enumerate(channels.cameras)]
         self.events = EpisodeLog(
@@ -114,11 +120,12 @@ class Stores:
         self._steps.append(store)
         return store
 
-    def _single_rows(self, channel: int) -> SingleRows:
-        images, deriver = [stores[0] for stores in self.images], RowDeriver(time_ns=self._container.end_time)
+    def _single_rows(self, i: int, channel: int) -> SingleRows:
+        """The steps of one environment, or of one sub-environment that steps apart from the others."""
+        images, deriver = [stores[i] for stores in self.images], RowDeriver(time_ns=self._container.end_time)
         store = SingleRows(
             self._layout, self._journal, "steps", channel, self._file.add_chunk, images,
-            self._container.counts[channel], deriver, sealed=self._file.sealed,
+            self._container.counts[channel], deriver, sealed=self._file.sealed, block=i,
         )  # fmt: skip
         self._steps.append(store)
         return store

@@ -20,7 +20,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import exact_array, exact_flag, leaf_value, shorten, structure_check
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Encoder", "StepLog", "StepLogs", "each_of", "leaf_encoders"]
+__all__ = ["Encoder", "StepLog", "StepLogs", "each_of", "final_encoder", "leaf_encoders"]
 
 Encoder = Callable[[Any, bytearray, int], None]
 _DOUBLE = struct.Struct("<d")
@@ -161,12 +161,16 @@ class StepLog:
 
     def prepare(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> PreparedStep:
         """A step as `commit` takes it; StepError if it cannot be stored exactly."""
-        self._check_action(action)
         out = bytearray(self._pending)
+        self._complete(out, action, reward, terminal, timeout)
+        return PreparedStep(out, self._layout.reward_total(reward), self.prepare_state(state))
+
+    def _complete(self, out: bytearray, action: Any, reward: Any, terminal: Any, timeout: Any) -> None:
+        """Appends to a record what follows its state."""
+        self._check_action(action)
         self._encode(out, self._action, action)
         self._encode(out, self._reward, reward)
         out += bytes((exact_flag(terminal, "terminal"), exact_flag(timeout, "timeout")))
-        return PreparedStep(out, self._layout.reward_total(reward), self.prepare_state(state))
 
     def commit(self, prepared: PreparedStep) -> None:
         """Completes and commits the running record; the prepared state starts the next one."""
@@ -191,6 +195,33 @@ class StepLog:
         self._position = end
         self._sizes.append(size)
         self.total += prepared.reward
+
+    def put_whole(self, state: Any, action: Any, reward: Any, terminal: Any, timeout: Any) -> None:
+        """A step with its state; the state after it is not known. StepError as `prepare`."""
+        out, images = self.prepare_state(state)
+        self._complete(out, action, reward, terminal, timeout)
+        total, size = self._layout.reward_total(reward), len(out)
+        self._pending.clear()
+        self._reserve(size + 1)
+        self._time = max(time.time_ns(), self._time)
+        self._number(out)
+        FRONT.pack_into(out, 0, 5, size - 9, self._channel, self.count, self._time)
+        seal(out, 0, size, b"")
+        records, start = self._records[self._half], self._position
+        end = start + size
+        # its front last, for a record with a front is a running one, whose state is taken
+        records[start + BODY : end + 1] = out[BODY:] + b"\0"
+        for sink, image in zip(self._images, images, strict=True):
+            sink.put_first(image)
+        records[start : start + BODY] = out[:BODY]
+        self._ends[self._half][0] = end
+        self._position = end
+        self._sizes.append(size)
+        self.count += 1
+        self._step += 1
+        self.total += total
+        for sink in self._images:
+            sink.advance()
 
     def put_state(self, state: Any) -> None:
         """`commit_state` of `prepare_state`."""
@@ -311,6 +342,24 @@ class StepLogs:
     def pending_state(self, i: int) -> bytes:
         """As `BatchStore.pending_state`."""
         return self.logs[i].pending_state()
+
+
+def final_encoder(layout: StepLayout) -> Callable[[Any], bytes]:
+    """Encodes a final state that is in no row, as it follows `episode` and `env` in `/final_state`; StepError if it
+    cannot be stored exactly."""
+    check, encoders = (
+        structure_check(layout.observation_space, "state"),
+        leaf_encoders(layout, layout.final_leaves),
+    )
+
+    def encode(state: Any) -> bytes:
+        check(state)
+        out = bytearray(8)
+        for leaf, encode_leaf in encoders:
+            encode_leaf(leaf_value(state, leaf), out, 0)
+        return bytes(out[8:])
+
+    return encode
 
 
 def each_of(space: Any, batch: Any, n: int) -> list[Any]:

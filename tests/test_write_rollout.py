@@ -1,0 +1,161 @@
+"""Recordings of arrays: rollouts of one or many environments, and lists of episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import tupli_mcap
+from tupli_mcap import Recording, StepError, verify_recording, write_rollout
+from tupli_mcap.vector import RecordEpisodes as RecordVector
+
+STEPS, N = 200, 3
+
+
+def rollout(mode: AutoresetMode, path: Path) -> dict[str, Any]:
+    """A rollout as a user collects it, and the recording that `RecordEpisodes` makes of it."""
+    make = lambda: gym.wrappers.TimeLimit(gym.make("CartPole-v1"), 15)  # noqa: E731
+    env = RecordVector(SyncVectorEnv([make] * N, autoreset_mode=mode), path)
+    rng = np.random.default_rng(0)
+    columns: dict[str, list[Any]] = {name: [] for name in ("s", "a", "r", "terminal", "timeout", "next")}
+    state, _ = env.reset(seed=3)
+    for _ in range(STEPS):
+        action = rng.integers(0, 2, N)
+        after, reward, terminal, timeout, info = env.step(action)
+        last = after.copy()
+        for i in np.flatnonzero(info.get("_final_obs", [])):
+            last[i] = info["final_obs"][i]
+        for name, value in zip(columns, (state, action, reward, terminal, timeout, last), strict=True):
+            columns[name].append(np.copy(value))
+        done = terminal | timeout
+        if mode is AutoresetMode.DISABLED and done.any():
+            after, _ = env.reset(options={"reset_mask": done})
+        state = after
+    env.close()
+    arrays = {name: np.stack(values) for name, values in columns.items()}
+    arrays["s"] = np.concatenate([arrays["s"], state[None]])
+    return arrays
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_a_rollout_is_what_the_wrapper_records(tmp_path: Path, mode: AutoresetMode) -> None:
+    got = rollout(mode, tmp_path / "wrapped.mcap")
+    write_rollout(
+        tmp_path / "arrays.mcap", got["s"], got["a"], got["r"], got["terminal"], got["timeout"],
+        next_states=got["next"], autoreset=mode.value, action_space=spaces.Discrete(2),
+    )  # fmt: skip
+    assert verify_recording(tmp_path / "arrays.mcap").problems == []
+    with Recording(tmp_path / "wrapped.mcap") as wrapped, Recording(tmp_path / "arrays.mcap") as written:
+        order = [np.lexsort((index["first_row"], index["env"])) for index in (wrapped.index, written.index)]
+        assert len(order[0]) == len(order[1]) > 3 * N
+        for i, j in zip(*order, strict=True):
+            expected, found = wrapped.episodes[int(i)], written.episodes[int(j)]
+            assert (expected.end, wrapped.index["env"][i]) == (found.end, written.index["env"][j])
+            for name in ("states", "actions", "rewards", "terminals", "timeouts", "final_state"):
+                np.testing.assert_array_equal(getattr(expected, name), getattr(found, name), name)
+            assert wrapped.index["return"][i] == written.index["return"][j]
+
+
+def test_final_states_come_from_where_they_are_known(tmp_path: Path) -> None:
+    states = np.arange(7, dtype=np.float32)[:, None]
+    done = np.array([False, True, False, False, False, True])
+    rewards, actions = np.zeros(6), np.zeros((6, 1))
+
+    def finals(**more: Any) -> list[Any]:
+        write_rollout(tmp_path / "r.mcap", states, actions, rewards, done, mode="w", **more)
+        with Recording(tmp_path / "r.mcap") as recording:
+            return [None if e.final_state is None else float(e.final_state[0]) for e in recording.episodes]
+
+    assert finals(autoreset="next-step") == [2, 6]
+    assert finals(autoreset="same-step") == [None, None]
+    assert finals(autoreset="disabled") == [None, 6]
+    assert finals(autoreset="same-step", final_states=np.array([[8.0], [9.0]], np.float32)) == [8, 9]
+    assert finals(autoreset="same-step", next_observations=states[1:] + 10) == [12, 16]
+
+
+def test_lists_are_episodes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    lengths = [3, 1, 7]
+    states = [rng.normal(size=(n + (i != 1), 2)) for i, n in enumerate(lengths)]
+    actions = [rng.normal(size=(n, 2)) for n in lengths]
+    rewards = [rng.normal(size=n) for n in lengths]
+    write_rollout(
+        tmp_path / "r.mcap", states, actions, rewards, [True, False, False], timeouts=[False, False, np.eye(7)[6]],
+        infos=[{"x": np.arange(n)} for n in lengths], metadata=[{"k": n} for n in lengths],
+    )  # fmt: skip
+    data = tupli_mcap.open(tmp_path / "r.mcap")
+    assert [e.end for e in data] == ["terminal", "interrupted", "timeout"]
+    assert [e.metadata for e in data] == [{"k": 3}, {"k": 1}, {"k": 7}]
+    assert data[1].final_state is None
+    np.testing.assert_array_equal(data[2].final_state, states[2][7])
+    np.testing.assert_array_equal(data[2].states, states[2][:7])
+    assert [info["x"] for info in data[2].infos] == list(range(7))
+
+
+def test_tensors_dicts_and_images_are_understood(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    images = np.random.default_rng(0).integers(0, 255, (5, 2, 16, 16, 3)).astype(np.uint8)
+    states = {"camera": torch.tensor(images), "joints": torch.rand(5, 2, 4, requires_grad=True)}
+    actions = (torch.zeros(5, 2, dtype=torch.int64), torch.zeros(5, 2, dtype=torch.bool))
+    write_rollout(tmp_path / "r.mcap", states, actions, torch.ones(5, 2), infos={"p": torch.rand(5, 2)})
+    assert verify_recording(tmp_path / "r.mcap").problems == []
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert recording.num_envs == 2
+        for env, episode in enumerate(recording.episodes):
+            np.testing.assert_array_equal(episode.states["camera"], images[:, env])
+            np.testing.assert_array_equal(episode.states["joints"], states["joints"][:, env].detach())
+            assert len(episode.infos) == 5
+
+
+def test_texts_need_their_space(tmp_path: Path) -> None:
+    words = np.array([["pick", "it"], ["up", "now"]])
+    with pytest.raises(StepError, match="states: expected numbers, found <U4; pass observation_space"):
+        write_rollout(tmp_path / "r.mcap", words, np.zeros((2, 2)), np.zeros((2, 2)))
+    space = spaces.Text(10)
+    write_rollout(tmp_path / "r.mcap", words, np.zeros((2, 2)), np.zeros((2, 2)), observation_space=space)
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert [list(e.states) for e in recording.episodes] == [["pick", "up"], ["it", "now"]]
+
+
+STATES, ACTIONS, REWARDS = np.zeros((4, 2)), np.zeros((4, 1)), np.zeros(4)
+ENDS = np.array([True, True, False, False])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((STATES, ACTIONS, REWARDS, ENDS), 'autoreset: an episode ends at step 0, and the arrays go on; pass'),
+        ((STATES, ACTIONS[1:], REWARDS), r"actions: expected arrays that begin with \(4,\), .* found \(3, 1\)"),
+        ((STATES[1:], ACTIONS, REWARDS), r"states: expected arrays that begin with \(4,\) or \(5,\), as rewards"),
+        ((STATES, ACTIONS, REWARDS, REWARDS + 2), r"terminals: expected flags of shape \(4,\), .* found float64"),
+        ((STATES, ACTIONS, np.zeros((4, 2, 2))), r"rewards: expected an array \[T\] or \[T, N\]"),
+        ((STATES, ACTIONS, None), "rewards: expected arrays, or a list of one for each episode, found None"),
+        (([STATES], [ACTIONS], [REWARDS, REWARDS]), "states: expected a list of one for each of 2 episodes, found 1"),
+        (([STATES], [ACTIONS], [REWARDS[1:]]), r"episode 0: actions: expected arrays that begin with \(3,\)"),
+        (([STATES], [ACTIONS], [REWARDS], [ENDS]), "expected no flag before the last step, 3, found one at step 0"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused(tmp_path: Path, given: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(StepError, match=message):
+        write_rollout(tmp_path / "r.mcap", *given)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_end_where_a_reset_should_be_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        StepError, match="expected a reset at step 1, after an end, found another end; pass autoreset"
+    ):
+        write_rollout(tmp_path / "r.mcap", STATES, ACTIONS, REWARDS, ENDS, autoreset="next-step")
+    with pytest.raises(
+        StepError, match="autoreset: expected one of next-step, same-step, disabled, found 'never'"
+    ):
+        write_rollout(tmp_path / "r.mcap", STATES, ACTIONS, REWARDS, ENDS, autoreset="never")
+    with pytest.raises(StepError, match="expected states or observations, which mean the same, found both"):
+        write_rollout(tmp_path / "r.mcap", STATES, ACTIONS, REWARDS, observations=STATES)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,532 @@
+"""`EpisodeWriter`: records episodes without an environment, step by step."""
+
+from __future__ import annotations
+
+import os
+import time
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import gymnasium as gym
+import numpy as np
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import Array, arrays_at
+from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.journal.seals import Durability
+from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
+from tupli_mcap.messages.images.pictures import ImageFormat
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.edit.rewrite import rewrite_recording
+from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
+from tupli_mcap.recording.write.options import Capture, Mode, RecordOptions
+from tupli_mcap.recording.write.rotation import Rotation
+from tupli_mcap.recording.write.rows.contract import StepStore
+from tupli_mcap.recording.write.rows.single import SingleRows
+from tupli_mcap.recording.write.rows.variable import final_encoder
+from tupli_mcap.recording.write.single import decide_layout
+from tupli_mcap.recording.write.work import BEGUN, DONE, Work
+from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
+from tupli_mcap.spaces.exact import shorten
+from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
+from tupli_mcap.wrappers.run import with_run
+from tupli_mcap.wrappers.stacks import format_version, with_stacks
+
+__all__ = ["EpisodeWriter"]
+
+
+class EpisodeWriter:
+    """Records episodes without an environment: of robots, teleoperation, simulators.
+
+        with EpisodeWriter("run.mcap", observation_space, action_space) as writer:
+            writer.begin(metadata={"operator": "Ann"})
+            writer.step(state, action, reward, terminal, timeout)  # and so on
+            writer.end(final_state)
+
+    A step is (state, action, reward, terminal, timeout); `state` is the observation that `action` was chosen on. It is
+    safe, whatever happens to the process, as soon as `step()` has returned. What still runs at `close()`, at garbage
+    collection and at the end of the interpreter ends as "interrupted", without a final state.
+
+    Args:
+        path: the recording, or a directory: it gets a new file named by time. Directories that are missing are made.
+            `mode` "x" refuses to overwrite, "w" replaces, "a" continues it, or makes it.
+        observation_space, action_space, reward_space: Gymnasium spaces of one step; by default a reward is a number.
+        num_envs: None for one stream of episodes; a number for as many streams in one file, as a vector environment has
+            sub-environments. Each has an episode of its own, and `env` says which of them is meant.
+        labels, attachments, compression, flush_seconds, journal_dir, chunk_size, durability, image_format, stack_size,
+            benchmark_id, max_bytes, max_seconds, name, metadata, tags, split, capture: those of
+            `tupli_mcap.RecordEpisodes`.
+
+    Raises:
+        SpaceError: a space that cannot be recorded, with the path of the leaf.
+        RecordingError: the file exists, is being written, or cannot be written.
+
+    Not thread-safe. A forked child cannot go on recording; the parent can.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        *,
+        reward_space: gym.Space[Any] | None = None,
+        num_envs: int | None = None,
+        labels: Mapping[str, Sequence[str]] | None = None,
+        attachments: Mapping[str, tuple[str, bytes]] | None = None,
+        compression: str = "zstd",
+        mode: Mode = "x",
+        benchmark_id: str = "",
+        flush_seconds: float | None = None,
+        journal_dir: str | os.PathLike[str] | None = None,
+        chunk_size: int = 256 * 1024,
+        durability: Durability = "os",
+        image_format: ImageFormat = "raw",
+        stack_size: int | None = None,
+        max_bytes: int | None = None,
+        max_seconds: float | None = None,
+        name: str | None = None,
+        metadata: Mapping[str, Any] | None = None,
+        tags: Sequence[str] = (),
+        split: str = "",
+        capture: Capture = "all",
+    ) -> None:
+        if num_envs is not None and not (isinstance(num_envs, int | np.integer) and num_envs > 0):
+            raise RecordingError(f"num_envs: expected a positive number or None, found {num_envs!r:.80}")
+        spaces = with_stacks(None, StepLayout(observation_space, action_space, reward_space), stack_size)
+        spaces.to_metadata()
+        named = chosen_labels(labels or {}, spaces.leaves, Labels.none())
+        given = dict(attachments or {})
+        if named:
+            given[LABELS_NAME] = (LABELS_MEDIA_TYPE, named.to_json())
+        options = RecordOptions(
+            compression=compression, mode=mode, benchmark_id=benchmark_id, capture_env=None, attachments=given,
+            flush_seconds=flush_seconds, journal_dir=journal_dir, chunk_size=chunk_size, durability=durability,
+            image_format=image_format, stack_size=stack_size, max_bytes=max_bytes, max_seconds=max_seconds, name=name,
+            metadata=metadata, tags=tags, split=split, capture=capture,
+        )  # fmt: skip
+        options = replace(options, attachments=with_run(given, options, ""))
+        self._spaces, self._num_envs = spaces, None if num_envs is None else int(num_envs)
+        self._rotation = Rotation(path, options, format_version(spaces, image_format), name or "run")
+        self._work = Work()
+        self._discarded: dict[Path, list[int]] = {}
+        self._compression, self._is_plain = compression, options.is_plain
+        writer = self._rotation.open_first()
+        try:
+            self._record_to(writer)
+            writer.check_spaces(spaces, self._num_envs or 1, vector=num_envs is not None)
+            self._finalizer = weakref.finalize(self, _close, self._work, self._discarded, compression)
+        except BaseException:
+            writer.close()
+            raise
+
+    def _record_to(self, writer: RecordingWriter) -> None:
+        self._writer = writer
+        self._streams = _Streams(writer, self._spaces, self._num_envs)
+        self._work.recorders.append(self._streams)
+
+    @property
+    def path(self) -> Path:
+        """The file that is recorded to."""
+        return self._rotation.path
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that this writer has recorded to, in their order."""
+        return self._rotation.paths
+
+    @property
+    def closed(self) -> bool:
+        """True once the recording is finished."""
+        return self._writer.closed
+
+    def begin(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+        metadata: Mapping[str, Any] | None = None,
+        env: int = 0,
+    ) -> None:
+        """Begins an episode.
+
+        Args:
+            seed, options: what a simulator was reset with.
+            metadata: of the episode; `end` may add to it.
+            env: in which stream.
+
+        Raises:
+            StepError: an episode runs in this stream that no flag has ended.
+            RecordingError: metadata that is no dict of what JSON can hold.
+        """
+        stream = self._stream(env)
+        if stream.is_running and stream.over is None:
+            raise StepError(f"an episode is running{_in(self._num_envs, env)}; call end() or discard() first")
+        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
+            raise StepError(f"seed: expected an integer or None, found {shorten(seed)}")
+        told = "" if options is None else jsonvalue.dumps_any(options)
+        facts = ResetFacts(None if seed is None else int(seed), None, told, "{}", time.time_ns())
+        entries = _metadata(metadata)
+        with _Whole(self._work, self._writer):
+            stream.end()
+            if self._rotation.is_due(self._writer) and not self._streams.is_running:
+                self._go_on()
+                stream = self._streams.streams[env]
+            stream.begin(facts, entries)
+
+    def _go_on(self) -> None:
+        """In the next file."""
+        before, left = self._streams, self._writer
+        self._record_to(self._work.ask(self._rotation.open_next))
+        self._writer.layout = left.layout
+        before.close()
+        self._work.recorders.remove(before)
+
+    def step(
+        self,
+        state: Any,
+        action: Any,
+        reward: Any,
+        terminal: bool = False,
+        timeout: bool = False,
+        *,
+        info: Mapping[str, Any] | None = None,
+        env: int = 0,
+    ) -> None:
+        """Records a step: the observation, the action that was chosen on it, and what came of it.
+
+        Args:
+            terminal, timeout: the step has ended the episode; `end` tells what the last state was.
+            info: entries to record with it: numbers, texts, arrays, and lists and dicts of them.
+            env: in which stream.
+
+        Raises:
+            StepError: no episode is running, or a value cannot be stored exactly; nothing of this step is recorded, and
+                the episode goes on.
+        """
+        stream = self._ready(env)
+        entries = entries_of(info, "info") if info else None
+        work = self._work
+        work.state = BEGUN
+        try:
+            stream.put(state, action, reward, terminal, timeout)
+            if entries:
+                stream.put_info(entries)
+            if not self._is_plain:
+                self._writer.flush_if_due()
+                self._writer.sync_step()
+        except StepError:
+            work.state = DONE
+            raise
+        except BaseException as err:
+            self._writer.stop(err)
+            raise
+        work.finish()
+
+    def steps(
+        self,
+        states: Any,
+        actions: Any,
+        rewards: Any,
+        terminals: Any = None,
+        timeouts: Any = None,
+        *,
+        infos: Sequence[Mapping[str, Any]] | None = None,
+        env: int = 0,
+    ) -> None:
+        """Records several steps of the running episode, which lie along the first axis of all arrays (NumPy's).
+
+        Args:
+            terminals, timeouts: by default false; only the last step may have one of them set.
+            infos: a dict for each step.
+
+        Raises:
+            StepError: as `step`; also for flags before the last step, and for arrays of unequal length.
+        """
+        stream = self._ready(env)
+        n = len(rewards)
+        flags = _flags(terminals, n, "terminals"), _flags(timeouts, n, "timeouts")
+        early = np.flatnonzero((flags[0] | flags[1])[:-1])
+        if len(early):
+            raise StepError(f"expected no flag before the last step, {n - 1}, found one at step {early[0]}")
+        if infos is not None and len(infos) != n:
+            raise StepError(f"infos: expected one for each of {n} steps, found {len(infos)}")
+        entries = [entries_of(info, "info") for info in infos or ()]
+        if n:
+            with _Whole(self._work, self._writer):
+                stream.put_many(states, actions, rewards, *flags, entries)
+                self._writer.flush_if_due()
+                self._writer.sync_step()
+
+    def end(
+        self, final_state: Any = None, *, metadata: Mapping[str, Any] | None = None, env: int = 0
+    ) -> None:
+        """Ends the running episode as the flags of its last step say, as "interrupted" if neither is set; an episode
+        without a step is none.
+
+        Args:
+            final_state: the observation after the last step; None: not known.
+            metadata: added to that of `begin`.
+            env: in which stream.
+
+        Raises:
+            StepError: no episode is running, or the state cannot be stored exactly; the episode is still running then.
+        """
+        stream = self._running(env)
+        entries = _metadata(metadata)
+        with _Whole(self._work, self._writer):
+            stream.end(final_state, entries)
+            self._writer.sync_step()
+
+    def discard(self, *, env: int = 0) -> None:
+        """Drops the running episode: it will not be in the finished file, and its number is not used again.
+
+        Its steps are in the file by now, so the file is written anew without them when it is closed. If the process is
+        killed before, the episode is found as an interrupted one, with `discarded` true in its metadata; and without
+        that if it is killed before this call.
+
+        Raises:
+            StepError: no episode is running.
+        """
+        stream = self._running(env)
+        with _Whole(self._work, self._writer):
+            number = stream.discard()
+            if number is not None:
+                self._discarded.setdefault(self._writer.path, []).append(number)
+            self._writer.sync_step()
+
+    def flush(self) -> None:
+        """Writes everything recorded so far into chunks; the journal already protects it."""
+        self._work.flush()
+
+    def close(self) -> None:
+        """Finishes the recording. Calling it twice is fine.
+
+        Raises:
+            RecordingError: the disk refuses; everything that was recorded is safe.
+        """
+        _close(self._work, self._discarded, self._compression)
+        self._finalizer.detach()
+
+    def _stream(self, env: int) -> _Stream:
+        if self._work.state or self._writer.closed:
+            self._work.refuse()
+        streams = self._streams.streams
+        if env.__class__ is int and 0 <= env < len(streams):
+            return streams[env]
+        if isinstance(env, bool) or not isinstance(env, int | np.integer) or not 0 <= env < len(streams):
+            more = "; pass num_envs for several streams" if self._num_envs is None else ""
+            raise StepError(f"env: expected a stream from 0 to {len(streams) - 1}, found {env!r:.40}{more}")
+        return streams[env]
+
+    def _ready(self, env: int) -> _Stream:
+        stream = self._stream(env)
+        if not stream.is_running or stream.over is not None:
+            ended = "the step before has ended the episode" if stream.is_running else "no episode is running"
+            raise StepError(f"{ended}{_in(self._num_envs, env)}; call begin() first")
+        return stream
+
+    def _running(self, env: int) -> _Stream:
+        stream = self._stream(env)
+        if not stream.is_running:
+            raise StepError(f"no episode is running{_in(self._num_envs, env)}; call begin() first")
+        return stream
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> Literal[False]:
+        self.close()
+        return False
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise RecordingError(
+            f"what records to {self.path} cannot be pickled or copied; make another one there"
+        )
+
+
+class _Whole:
+    """Marks the work while it is done (`work`): a refused step leaves it whole, what else interrupts it does not."""
+
+    __slots__ = ("_work", "_writer")
+
+    def __init__(self, work: Work, writer: RecordingWriter) -> None:
+        self._work, self._writer = work, writer
+
+    def __enter__(self) -> None:
+        self._work.state = BEGUN
+
+    def __exit__(self, _: object, err: BaseException | None, __: object) -> Literal[False]:
+        work = self._work
+        if err is None:
+            work.finish()
+        elif work.is_whole_after(err):
+            work.state = DONE
+        else:
+            self._writer.stop(err)
+        return False
+
+
+class _Streams:
+    """Records the episodes of each stream into one file."""
+
+    def __init__(self, writer: RecordingWriter, spaces: StepLayout, num_envs: int | None) -> None:
+        self.writer, self.spaces, self._num_envs = writer, spaces, num_envs
+        self.infos = InfoRecorder(True)
+        self.streams = [_Stream(self, i) for i in range(num_envs or 1)]
+
+    @property
+    def is_running(self) -> bool:
+        """True if some stream is within an episode."""
+        return any(stream.is_running for stream in self.streams)
+
+    def begin(self, state: Any, action: Any, reward: Any) -> None:
+        """Fixes the layout by the values of the first step, where it is not fixed yet."""
+        writer = self.writer
+        if not writer.streams:
+            layout = decide_layout(self.spaces, [state], [action], [reward], writer.layout)
+            schema, n = self.infos.codec.schema(), self._num_envs
+            writer.begin(layout, n or 1, vector=n is not None, apart=True, info_schema=schema)
+
+    def close(self) -> None:
+        """Ends the running episodes as their flags say, or as interrupted, and finishes the file."""
+        if self.writer.closed:
+            return
+        for stream in self.streams:
+            stream.end()
+        self.writer.close()
+
+
+class _Stream:
+    """Records the episodes of one stream.
+
+    Attributes:
+        is_running: an episode has begun and not ended.
+        over: how the last step has ended the running episode, None if it has not.
+    """
+
+    def __init__(self, streams: _Streams, env: int) -> None:
+        self._streams, self._writer, self._env = streams, streams.writer, env
+        self.is_running = False
+        self.over: int | None = None
+        self._facts = ResetFacts(None, None, "", "{}", 0)
+        self._metadata: dict[str, Any] = {}
+        self._episode: StartedEpisode | None = None
+        self._store: StepStore | None = None
+
+    def begin(self, facts: ResetFacts, metadata: dict[str, Any]) -> None:
+        """Begins an episode, which is written with its first step."""
+        self._facts, self._metadata = facts, metadata
+        self.is_running, self.over = True, None
+
+    def put(self, state: Any, action: Any, reward: Any, terminal: Any, timeout: Any) -> None:
+        """Records a step."""
+        if self._episode is None:
+            self._put_first(state, action, reward, terminal, timeout)
+        else:
+            self._store.put_whole(state, action, reward, terminal, timeout)  # type: ignore[union-attr]
+        if terminal or timeout:
+            self.over = TERMINAL if terminal else TIMEOUT
+
+    def _put_first(self, *step: Any) -> None:
+        writer = self._writer
+        is_first = not writer.streams
+        self._streams.begin(*step[:3])
+        self._store = store = writer.streams[self._env]
+        store.begin_episode(writer.next_episode)
+        episode = writer.start_episode(self._env, store.count, self._facts)
+        try:
+            store.put_whole(*step)
+        except StepError:
+            writer.drop_start()
+            raise
+        self._episode = episode
+        if is_first:
+            writer.take_place()
+
+    def put_many(
+        self,
+        states: Any,
+        actions: Any,
+        rewards: Any,
+        terminals: Array,
+        timeouts: Array,
+        infos: Sequence[Mapping[str, Any]],
+    ) -> None:
+        """Records several steps."""
+        columns = (states, actions, rewards)
+        for i in range(len(rewards)):
+            store = self._store
+            if self._episode and not infos and isinstance(store, SingleRows) and store.can_put_many:
+                rest = [arrays_at(column, slice(i, None)) for column in columns]
+                store.put_many(rest[0], rest[1], rest[2], terminals[i:], timeouts[i:], self._episode.number)
+                self.over = TERMINAL if terminals[-1] else TIMEOUT if timeouts[-1] else None
+                break
+            state, action, reward = (arrays_at(column, i) for column in columns)
+            self.put(state, action, reward, bool(terminals[i]), bool(timeouts[i]))
+            if infos:
+                self.put_info(infos[i])
+
+    def put_info(self, info: Mapping[str, Any]) -> None:
+        """Records the info of the step just put."""
+        if self._episode is not None and self._store is not None:
+            step = self._store.count - self._episode.first_row - 1
+            self._streams.infos.put(self._writer, self._episode.number, step, info)
+
+    def end(self, final_state: Any = None, metadata: Mapping[str, Any] | None = None) -> None:
+        """Ends the running episode, if there is one; one without a step is none."""
+        writer, episode, store = self._writer, self._episode, self._store
+        if episode is not None and store is not None:
+            final = None
+            if final_state is not None and writer.layout is not None:
+                final = final_encoder(writer.layout)(final_state)
+            text = jsonvalue.dumps_plain({**self._metadata, **(metadata or {})})
+            length = store.count - episode.first_row
+            how = INTERRUPTED if self.over is None else self.over
+            writer.end_episode(episode, how, length, store.total, final, text)
+        self._episode = None
+        self.is_running, self.over = False, None
+
+    def discard(self) -> int | None:
+        """Ends the running episode as one to leave out; returns its number, None if it has no step."""
+        number = None if self._episode is None else self._episode.number
+        self.end(metadata={"discarded": True})
+        return number
+
+
+def _in(num_envs: int | None, env: int) -> str:
+    return "" if num_envs is None else f" in stream {env}"
+
+
+def _flags(given: Any, n: int, name: str) -> Array:
+    flags: Array = np.zeros(n, np.bool_) if given is None else np.asarray(given)
+    if flags.shape != (n,) or not (flags.dtype == np.bool_ or np.isin(flags, (0, 1)).all()):
+        raise StepError(f"{name}: expected {n} flags, found {shorten(given)}")
+    return flags.astype(np.bool_)
+
+
+def _metadata(given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """A copy of an episode's metadata; RecordingError unless JSON can hold them."""
+    entries = entries_of(given, "metadata")
+    try:
+        jsonvalue.dumps_plain(entries)
+    except (TypeError, ValueError) as err:
+        raise RecordingError(f"metadata: {err}") from err
+    return entries
+
+
+def _close(work: Work, discarded: dict[Path, list[int]], compression: str) -> None:
+    """Finishes the files, and leaves out of them what was discarded."""
+    work.close()
+    while discarded:
+        path, numbers = discarded.popitem()
+        with Recording(path) as recording:
+            kept = [number for number in recording.index["episode"].tolist() if number not in numbers]
+            if kept:
+                rewrite_recording(recording, path, episodes=kept, compression=compression)
+        if not kept:
+            path.unlink()

@@ -1,0 +1,363 @@
+"""`write_rollout`: a recording of arrays that hold whole rollouts."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, Literal, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from tupli_mcap.arrays import Array, arrays_at, map_arrays
+from tupli_mcap.errors import StepError
+from tupli_mcap.recording.write.options import Mode
+from tupli_mcap.spaces.exact import shorten
+from tupli_mcap.wrappers.episode_writer import EpisodeWriter
+
+__all__ = ["write_rollout"]
+
+Autoreset = Literal["next-step", "same-step", "disabled"]
+_MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
+_CHUNK: Final = 256 * 1024
+_MANY: Final = (
+    16  # streams up to which chunks are as large as those of one: they all have room in the journal
+)
+_CHOOSE: Final = (
+    'pass autoreset="next-step" if the step after an end is a reset, whose action was ignored, "same-step" if the step '
+    'that ends an episode already resets, "disabled" if you have reset between the steps'
+)
+
+
+class _Part(NamedTuple):
+    """Steps of one episode."""
+
+    env: int
+    states: Any
+    actions: Any
+    rewards: Any
+    terminals: Array
+    timeouts: Array
+    final_state: Any
+    infos: Mapping[str, Any]
+    metadata: Mapping[str, Any]
+
+
+def write_rollout(
+    path: str | os.PathLike[str],
+    states: Any = None,
+    actions: Any = None,
+    rewards: Any = None,
+    terminals: Any = None,
+    timeouts: Any = None,
+    *,
+    next_states: Any = None,
+    final_states: Any = None,
+    infos: Any = None,
+    metadata: Any = None,
+    autoreset: Autoreset | str | None = None,
+    observation_space: gym.Space[Any] | None = None,
+    action_space: gym.Space[Any] | None = None,
+    reward_space: gym.Space[Any] | None = None,
+    labels: Mapping[str, Sequence[str]] | None = None,
+    attachments: Mapping[str, tuple[str, bytes]] | None = None,
+    compression: str = "zstd",
+    mode: Mode = "x",
+    benchmark_id: str = "",
+    run: Mapping[str, Any] | None = None,
+    observations: Any = None,
+    terminations: Any = None,
+    truncations: Any = None,
+    next_observations: Any = None,
+) -> None:
+    """Writes a recording of arrays that hold whole rollouts.
+
+        write_rollout("run.mcap", observations, actions, rewards, terminations, truncations, autoreset="next-step")
+        write_rollout("demos.mcap", states=[s0, s1], actions=[a0, a1], rewards=[r0, r1], terminals=[True, False])
+
+    Arrays are NumPy's, or have `__dlpack__` or `__array__` (torch, JAX); states and actions may be dicts and tuples of
+    them, as their spaces are. Given as arrays, they hold T steps: [T, …], or [T, N, …] of N sub-environments, each of
+    which becomes a stream of episodes of its own. Given as lists, each entry is an episode: [T of this one, …].
+
+    Args:
+        states: what the actions were chosen on; one more than there are steps (T + 1) tells the state after the last.
+        terminals, timeouts: whether a step ended its episode; of lists, one flag an episode will do. By default false.
+            Steps after the last end are an episode that was interrupted.
+        next_states: the state after each step, in arrays of the actions' lengths; only final states are taken of it.
+        final_states: instead of that, one for each episode that a flag ends, in the order of
+            `numpy.argwhere(terminals | timeouts)`; of lists, one for each episode, None where it is not known.
+        infos: name -> array, along the same axes as the rewards; of lists, one such dict for each episode.
+        metadata: of every episode; of lists, one for each or one for all.
+        autoreset: what the step after an end is, where arrays go on after one. "next-step": a reset, whose action and
+            reward are left out; "same-step": a step of the next episode, and the state after an end is its first one;
+            "disabled": the same, and the caller has reset between the steps.
+        observation_space, action_space: by default Boxes of the arrays' dtypes and shapes, without bounds.
+        reward_space: for rewards that are arrays.
+        run: name, metadata, tags, split and capture of the run, as `tupli_mcap.RecordEpisodes` has them.
+        labels, attachments, compression, mode, benchmark_id: those of `tupli_mcap.RecordEpisodes`.
+        observations, terminations, truncations, next_observations: Gymnasium's names of states, terminals, timeouts,
+            next_states.
+
+    Raises:
+        StepError: arrays that do not fit together, or values that cannot be stored exactly; of lists, the episodes
+            before that one are in the file.
+        SpaceError: a space that cannot be recorded.
+        RecordingError: the file exists, is being written, or cannot be written.
+    """
+    states = _one_of("states", states, "observations", observations)
+    terminals = _one_of("terminals", terminals, "terminations", terminations)
+    timeouts = _one_of("timeouts", timeouts, "truncations", truncations)
+    next_states = _one_of("next_states", next_states, "next_observations", next_observations)
+    for name, given in (("states", states), ("actions", actions), ("rewards", rewards)):
+        if given is None:
+            raise StepError(f"{name}: expected arrays, or a list of one for each episode, found None")
+    data = _Given(states, actions, rewards, terminals, timeouts, next_states, final_states, infos, metadata)
+    if isinstance(rewards, list | tuple) and rewards and _array(rewards[0]).ndim:
+        lead, count, first = 1, None, _episode(data, 0)
+        parts: Iterable[_Part] = _episodes(data)
+    else:
+        first = data = _Given._make([*(map_arrays(one, _array) for one in data[:-1]), metadata])
+        lead = _lead(data.rewards, reward_space)
+        count = data.rewards.shape[1] if lead == 2 else None
+        parts = list(_streams(data, lead, _mode(autoreset)))  # looked at before anything is written
+    observations = observation_space or _space(first.states, lead, "states")
+    actions = action_space or _space(first.actions, lead, "actions")
+    with EpisodeWriter(
+        path, observations, actions, reward_space=reward_space, num_envs=count, labels=labels,
+        attachments=attachments, compression=compression, mode=mode, benchmark_id=benchmark_id,
+        chunk_size=_CHUNK * min(count or 1, _MANY), **(run or {}),
+    ) as writer:  # fmt: skip
+        for part in parts:
+            _write(writer, part)
+
+
+class _Given(NamedTuple):
+    """The arguments that hold data."""
+
+    states: Any
+    actions: Any
+    rewards: Any
+    terminals: Any
+    timeouts: Any
+    next_states: Any
+    final_states: Any
+    infos: Any
+    metadata: Any
+
+
+def _write(writer: EpisodeWriter, part: _Part) -> None:
+    n = len(part.rewards)
+    infos = (
+        [{name: values[i] for name, values in part.infos.items()} for i in range(n)] if part.infos else None
+    )
+    writer.begin(metadata=part.metadata, env=part.env)
+    writer.steps(
+        part.states, part.actions, part.rewards, part.terminals, part.timeouts, infos=infos, env=part.env
+    )
+    writer.end(part.final_state, env=part.env)
+
+
+# ---- lists of episodes
+
+
+def _episodes(given: _Given) -> Iterator[_Part]:
+    """The episodes of lists of arrays."""
+    for i in range(len(given.rewards)):
+        one = _episode(given, i)
+        states, rewards, n = one.states, _array(one.rewards), len(one.rewards)
+        if n == 0:
+            raise StepError(f"episode {i}: expected at least one step, found none")
+        for name in ("actions", "next_states", "infos"):
+            _check_shape(f"episode {i}: {name}", getattr(one, name), (n,), n)
+        _check_shape(f"episode {i}: states", states, (n,), n, n + 1)
+        final = one.final_states
+        if final is None:
+            final = arrays_at(one.next_states, n - 1) if _length(states) == n else arrays_at(states, n)
+        flags = [_episode_flags(one.terminals, n), _episode_flags(one.timeouts, n)]
+        metadata, infos = one.metadata or {}, one.infos or {}
+        yield _Part(
+            0, arrays_at(states, slice(n)), one.actions, rewards, flags[0], flags[1], final, infos, metadata
+        )
+
+
+def _episode(given: _Given, i: int) -> _Given:
+    """The i-th entry of everything that is given."""
+    count, entries = len(given.rewards), []
+    for name, value in given._asdict().items():
+        if value is None or (name == "metadata" and isinstance(value, Mapping)):
+            entries.append(value)
+            continue
+        if isinstance(value, Mapping) or len(value) != count:
+            found = "a dict" if isinstance(value, Mapping) else len(value)
+            raise StepError(f"{name}: expected a list of one for each of {count} episodes, found {found}")
+        entries.append(value[i] if name == "metadata" else map_arrays(value[i], _array))
+    return _Given(*entries)
+
+
+def _episode_flags(given: Any, n: int) -> Array:
+    """Flags of the steps of an episode, of which the last one may be given alone."""
+    if given is not None and given.ndim:
+        return np.asarray(given)
+    flags = np.zeros(n, np.bool_)
+    flags[-1] = given is not None and bool(given)
+    return flags
+
+
+# ---- arrays of steps
+
+
+def _streams(given: _Given, lead: int, mode: str) -> Iterator[_Part]:
+    """The episodes of arrays [T, …] or [T, N, …], one sub-environment after the other."""
+    shape = given.rewards.shape[:lead]
+    for name in ("actions", "next_states", "infos"):
+        _check_shape(name, getattr(given, name), shape, shape[0])
+    _check_shape("states", given.states, shape, shape[0], shape[0] + 1)
+    terminals, timeouts = (
+        _flags("terminals", given.terminals, shape),
+        _flags("timeouts", given.timeouts, shape),
+    )
+    done = terminals | timeouts
+    if not mode and done[:-1].any():
+        step = np.argwhere(done[:-1])[0][0]
+        raise StepError(f"autoreset: an episode ends at step {step}, and the arrays go on; {_CHOOSE}")
+    final_of = _finals(given, done, mode)
+    for env in range(shape[1] if lead == 2 else 1):
+        column = (env,) if lead == 2 else ()
+        for begin, end in _spans(done[:, *column], mode):
+            where = (slice(begin, end + 1), *column)
+            states, actions, infos = (
+                arrays_at(tree, where) for tree in (given.states, given.actions, given.infos or {})
+            )
+            rewards, metadata = given.rewards[where], given.metadata or {}
+            yield _Part(
+                env, states, actions, rewards, terminals[where], timeouts[where], final_of((end, *column)),
+                infos, metadata,
+            )  # fmt: skip
+
+
+def _spans(done: Array, mode: str) -> Iterator[tuple[int, int]]:
+    """First and last step of each episode of one sub-environment."""
+    begin, last = 0, len(done) - 1
+    for end in dict.fromkeys([*np.flatnonzero(done).tolist(), last]):
+        if end >= begin:
+            yield begin, end
+            begin = end + 1 + (mode == "next-step")
+        elif done[end]:
+            raise StepError(
+                f"autoreset: expected a reset at step {end}, after an end, found another end; {_CHOOSE}"
+            )
+
+
+def _finals(given: _Given, done: Array, mode: str) -> Callable[[tuple[int, ...]], Any]:
+    """What gives the final state of an episode, None if it is not known, from the place of its last step."""
+    order = {tuple(place): k for k, place in enumerate(np.argwhere(done).tolist())}
+    if given.final_states is not None:
+        _check_shape("final_states", given.final_states, (len(order),), len(order))
+    steps, known = len(done), _length(given.states)
+
+    def final_of(place: tuple[int, ...]) -> Any:
+        if given.final_states is not None and place in order:
+            return arrays_at(given.final_states, order[place])
+        if given.next_states is not None:
+            return arrays_at(given.next_states, place)
+        after = place[0] + 1
+        is_final = place not in order or mode == "next-step" or (after == steps and mode != "same-step")
+        return arrays_at(given.states, (after, *place[1:])) if is_final and after < known else None
+
+    return final_of
+
+
+def _mode(given: Any) -> str:
+    if given is None:
+        return ""
+    text = str(getattr(given, "value", given)).lower().replace("_", "").replace("-", "").replace(" ", "")
+    if text not in _MODES:
+        raise StepError(f"autoreset: expected one of {', '.join(_MODES.values())}, found {shorten(given)}")
+    return _MODES[text]
+
+
+def _lead(rewards: Array, space: gym.Space[Any] | None) -> int:
+    """How many axes come before those of one step: 1, or 2 with sub-environments."""
+    own = 0 if space is None or space.shape is None else len(space.shape)
+    lead = rewards.ndim - own
+    if lead not in (1, 2) or 0 in rewards.shape[:lead]:
+        raise StepError(
+            f"rewards: expected an array [T] or [T, N] of T > 0 steps, or a list of one for each episode, "
+            f"found shape {rewards.shape}"
+        )
+    return lead
+
+
+def _flags(name: str, given: Any, shape: tuple[int, ...]) -> Array:
+    if given is None:
+        return np.zeros(shape, np.bool_)
+    if given.shape != shape or not (given.dtype == np.bool_ or np.isin(given, (0, 1)).all()):
+        raise StepError(
+            f"{name}: expected flags of shape {shape}, as rewards, found {given.dtype} of {given.shape}"
+        )
+    flags: Array = given.astype(np.bool_)
+    return flags
+
+
+def _check_shape(name: str, tree: Any, shape: tuple[int, ...], *steps: int) -> None:
+    for array in _leaves(tree):
+        if array.shape[: len(shape)] not in [(t, *shape[1:]) for t in steps]:
+            expected = " or ".join(str((t, *shape[1:])) for t in steps)
+            raise StepError(
+                f"{name}: expected arrays that begin with {expected}, as rewards, found {array.shape}"
+            )
+
+
+# ---- trees of arrays
+
+
+def _one_of(name: str, given: Any, other: str, value: Any) -> Any:
+    """What is given under either of two names."""
+    if given is not None and value is not None:
+        raise StepError(f"expected {name} or {other}, which mean the same, found both")
+    return value if given is None else given
+
+
+def _array(value: Any) -> Array:
+    """An array of what holds one, without a copy where that is possible."""
+    if isinstance(value, np.ndarray):
+        return value
+    if hasattr(value, "detach"):  # a tensor that has a gradient, or lies on another device
+        value = value.detach().cpu()
+    if hasattr(value, "__dlpack__"):
+        try:
+            found: Array = np.from_dlpack(value)
+        except (BufferError, TypeError, RuntimeError, ValueError):
+            pass  # what DLPack does not pass on may still be an array
+        else:
+            return found
+    return np.asarray(value)
+
+
+def _leaves(tree: Any) -> list[Array]:
+    if tree is None:
+        return []
+    if isinstance(tree, Mapping):
+        tree = tuple(tree.values())
+    return [leaf for one in tree for leaf in _leaves(one)] if isinstance(tree, tuple) else [tree]
+
+
+def _length(tree: Any) -> int:
+    return min((len(array) for array in _leaves(tree)), default=0)
+
+
+def _space(tree: Any, lead: int, name: str) -> gym.Space[Any]:
+    """A space of what arrays hold behind their first axes."""
+    if isinstance(tree, Mapping):
+        return gym.spaces.Dict({key: _space(value, lead, f"{name}[{key!r}]") for key, value in tree.items()})
+    if isinstance(tree, tuple):
+        return gym.spaces.Tuple([_space(value, lead, f"{name}[{i}]") for i, value in enumerate(tree)])
+    shape, dtype = tree.shape[lead:], tree.dtype
+    if dtype.kind == "b":
+        return gym.spaces.MultiBinary(shape) if shape else gym.spaces.Discrete(2)
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        return gym.spaces.Box(limits.min, limits.max, shape, dtype.type)
+    if dtype.kind == "f":
+        return gym.spaces.Box(-np.inf, np.inf, shape, dtype.type)
+    raise StepError(f"{name}: expected numbers, found {dtype}; pass observation_space and action_space")
