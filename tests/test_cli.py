@@ -192,6 +192,11 @@ class TestRecord:
             assert len(recording) == told["episodes"]
             assert recording.benchmark.record.name == "CartPole-v1"
 
+    def test_a_directory_gets_a_new_file_each_time(self, here: Path) -> None:
+        for _ in range(2):
+            ok("record", "CartPole-v1", "-o", "new/runs/", "--steps", 10)
+        assert len([Recording(path) for path in Path("new/runs").glob("CartPole-v1_*.mcap")]) == 2
+
     def test_modes(self, here: Path) -> None:
         ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 40)
         before = Path("a.mcap").read_bytes()

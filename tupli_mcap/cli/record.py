@@ -61,7 +61,12 @@ def _check_policy(value: str | None) -> str | None:
 
 
 _EnvId = Annotated[str, typer.Argument(metavar="ENV_ID", help="As gymnasium.make takes it.")]
-_Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording (.mcap).")]
+_Output = Annotated[
+    str,  # a Path would lose the slash that says that it is a directory
+    typer.Option(
+        "--output", "-o", metavar="FILE", help="The recording (.mcap), or a directory/, which gets a new file."
+    ),
+]  # fmt: skip
 _Steps = Annotated[int, typer.Option(min=1, help="Steps to record, in total.")]
 _Seed = Annotated[int | None, typer.Option(min=0, help="Of the first reset and of random actions.")]
 _NumEnvs = Annotated[int, typer.Option(min=1, help="Sub-environments side by side.")]
@@ -135,7 +140,7 @@ def record(
         sys.path.append("")  # last: a file that happens to lie here replaces no installed module
     function = None if policy is None else load_policy(policy)
     with (
-        _saying_what_is_safe(output, max_bytes or max_seconds, replaces=mode is _Mode.w),
+        _saying_what_is_safe(Path(output), max_bytes or max_seconds, replaces=mode is _Mode.w),
         step_progress(steps) as progress,
     ):
         summary = record_rollouts(
@@ -179,6 +184,8 @@ def _held(output: Path, limit: float | None) -> str:
     from tupli_mcap.recording import Recording
     from tupli_mcap.recording.file_series import series
 
+    if output.is_dir():
+        return f"what was recorded is in the newest file in {output}"
     first, others = (output, {}) if limit is None else series(output)
     paths = [path for path in (first, *others.values()) if path.exists()]
     episodes = steps = 0
