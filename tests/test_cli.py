@@ -421,12 +421,14 @@ class TestLook:
         shutil.copy(cartpole, here / "deep" / "b.mcap")
         shutil.copy(cartpole, here / "a.mcap")
         header, *rows = ok("ls").splitlines()
-        assert header.split() == ["RECORDING", "EPISODES", "STEPS", "RETURN", "SIZE", "STATE"]
+        assert header.split() == [
+            "RECORDING", "RUN", "ENVIRONMENT", "EPISODES", "STEPS", "RETURN", "STARTED", "SIZE", "STATE",
+        ]  # fmt: skip
         assert [row.split()[0] for row in rows] == ["a.mcap", "deep/b.mcap"]
         with Recording(cartpole) as recording:
             mean = f"{recording.index['return'].mean():.2f}".removesuffix(".00")
             expected = [str(len(recording)), "200", mean]
-        assert rows[0].split()[1:4] == expected
+        assert rows[0].split()[1:6] == ["a", "CartPole-v1", *expected]
         assert rows[0].split()[-1] == "complete"
         (told,) = run("ls", "deep", "--json").json
         assert told["path"] == "deep/b.mcap"
@@ -549,7 +551,10 @@ class TestLook:
             gym.registry.pop("tests/Rewarded-v0")
         assert f"{len(returns)} steps, {told}, " in said
         size = bytes_of(Path("r.mcap").stat().st_size)
-        assert " ".join(ok("ls", "r.mcap").splitlines()[1].split()) == f"r.mcap {row.format(size)}"
+        told_row = ok("ls", "r.mcap", "--columns", "recording,episodes,steps,return,size,state").splitlines()[
+            1
+        ]
+        assert " ".join(told_row.split()) == f"r.mcap {row.format(size)}"
         monkeypatch.setenv("COLUMNS", "60")
         assert ok("ls", "r.mcap").splitlines()[1].startswith("r.mcap ")  # the note is what is cut
         (listed,) = run("ls", "r.mcap", "--json").json

@@ -318,6 +318,7 @@ class TestMerge:
         merge_recordings([one, two], tmp_path / "all.mcap")
         with Recording(tmp_path / "all.mcap") as merged:
             found = {name: merged.read_attachment(name) for name in merged.attachments}
+        assert found.pop("run.json")
         assert found == {"a": b"1", "b": b"2", "c": b"3"}
         other = record(tmp_path / "3.mcap", attachments={"c": ("text/plain", b"?")})
         with pytest.raises(RecordingError, match=r"3\.mcap: its attachment 'c' differs"):

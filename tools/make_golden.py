@@ -29,7 +29,14 @@ from gymnasium.wrappers import FrameStackObservation, TransformObservation
 
 from tupli_mcap import RecordEpisodes, jsonvalue, vector as recorded_vector
 from tupli_mcap.environment import EnvironmentRecord
-from tupli_mcap.recording import EpisodeData, Recording, journal_path, rewrite_recording, write_recording
+from tupli_mcap.recording import (
+    EpisodeData,
+    Recording,
+    annotate_episodes,
+    journal_path,
+    rewrite_recording,
+    write_recording,
+)
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 
 DIRECTORY = Path(__file__).parents[1] / "tests" / "golden"
@@ -191,7 +198,7 @@ def constant(path: Path, compression: str) -> list[Log]:
     }
     with RecordEpisodes(
         env, path, compression=compression, metadata_callback=Score(), benchmark_id="b" * 64,
-        attachments=attachments, chunk_size=400,
+        attachments=attachments, capture="none", chunk_size=400,
     ) as recorder:  # fmt: skip
         roll(recorder, env, [3, 4, 2], action)
     episodes = expected(env)
@@ -212,7 +219,7 @@ def stacked(path: Path, axis: int = 0, **options: Any) -> list[Log]:
             window, lambda frames: np.moveaxis(frames, 0, axis), spaces.Box(0, 255, (2, 3, 3), np.uint8)
         )
     with RecordEpisodes(
-        window, path, compression="none", attachments={}, chunk_size=400, **options
+        window, path, compression="none", attachments={}, capture="none", chunk_size=400, **options
     ) as recorder:
         roll(recorder, env, [3, 4, 2], action)
     episodes = expected(env)
@@ -228,7 +235,7 @@ def png_images(path: Path) -> list[Log]:
     with (
         mock.patch("tupli_mcap.messages.images.png.encode_pixels", stored_png),
         RecordEpisodes(
-            env, path, image_format="png", compression="none", attachments={}, chunk_size=400
+            env, path, image_format="png", compression="none", attachments={}, capture="none", chunk_size=400
         ) as recorder,
     ):
         roll(recorder, env, [3, 4, 2], action)
@@ -264,7 +271,9 @@ def dict_with_images(path: Path) -> list[Log]:
 
     actions = spaces.Tuple((spaces.Discrete(2), spaces.Box(-1, 1, (2, 2), np.float64)))
     env = Played(space, observe, [(3, "terminal"), (5, "timeout")], actions)
-    with RecordEpisodes(env, path, compression="none", attachments={}, chunk_size=300) as recorder:
+    with RecordEpisodes(
+        env, path, compression="none", attachments={}, capture="none", chunk_size=300
+    ) as recorder:
         roll(recorder, env, [3, 5, 2], lambda t: (np.int64(t % 2), np.full((2, 2), t / 3)))
     return expected(env)
 
@@ -300,7 +309,9 @@ def variable(path: Path) -> list[Log]:
         }
 
     env = Played(space, observe, [(4, "terminal"), (3, "timeout")])
-    with RecordEpisodes(env, path, compression="none", attachments={}, chunk_size=700) as recorder:
+    with RecordEpisodes(
+        env, path, compression="none", attachments={}, capture="none", chunk_size=700
+    ) as recorder:
         roll(recorder, env, [4, 3, 2], action)
     return expected(env)
 
@@ -319,7 +330,7 @@ def every_dtype(path: Path) -> list[Log]:
         return {key: values[key] for key in leaves}
 
     env = Played(spaces.Dict(list(leaves.items())), observe, [(3, "timeout")])
-    with RecordEpisodes(env, path, compression="none", attachments={}) as recorder:
+    with RecordEpisodes(env, path, compression="none", attachments={}, capture="none") as recorder:
         roll(recorder, env, [3, 1], action)
     return expected(env)
 
@@ -336,7 +347,12 @@ def widened(path: Path) -> list[Log]:
         reward=lambda t: np.array([t / 4, -1.0], np.float32),
     )
     reward_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
-    options: dict[str, Any] = {"compression": "none", "attachments": {}, "reward_space": reward_space}
+    options: dict[str, Any] = {
+        "compression": "none",
+        "attachments": {},
+        "capture": "none",
+        "reward_space": reward_space,
+    }
     with RecordEpisodes(env, path, **options) as recorder:
         roll(recorder, env, [3], action)
     return expected(env)
@@ -350,7 +366,9 @@ def infos(path: Path) -> list[Log]:
         return {**found, "score": np.arange(t, dtype=np.int8), "missing": None} if t == 2 else found
 
     env = Played(POLE, pole, [(3, "terminal")], info=info)
-    with RecordEpisodes(env, path, compression="none", attachments={}, record_info=names) as recorder:
+    with RecordEpisodes(
+        env, path, compression="none", attachments={}, capture="none", record_info=names
+    ) as recorder:
         roll(recorder, env, [3, 2], action)
     return expected(
         env, infos=lambda log: [{k: v for k, v in one.items() if k in names} for one in log["infos"]]
@@ -364,7 +382,9 @@ def every_info(path: Path) -> list[Log]:
         [(3, "timeout")],
         info=lambda t: {} if t == 1 else {"a": (t, {2.5: b"\0"}), "n": np.float32(np.nan)},
     )
-    with RecordEpisodes(env, path, compression="none", attachments={}, record_info=True) as recorder:
+    with RecordEpisodes(
+        env, path, compression="none", attachments={}, capture="none", record_info=True
+    ) as recorder:
         roll(recorder, env, [3], action)
     return expected(env, infos=lambda log: log["infos"])
 
@@ -377,7 +397,9 @@ def vector(
 ) -> list[Log]:
     envs = [Played(space, observe, [(2 + i, "terminal"), (3, "timeout")]) for i in range(3)]
     inner = gym.vector.SyncVectorEnv([lambda env=env: env for env in envs], autoreset_mode=mode)  # type: ignore[misc]
-    with recorded_vector.RecordEpisodes(inner, path, compression="none", attachments={}) as recorder:
+    with recorded_vector.RecordEpisodes(
+        inner, path, compression="none", attachments={}, capture="none"
+    ) as recorder:
         recorder.reset(seed=11)
         for t in range(9):
             recorder.step(np.array([-1, 0, 1]) if t % 2 else np.array([1, 1, 1]))
@@ -387,7 +409,12 @@ def vector(
 def appended(path: Path) -> list[Log]:
     env = Played(POLE, pole, [(3, "terminal"), (2, "timeout")])
     for mode, lengths in (("x", [3, 1]), ("a", [2, 2])):
-        options: Mapping[str, Any] = {"compression": "none", "attachments": {}, "mode": mode}
+        options: Mapping[str, Any] = {
+            "compression": "none",
+            "attachments": {},
+            "capture": "none",
+            "mode": mode,
+        }
         with RecordEpisodes(env, path, **options) as recorder:
             roll(recorder, env, lengths, action)
     return expected(env)
@@ -396,7 +423,7 @@ def appended(path: Path) -> list[Log]:
 def continued(path: Path) -> list[Log]:
     """Stepped on after an end, without a reset: another episode, which starts at the final state."""
     env = Played(POLE, pole, [(2, "terminal"), (3, "timeout")])
-    with RecordEpisodes(env, path, compression="none", attachments={}) as recorder:
+    with RecordEpisodes(env, path, compression="none", attachments={}, capture="none") as recorder:
         roll(recorder, env, [5, 3], action)
     return expected(env)
 
@@ -410,6 +437,19 @@ def rewritten(path: Path) -> list[Log]:
             extra = {"note": ("text/plain", b"rewritten")}
             rewrite_recording(recording, path, episodes=[0, 2], attachments=extra, compression="none")
     return [episodes[0], episodes[2]]
+
+
+def described(path: Path) -> list[Log]:
+    """A run with a name and settings, and two annotations."""
+    env = Played(POLE, pole, [(3, "terminal"), (2, "timeout")])
+    run: dict[str, Any] = {"name": "ppo-3", "metadata": {"lr": 0.001}, "tags": ["a"], "split": "train"}
+    with RecordEpisodes(env, path, compression="none", attachments={}, capture="none", **run) as recorder:
+        roll(recorder, env, [3, 2], action)
+    with mock.patch("getpass.getuser", return_value="ada"):
+        annotate_episodes(path, {"success": True, "note": "first"}, [0])
+        annotate_episodes(path, {"note": None})
+    first, second = expected(env)
+    return [{**first, "metadata": {"success": True}}, second]
 
 
 def handmade(path: Path) -> list[Log]:
@@ -434,7 +474,7 @@ def bundle(path: Path) -> list[Log]:
         "env.cloudpickle": ("application/octet-stream", code),
         f"artifacts/{hashlib.sha256(artifact).hexdigest()}": ("application/octet-stream", artifact),
     }
-    with RecordEpisodes(env, path, compression="none", attachments=attachments) as recorder:
+    with RecordEpisodes(env, path, compression="none", attachments=attachments, capture="none") as recorder:
         roll(recorder, env, [3, 1], action)
     return expected(env)
 
@@ -446,7 +486,7 @@ def named(path: Path) -> list[Log]:
         "Pole-v0", classes=("poles:Limit", "poles:Pole"), versions={"gymnasium": "1.0"}
     )
     attachments = {"benchmark.json": ("application/json", record.to_json())}
-    with RecordEpisodes(env, path, compression="none", attachments=attachments) as recorder:
+    with RecordEpisodes(env, path, compression="none", attachments=attachments, capture="none") as recorder:
         roll(recorder, env, [3, 1], action)
     return expected(env)
 
@@ -454,7 +494,7 @@ def named(path: Path) -> list[Log]:
 def frames(path: Path) -> list[Log]:
     """A picture of every second state and of each final one; an episode that was cut short, and one appended."""
     env = Painted(POLE, pole, [(3, "terminal"), (4, "timeout"), (9, "terminal")])
-    options: dict[str, Any] = {"compression": "none", "attachments": {}, "chunk_size": 300}
+    options: dict[str, Any] = {"compression": "none", "attachments": {}, "capture": "none", "chunk_size": 300}
     with mock.patch("tupli_mcap.recording.write.frames.encode_picture", stored_png):
         for mode, lengths in (("x", [3, 4, 3]), ("a", [2])):
             with RecordEpisodes(env, path, frames=2, mode=mode, **options) as recorder:  # type: ignore[arg-type]
@@ -471,7 +511,12 @@ def unfinished(path: Path, env: Played, **more: Any) -> list[Log]:
     """What a power loss leaves at the best: a file without a summary, and its journal."""
     with tempfile.TemporaryDirectory() as directory:
         live = Path(directory, path.name)
-        options: dict[str, Any] = {"compression": "none", "attachments": {}, "chunk_size": 400}
+        options: dict[str, Any] = {
+            "compression": "none",
+            "attachments": {},
+            "capture": "none",
+            "chunk_size": 400,
+        }
         with RecordEpisodes(env, live, durability="step", **options, **more) as recorder:
             roll(recorder, env, [3, 4, 2], action)
             keep(live, path)
@@ -500,7 +545,9 @@ def unfinished_holes(path: Path) -> list[Log]:
     env = Silent(POLE, pole, ENDS)
     with tempfile.TemporaryDirectory() as directory, mock.patch(BOOT_ID, return_value=""):
         live = Path(directory, path.name)
-        with RecordEpisodes(env, live, compression="none", attachments={}, chunk_size=400) as recorder:
+        with RecordEpisodes(
+            env, live, compression="none", attachments={}, capture="none", chunk_size=400
+        ) as recorder:
             recorder.reset(seed=7)
             for length in (3, 4, 9, 3, 4, 2):
                 for t in range(length):
@@ -550,6 +597,7 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "stacked_last": lambda path: stacked(path, -1),
     "png_stacks": png_stacks,
     "named": named,
+    "described": described,
 }
 
 

@@ -42,6 +42,11 @@ _RECORDING_OPTIONS = (
     "image_format",
     "max_bytes",
     "max_seconds",
+    "name",
+    "metadata",
+    "tags",
+    "split",
+    "capture",
 )
 
 
@@ -79,7 +84,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         metadata_callback: called with every recorded step; its last result becomes the episode's metadata.
         rl_tuple_cls: the class of the tuples that the callback is given. Recorded are the values themselves.
         recording_options: for `RecordEpisodes`: record_info, step_callback, reward_space, compression,
-            chunk_size, flush_seconds, durability, frames, frame_format, image_format, max_bytes, max_seconds.
+            chunk_size, flush_seconds, durability, frames, frame_format, image_format, max_bytes, max_seconds, name,
+            metadata, tags, split, capture.
 
     Subclasses that keep data outside of the environment override `_serialize` and `_deserialize`. `_serialize` is
     given a copy, made of the pickle when the environment is serialized; nobody closes it.

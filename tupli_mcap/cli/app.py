@@ -210,6 +210,8 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
     },
     "Check": {"doctor": doctor.doctor, "verify": verify.verify},
     "Edit": {
+        "tag": edit.tag,
+        "edit": edit.edit,
         "filter": edit.filter_,
         "merge": edit.merge,
         "split": edit.split,
@@ -235,8 +237,19 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "record": (
         "record CartPole-v1 -o run.mcap --steps 10000 --seed 1",
         "record CartPole-v1 -o run.mcap --num-envs 8 --policy my_agent:act",
+        "record CartPole-v1 -o runs/ --name random --set policy=random",
     ),
-    "ls": ("ls", "ls runs/ lab/"),
+    "ls": (
+        "ls",
+        "ls runs/ --filter 'run.metadata.lr < 1e-3' --sort -return",
+        "ls lab/ --columns run,return,started",
+    ),
+    "tag": (
+        "tag run.mcap --episodes 3,7 success=true note='gripper slipped'",
+        "tag run.mcap --filter 'return > 100' quality=good",
+        "tag run.mcap --undo",
+    ),
+    "edit": ("edit run.mcap --name ppo-seed3 --set lr=0.0003 --tag baseline",),
     "info": ("info run.mcap",),
     "episodes": ("episodes run.mcap --filter 'return > 100'", "episodes lab/ --limit 20 --json"),
     "view": ("view run.mcap", "view run.mcap --episodes best,worst --compare", "view lab/ --web"),

@@ -1,4 +1,4 @@
-"""Commands that make new recordings of others: merge, split, filter, recover."""
+"""Commands that change what recordings say (tag, edit), or make new ones of them (merge, split, filter, recover)."""
 
 from __future__ import annotations
 
@@ -7,14 +7,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import Column, bytes_of, counted, number, print_json, print_table, print_wrapped
+from tupli_mcap.cli.options import FilterText, Json, filter_of, pair_of
+from tupli_mcap.cli.output import (
+    Column,
+    bytes_of,
+    counted,
+    number,
+    print_facts,
+    print_json,
+    print_table,
+    print_wrapped,
+)
 from tupli_mcap.cli.terminal import say
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import RecoveryReport
 
-__all__ = ["filter_", "merge", "recover", "split"]
+__all__ = ["edit", "filter_", "merge", "recover", "split", "tag"]
 
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The new recording (.mcap).")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
@@ -78,6 +87,89 @@ def split(
     columns = (Column("RECORDING", shrink="start"), Column("EPISODES", "right"), Column("STEPS", "right"))
     rows = [(str(part.path), number(part.episodes), number(part.steps)) for part in parts]
     print_table(columns, rows, empty="nothing to split")
+
+
+def tag(
+    files: Annotated[
+        list[str], typer.Argument(metavar="FILE|KEY=VALUE", help="Recordings, and what to say.")
+    ],
+    episodes: Annotated[
+        str | None,
+        typer.Option("--episodes", "--episode", metavar="3,7", help="Numbers, best, last, …; all else."),
+    ] = None,
+    filter_text: FilterText = None,
+    undo: Annotated[bool, typer.Option("--undo", help="Take back what was said last.")] = False,
+    dry_run: _DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Say more about episodes, such as success=true.
+
+    Values count more than the metadata that were recorded, in filters and tables too. They are JSON where they look
+    like it, else texts; KEY= takes a key away. The end of a file is written anew, its steps are not touched; who said
+    it and when is kept. A signature is left out.
+    """
+    from tupli_mcap.dataset.which import choose_episodes
+    from tupli_mcap.recording import Recording, annotate_episodes, undo_annotation
+
+    paths = [Path(text) for text in files if "=" not in text]
+    values = dict(pair_of(text) for text in files if "=" in text)
+    if not paths or bool(values) == undo:
+        raise typer.BadParameter(
+            "give recordings, and KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 success=true"
+        )
+    wanted, done = filter_of(filter_text), []
+    for path in paths:
+        if undo:
+            last = undo_annotation(path, dry_run=dry_run)
+            done.append({"path": str(path), "episodes": last.episodes, "undone": last.values})
+            continue
+        with Recording(path) as recording:
+            chosen = [episode.number for episode in choose_episodes(recording, episodes or "all", wanted)]
+        annotate_episodes(path, values, chosen, dry_run=dry_run)
+        done.append({"path": str(path), "episodes": chosen, "values": values})
+    if as_json:
+        print_json([{"dry_run": dry_run, **one} for one in done])
+        return
+    for one in done:
+        would = "would be " if dry_run else ""
+        say(
+            f"{one['path']}: {counted(len(one['episodes']), 'episode')} {would}{'undone' if undo else 'annotated'}"
+        )
+
+
+def edit(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
+    name: Annotated[str | None, typer.Option(help="Of the run.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Of the run's metadata; KEY= removes it."),
+    ] = None,
+    tags: Annotated[
+        list[str] | None, typer.Option("--tag", help="Of the run, in place of those it has.")
+    ] = None,
+    run_split: Annotated[str | None, typer.Option("--split", help="train, eval, …")] = None,
+    dry_run: _DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Change what a recording says of its run.
+
+    The recording keeps its identity; the end of the file is written anew, its steps are not touched. A signature is
+    left out.
+    """
+    from tupli_mcap.recording import edit_run
+
+    if name is None and not settings and tags is None and run_split is None:
+        raise typer.BadParameter("give what to change: --name, --set KEY=VALUE, --tag or --split")
+    metadata = dict(pair_of(text) for text in settings or ())
+    run = edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry_run)
+    if as_json:
+        print_json({"dry_run": dry_run, "path": str(file), "run": run.as_dict()})
+        return
+    from tupli_mcap.jsonvalue import shown
+
+    facts = {"run": run.name, "split": run.split, "tags": ", ".join(run.tags)}
+    facts |= {key: shown(value) for key, value in run.metadata.items()}
+    print_facts([(key, text) for key, text in facts.items() if text])
 
 
 def filter_(

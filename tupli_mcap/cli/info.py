@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,12 +27,14 @@ from tupli_mcap.cli.output import (
 from tupli_mcap.cli.terminal import can_print, fail, say, terminal_width
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+    from typing import Any
 
     from tupli_mcap.recording import Recording
     from tupli_mcap.recording.description import RecordingDescription, Spread
     from tupli_mcap.recording.series import Series
     from tupli_mcap.schema import EpisodeHeader
+    from tupli_mcap.storage.listing import ListedRecording
 
 __all__ = ["episodes", "info", "ls", "print_episodes", "sparkline"]
 
@@ -40,6 +44,10 @@ PLAIN = ".:-=+*#@"  # where blocks cannot be printed
 _WIDEST, _NARROWEST = 40, 8
 _OTHERS = 44  # columns of a line beside its blocks
 _LONGEST_NAME = 24
+_LS_COLUMNS = {  # column of `ls`: field of `ListedRecording`
+    "recording": "path", "run": "name", "environment": "environment", "episodes": "episodes", "steps": "steps",
+    "return": "return_mean", "success": "success", "started": "started", "size": "size", "state": "state",
+}  # fmt: skip
 
 
 def ls(
@@ -47,41 +55,110 @@ def ls(
         list[Path] | None,
         typer.Argument(metavar="PATH", help="Files, directories, storages; here by default.", readable=False),
     ] = None,
+    filter_text: FilterText = None,
+    sort: Annotated[
+        str | None, typer.Option(metavar="COLUMN", help="Order by a column; -COLUMN puts the largest first.")
+    ] = None,
+    columns: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help=f"Which columns, of {', '.join(_LS_COLUMNS)}.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """List recordings in files and directories.
+    """List recordings in files and directories: their runs.
 
     RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; or recovered:
     its writer was killed or failed, and all steps that were finished are there, if its journal is.
-    Deleted episodes of a storage are not counted.
+    Deleted episodes of a storage are not counted; with --filter, only episodes that it is true of are.
     """
-    from tupli_mcap.recording.description import nan_text
     from tupli_mcap.storage.listing import list_recordings
 
-    listed = list(list_recordings(paths or [Path()]))
+    wanted = filter_of(filter_text)
+    choose = None
+    if wanted is not None:
+        from tupli_mcap.dataset.which import candidates
+
+        choose = partial(candidates, filter=wanted)
+    listed = list(list_recordings(paths or [Path()], choose))
     good = [item for item in listed if item.error is None]
-    if as_json:
-        print_json([item._asdict() for item in listed])
-    else:
-        columns = (
-            Column("RECORDING", shrink="start"),
-            *(Column(title, "right") for title in ("EPISODES", "STEPS", "RETURN", "SIZE")),
-            Column("STATE"),
-            Column("NOTE ON RETURN", shrink="end"),
+    if sort is not None:
+        key = _column_key(sort.removeprefix("-"))
+        values = [(key(item), item) for item in good]
+        known = sorted(
+            (pair for pair in values if pair[0] is not None), key=itemgetter(0), reverse=sort.startswith("-")
         )
-        means = numbers([None if r.return_nan == r.episodes else r.return_mean for r in good])
-        notes = [nan_text(r.return_nan, r.episodes) for r in good]
-        rows = [
-            (short_ids(r.path), number(r.episodes), number(r.steps), mean, bytes_of(r.size), r.state, note)
-            for r, mean, note in zip(good, means, notes, strict=True)
-        ]
-        if good or not listed:
-            print_table(columns, rows, empty="no recordings")
+        good = [item for _, item in [*known, *(pair for pair in values if pair[0] is None)]]
     bad = [item for item in listed if item.error is not None]
+    if as_json:
+        print_json(
+            [item._asdict() for item in [*good, *bad]] if sort else [item._asdict() for item in listed]
+        )
+    elif good or not listed:
+        _print_runs(good, _chosen_columns(columns, good))
     for item in bad:
         fail(item.error or "")
     if bad:
         raise typer.Exit(1)
+
+
+def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[str]:
+    if text is not None:
+        names = [name.strip().lower() for name in text.split(",")]
+        for name in names:
+            _column_key(name)
+        return names
+    roomy = (terminal_width() or _ROOMY) >= _ROOMY
+    names = ["recording", *(["run", "environment"] * roomy), "episodes", "steps", "return"]
+    names += ["success"] * any(item.success is not None for item in items)
+    return [*names, *(["started"] * roomy), "size", "state"]
+
+
+def _column_key(name: str) -> Callable[[ListedRecording], Any]:
+    """What a column is ordered by."""
+    field = _LS_COLUMNS.get(name.lower())
+    if field is None:
+        from tupli_mcap.errors import did_you_mean
+
+        raise typer.BadParameter(
+            f"there is no column {name!r}{did_you_mean(name, list(_LS_COLUMNS))}; there are {', '.join(_LS_COLUMNS)}"
+        )
+
+    def key(item: ListedRecording) -> Any:
+        value = getattr(item, field)
+        return None if isinstance(value, float) and math.isnan(value) else value
+
+    return key
+
+
+def _print_runs(items: Sequence[ListedRecording], names: Sequence[str]) -> None:
+    from tupli_mcap.recording.description import nan_text
+
+    means = numbers([None if r.return_nan == r.episodes else r.return_mean for r in items])
+    columns, cells = [], []
+    for name in names:
+        left = {"recording": "start", "run": "end", "environment": "end"}.get(name)
+        if name in ("recording", "run", "environment", "started", "state"):
+            columns.append(Column(name.upper(), shrink=left))  # type: ignore[arg-type]
+        else:
+            columns.append(Column(name.upper(), "right"))
+        cells.append(
+            {
+                "recording": lambda: [short_ids(r.path) for r in items],
+                "run": lambda: [r.name for r in items],
+                "environment": lambda: [r.environment for r in items],
+                "episodes": lambda: [number(r.episodes) for r in items],
+                "steps": lambda: [number(r.steps) for r in items],
+                "return": lambda: means,
+                "success": lambda: ["" if r.success is None else f"{r.success:.0%}" for r in items],
+                "started": lambda: [when(r.started) for r in items],
+                "size": lambda: [bytes_of(r.size) for r in items],
+                "state": lambda: [r.state for r in items],
+            }[name]()
+        )
+    notes = [nan_text(r.return_nan, r.episodes) for r in items]
+    if any(notes) and "return" in names:
+        columns.append(Column("NOTE ON RETURN", shrink="end"))
+        cells.append(notes)
+    print_table(columns, list(zip(*cells, strict=True)), empty="no recordings")
 
 
 def info(
@@ -208,6 +285,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)
     return [
         ("recording", d.name),
+        *_run_facts(d.run),
         ("state", states[d.state]),
         ("uuid", d.uuid),
         ("made", f"{time_of(d.created_ns)} by {d.library}"),
@@ -220,8 +298,28 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),
         ("steps", f"{d.steps:,}{_spread_text(d.lengths, d.episodes, ' an episode')}"),
         *([("return", _spread_text(d.returns, d.episodes).removeprefix(", "))] if d.returns else []),
+        *([] if d.success is None else [("success", f"{d.success:.0%} of the episodes that say it")]),
+        *([("metadata", ", ".join(d.metadata_keys))] if d.metadata_keys else []),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
+
+
+def _run_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
+    """What is known of the run, as far as other lines do not say it."""
+    git = run.get("git", {})
+    facts = {
+        "run": run.get("name", ""),
+        "split": run.get("split", ""),
+        "tags": ", ".join(run.get("tags", ())),
+        "settings": ", ".join(f"{key}={_short(value)}" for key, value in run.get("metadata", {}).items()),
+        "command": " ".join(run.get("command", ())),
+        "commit": f"{git.get('commit', '')!s:.12}{', with changes' if git.get('dirty') else ''}"
+        if git
+        else "",
+        "host": run.get("host", ""),
+        "versions": ", ".join(f"{name} {version}" for name, version in run.get("versions", {}).items()),
+    }
+    return [(name, text) for name, text in facts.items() if text]
 
 
 def _spread_text(spread: Spread | None, episodes: int, of: str = "") -> str:

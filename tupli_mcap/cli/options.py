@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tupli_mcap.storage import FileStorage
 
 __all__ = [
-    "FilterText", "Json", "Limit", "StoragePath", "filter_of", "full_id", "open_storage"
+    "FilterText", "Json", "Limit", "StoragePath", "filter_of", "full_id", "open_storage", "pair_of"
 ]  # fmt: skip
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead.")]
@@ -38,6 +38,22 @@ def filter_of(text: str | None) -> BaseFilter | None:
     from tupli_mcap.schema import parse_filter
 
     return parse_filter(text)
+
+
+def pair_of(text: str) -> tuple[str, Any]:
+    """KEY=VALUE; the value is None where there is none, JSON where it looks like it, else a text."""
+    from tupli_mcap import jsonvalue
+    from tupli_mcap.errors import FormatError
+
+    key, sign, value = text.partition("=")
+    if not sign or not key:
+        raise typer.BadParameter(f"expected KEY=VALUE, found {text!r}")
+    if not value:
+        return key, None
+    try:
+        return key, jsonvalue.loads(value)
+    except (FormatError, ValueError, RecursionError):
+        return key, value
 
 
 def open_storage(path: Path, *, create: bool = False) -> FileStorage:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import Json
+from tupli_mcap.cli.options import Json, pair_of
 from tupli_mcap.cli.output import bytes_of, counted, number, print_json
 from tupli_mcap.cli.terminal import say, step_progress
 from tupli_mcap.errors import TupliError
@@ -54,6 +54,12 @@ class _CaptureEnv(StrEnum):
         return None if self is _CaptureEnv.none else "pickle" if self is _CaptureEnv.pickle else "spec"
 
 
+class _Capture(StrEnum):
+    all = "all"
+    versions = "versions"
+    none = "none"
+
+
 def _check_policy(value: str | None) -> str | None:
     if value is not None and not all(value.partition(":")[::2]):
         raise typer.BadParameter(f"expected module:function, found {value!r}")
@@ -62,11 +68,11 @@ def _check_policy(value: str | None) -> str | None:
 
 _EnvId = Annotated[str, typer.Argument(metavar="ENV_ID", help="As gymnasium.make takes it.")]
 _Output = Annotated[
-    str,  # a Path would lose the slash that says that it is a directory
+    str,
     typer.Option(
-        "--output", "-o", metavar="FILE", help="The recording (.mcap), or a directory/, which gets a new file."
+        "--output", "-o", metavar="FILE|DIR/", help="The recording (.mcap), or where a new one is made."
     ),
-]  # fmt: skip
+]
 _Steps = Annotated[int, typer.Option(min=1, help="Steps to record, in total.")]
 _Seed = Annotated[int | None, typer.Option(min=0, help="Of the first reset and of random actions.")]
 _NumEnvs = Annotated[int, typer.Option(min=1, help="Sub-environments side by side.")]
@@ -104,6 +110,19 @@ _MaxSeconds = Annotated[
     typer.Option(min=0.001, help="The same after so many seconds; a running episode stays whole."),
 ]
 
+_Name = Annotated[str | None, typer.Option(metavar="NAME", help="What the run is called.")]
+_Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Metadata of the run; may be repeated.")
+]
+_Tag = Annotated[
+    list[str] | None, typer.Option("--tag", metavar="WORD", help="For the run; may be repeated.")
+]
+_Split = Annotated[str, typer.Option("--split", metavar="WORD", help="train, eval, …")]
+_CaptureOption = Annotated[
+    _Capture,
+    typer.Option("--capture", help="What the file says of this process: command, commit, host, versions."),
+]
+
 
 def record(
     env_id: _EnvId,
@@ -122,6 +141,11 @@ def record(
     capture_env: _CaptureEnvOption = _CaptureEnv.spec,
     max_bytes: _MaxBytes = None,
     max_seconds: _MaxSeconds = None,
+    name: _Name = None,
+    settings: _Set = None,
+    tags: _Tag = None,
+    run_split: _Split = "",
+    capture: _CaptureOption = _Capture.all,
     as_json: Json = False,
 ) -> None:
     """Record rollouts of an environment.
@@ -147,7 +171,8 @@ def record(
             env_id, output, steps=steps, seed=seed, num_envs=num_envs, policy=function, mode=mode.value,
             compression=compression.value, record_info=record_info, durability=durability.value, live=live,
             frames=every if frames else False, capture_env=capture_env.argument, max_bytes=max_bytes,
-            max_seconds=max_seconds, progress=progress,
+            max_seconds=max_seconds, name=name, metadata=dict(map(pair_of, settings or ())), tags=tags or (),
+            split=run_split, capture=capture.value, progress=progress,
         )  # fmt: skip
     _print_rollout(summary, as_json=as_json)
 
@@ -185,7 +210,7 @@ def _held(output: Path, limit: float | None) -> str:
     from tupli_mcap.recording.file_series import series
 
     if output.is_dir():
-        return f"what was recorded is in the newest file in {output}"
+        return f"tupli-mcap ls {output} lists what was recorded"
     first, others = (output, {}) if limit is None else series(output)
     paths = [path for path in (first, *others.values()) if path.exists()]
     episodes = steps = 0

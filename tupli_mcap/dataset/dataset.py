@@ -228,15 +228,21 @@ class Dataset(RandomAccess):
         return self._of(found)
 
     def _check_metadata(self, wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
-        """Raises FilterError if a filter that is true of no episode names metadata that none of them has."""
-        known = {key for header in among for key in header.metadata}
+        """Raises FilterError if a filter that is true of no episode names metadata or facts of runs that none of them
+        has."""
+        known = {
+            ("metadata",): {key for header in among for key in header.metadata},
+            ("run",): {key for header in among for key in header.run},
+            ("run", "metadata"): {key for header in among for key in header.run.get("metadata", {})},
+        }
         for comparison in comparisons(wanted) if among else ():
-            name, *inside = path_in(comparison.key or "", EpisodeHeader)
-            if name == "metadata" and inside and inside[0] not in known:
-                raise FilterError(
-                    f"no episode has {comparison.key}{did_you_mean(inside[0], known)}; "
-                    f"their metadata have {', '.join(sorted(known)) or 'no keys'}"
-                )
+            path = path_in(comparison.key or "", EpisodeHeader)
+            for there, keys in known.items():
+                if path[:-1][: len(there)] == there and path[len(there)] not in keys:
+                    raise FilterError(
+                        f"no episode has {comparison.key}{did_you_mean(path[len(there)], keys)}; "
+                        f"{'.'.join(there)} has {', '.join(sorted(keys)) or 'no keys'}"
+                    )
 
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
         """The episodes in the order of a key ("return", "steps", "metadata.score"), or of a function of an `Episode`.
@@ -300,11 +306,14 @@ class Dataset(RandomAccess):
     def keys(self) -> list[str]:
         """What filters, `sort` and `split` may name: the facts about episodes, and the metadata that some have."""
         own = {"metadata." + key for header in self._headers for key in header.metadata}
-        return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own | {"run"})
+        runs = {id(header.run): header.run for header in self._headers}.values()
+        own |= {"run." + key for run in runs for key in run if key != "metadata"}
+        own |= {"run.metadata." + key for run in runs for key in run.get("metadata", {})}
+        return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own)
 
     def _value(self, header: EpisodeHeader, key: str) -> Any:
-        if key == "run":
-            return header.id.partition("-")[0]
+        if key == "run":  # of files without a run, each is one
+            return header.run.get("id") or header.id.partition("-")[0]
         value = look_up(header, path_in(key, EpisodeHeader))
         return None if value is MISSING else value
 

@@ -227,8 +227,9 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
     ]
     columns.append(iso_utc_each(index["end_time"]))
     uuid, benchmark_id = recording.uuid, recording.benchmark_id
-    for number, env, length, end, total, has_seed, seed, ended, metadata in zip(
-        *columns, recording.all_metadata(), strict=True
+    runs = [run.as_dict() for run in recording.runs]
+    for number, env, length, end, total, has_seed, seed, ended, metadata, run in zip(
+        *columns, recording.all_metadata(), recording.run_places, strict=True
     ):
         if number in deleted:
             continue
@@ -249,6 +250,7 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
                 "env": env,
                 "episode": number,
                 "recording": name,
+                "run": runs[run],
             }
         )
 

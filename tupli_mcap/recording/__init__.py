@@ -4,6 +4,7 @@ recording, episode, frames    `Recording`, and what it gives
 open, contents                opening a file: everything that is known of it then
 index, limits                 the episode index, and whether it can be true
 channels, file_series         the channels that a layout needs; the files of a series
+run, annotations              what is said of the run, and of episodes afterwards
 description, series           what `info` shows
 blocks                        whole episodes in bounded memory
 signature_file                the attachment that a signature is
@@ -20,9 +21,11 @@ from tupli_mcap.journal.file import journal_path
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.episode import Episode, Episodes, Step
 from tupli_mcap.recording.recording import RecordedBenchmark, Recording
+from tupli_mcap.recording.run import Run
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.check.verify import Problem, VerifyReport, verify_recording
+    from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation
     from tupli_mcap.recording.edit.merge import MergeReport, Part, merge_recordings, split_recording
     from tupli_mcap.recording.edit.repair import RecoveryReport, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording
@@ -36,10 +39,13 @@ _HOMES = {
     "Problem": "check.verify",
     "RecoveryReport": "edit.repair",
     "VerifyReport": "check.verify",
+    "annotate_episodes": "edit.annotate",
+    "edit_run": "edit.annotate",
     "merge_recordings": "edit.merge",
     "recover_recording": "edit.repair",
     "rewrite_recording": "edit.rewrite",
     "split_recording": "edit.merge",
+    "undo_annotation": "edit.annotate",
     "verify_recording": "check.verify",
     "write_recording": "write.from_values",
 }
@@ -55,13 +61,17 @@ __all__ = [
     "RecordedBenchmark",
     "Recording",
     "RecoveryReport",
+    "Run",
     "Step",
     "VerifyReport",
+    "annotate_episodes",
+    "edit_run",
     "journal_path",
     "merge_recordings",
     "recover_recording",
     "rewrite_recording",
     "split_recording",
+    "undo_annotation",
     "verify_recording",
     "write_recording",
 ]

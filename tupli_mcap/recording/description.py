@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from tupli_mcap import signing
+from tupli_mcap import jsonvalue, signing
+from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
@@ -26,6 +27,7 @@ __all__ = [
     "nan_text",
     "spread_of",
     "state_of",
+    "success_rate",
 ]
 
 
@@ -61,6 +63,7 @@ class RecordingDescription:
         an episode.
     compression: bytes of messages for one byte of chunks in the file; None without a chunk.
     ends: episodes by how they ended. environment: the name its benchmark says, None if it carries none.
+    run: what is known of the run. metadata_keys: those that episodes have. success: see `success_rate`.
     signed_by: the fingerprint of the key that its signature names, unchecked; None if it is not signed.
     """
 
@@ -75,6 +78,9 @@ class RecordingDescription:
     benchmark_id: str
     environment: str | None
     signed_by: str | None
+    run: dict[str, Any]
+    metadata_keys: list[str]
+    success: float | None
     num_envs: int
     episodes: int
     steps: int
@@ -112,6 +118,9 @@ def describe(recording: Recording) -> RecordingDescription:
         benchmark_id=recording.benchmark_id,
         environment=recording.benchmark.record.name if carried else None,
         signed_by=claimed_signer(recording),
+        run={key: value for key, value in vars(recording.run).items() if value},
+        metadata_keys=_metadata_keys(recording),
+        success=success_rate(recording, np.arange(len(rows))),
         num_envs=recording.num_envs,
         episodes=len(rows),
         steps=recording.num_steps,
@@ -131,6 +140,29 @@ def state_of(recording: Recording) -> str:
     if recording.complete:
         return "complete"
     return "recording" if recording.path is not None and is_locked(recording.path) else "recovered"
+
+
+def _metadata_keys(recording: Recording) -> list[str]:
+    texts = set(recording.all_metadata()) - {"{}"}
+    found: dict[str, None] = {}
+    for text in texts:
+        found.update(dict.fromkeys(jsonvalue.loads(text)))
+    return sorted(found)
+
+
+def success_rate(recording: Recording, positions: Array) -> float | None:
+    """The share of some episodes that succeeded, among those whose metadata say `success` or `is_success`; None if none
+    do."""
+    texts = recording.all_metadata()
+    said = []
+    for i in positions.tolist():
+        if 'success"' not in texts[i]:
+            continue
+        metadata = recording.episode_metadata(i)
+        value = metadata.get("success", metadata.get("is_success"))
+        if isinstance(value, bool | int | float) and value in (0, 1):
+            said.append(bool(value))
+    return sum(said) / len(said) if said else None
 
 
 def describe_space(space: gym.Space[Any]) -> str:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.columns.read import Columns
     from tupli_mcap.recording.frames import Frames
     from tupli_mcap.recording.recording import Recording
+    from tupli_mcap.recording.run import Run
 
 __all__ = ["Episode", "Episodes", "Step", "item_getter", "reward_getter"]
 
@@ -131,10 +132,24 @@ class Episode(GymnasiumNames):
         """Wall clock of the end (ns)."""
         return int(self._row["end_time"])
 
+    @property
+    def run(self) -> Run:
+        """The run it is of."""
+        return self._recording.run_of(self._position)
+
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """What the metadata callback returned last."""
+        """What the metadata callback returned last, and what annotations say."""
         return self._recording.episode_metadata(self._position)
+
+    def annotate(self, **values: Any) -> None:
+        """Says more about the episode, in its file: `annotate(success=True, note="gripper slipped")`.
+
+        Values count more than the metadata that were recorded; None takes a key away. See `annotate_episodes`, which
+        says it of many episodes at once.
+        """
+        self._recording.annotate([self.number], values)
+        self.__dict__.pop("metadata", None)
 
     @cached_property
     def start(self) -> EpisodeStart:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from functools import cached_property
+from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, BinaryIO, NamedTuple
 
@@ -14,7 +16,7 @@ from mcap.records import Channel
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
-from tupli_mcap.errors import FormatError, RecordingError, memory_for
+from tupli_mcap.errors import FormatError, RecordingError, TupliError, memory_for
 from tupli_mcap.mcap.records import BODY, read_attachment
 from tupli_mcap.mcap.source import Source, open_source
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA, EpisodeStart
@@ -22,6 +24,7 @@ from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
+from tupli_mcap.recording.annotations import ANNOTATIONS_NAME, Annotations
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.fields import FIVE, field_names
 from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
@@ -31,6 +34,7 @@ from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.frames import Cameras, Frames
 from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
 from tupli_mcap.recording.open import read_contents
+from tupli_mcap.recording.run import MAX_RUN, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, voucher
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf
@@ -310,10 +314,82 @@ class Recording:
         signature = self.read_attachment(SIGNATURE_NAME) if SIGNATURE_NAME in self.attachments else None
         return RecordedBenchmark(self.benchmark_id, record, signature)
 
+    # ---- what somebody says about it
+
+    @property
+    def run(self) -> Run:
+        """The run it is of; of a recording made of several, the first one. `run_of` says which an episode is of."""
+        return self.runs[0]
+
+    @cached_property
+    def runs(self) -> list[Run]:
+        """The runs that it is of, more than one where it was made of other recordings.
+
+        Raises:
+            FormatError: what it says of them is damaged.
+        """
+        rows = self.index
+        ended = int(rows["end_time"].max()) if len(rows) else 0
+        name, environment = PurePosixPath(self.name).stem, self._environment_name
+        said = self.recorded_runs
+        return [run.known_as(name, environment, self.created_ns, ended) for run in said.runs]
+
+    @cached_property
+    def run_places(self) -> list[int]:
+        """For each episode, which of `runs` it is of."""
+        return self.recorded_runs.places(len(self.index))
+
+    def run_of(self, i: int) -> Run:
+        """The run of episode `i`."""
+        return self.runs[self.run_places[i]]
+
+    @cached_property
+    def recorded_runs(self) -> RecordedRuns:
+        """`runs` as `run.json` has them: empty where the recording does not say it."""
+        info = self.attachments.get(RUN_NAME)
+        if info is None:
+            return RecordedRuns([Run()])
+        where = f"{self.name}: {RUN_NAME}"
+        if info.size > MAX_RUN:
+            raise FormatError(f"{where}: expected at most {MAX_RUN} bytes, found {info.size}")
+        return RecordedRuns.from_json(self.read_attachment(RUN_NAME), where)
+
+    @property
+    def _environment_name(self) -> str:
+        with contextlib.suppress(TupliError):  # damaged, which opening it says
+            return self.benchmark.record.name
+        return ""
+
+    @cached_property
+    def annotations(self) -> Annotations:
+        """What was said about its episodes after they were recorded; FormatError if that is damaged."""
+        if ANNOTATIONS_NAME not in self.attachments:
+            return Annotations()
+        return Annotations(self.read_attachment(ANNOTATIONS_NAME), f"{self.name}: {ANNOTATIONS_NAME}")
+
+    def annotate(self, episodes: Sequence[int] | None, values: Mapping[str, Any]) -> None:
+        """Gives episodes (their numbers; None: all) values that count more than the metadata that were recorded.
+
+        Raises:
+            RecordingError: it has no path; otherwise as `annotate_episodes`.
+        """
+        from tupli_mcap.recording.edit.annotate import annotate_episodes
+
+        if self.path is None:
+            raise RecordingError(f"{self.name} is no file that can be changed; fetch it, and open the copy")
+        annotate_episodes(self.path, values, episodes)
+        with Recording(self.path) as changed:
+            self.annotations = changed.annotations
+
     # ---- episodes
 
     def episode_metadata(self, i: int) -> dict[str, Any]:
-        """The metadata of episode `i`."""
+        """The metadata of episode `i`, with what was said about it later."""
+        number = int(self.index["episode"][i])
+        return self.annotations.applied(number, self.recorded_metadata(i))
+
+    def recorded_metadata(self, i: int) -> dict[str, Any]:
+        """The metadata of episode `i` as they were recorded."""
         value = jsonvalue.loads(self._contents.index.metadata_text(i))
         if not isinstance(value, dict):
             raise FormatError(
@@ -323,7 +399,12 @@ class Recording:
 
     def all_metadata(self) -> list[str]:
         """The metadata of all episodes as JSON texts; "{}" where there is none."""
-        return [self._contents.index.metadata_text(i) for i in range(len(self.index))]
+        texts = [self._contents.index.metadata_text(i) for i in range(len(self.index))]
+        if self.annotations.said:
+            for i, number in enumerate(self.index["episode"].tolist()):
+                if self.annotations.of(number):
+                    texts[i] = jsonvalue.dumps(self.episode_metadata(i))
+        return texts
 
     def episode_start(self, i: int) -> EpisodeStart:
         """The `/episode_start` message of episode `i`."""

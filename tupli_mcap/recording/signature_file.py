@@ -30,8 +30,9 @@ _MAX_BYTES = 16 << 20
 # Names what is signed, so that nobody's key can be made to sign something else that looks like a manifest.
 _PURPOSE = b"tupli_mcap signature v1\0"
 _HEX_KEY = r"^[0-9a-f]{64}$"
-# What an environment is rebuilt from must be signed; other attachments may be added later.
-_COVERED_KINDS = ("benchmark.json", "env.cloudpickle", "artifacts/")
+# What an environment is rebuilt from, and what is said of runs and episodes, must be signed; other attachments may be
+# added later.
+_COVERED_KINDS = ("benchmark.json", "env.cloudpickle", "artifacts/", "run.json", "annotations.json")
 
 
 class _Document(BaseModel):

@@ -28,9 +28,10 @@ from tupli_mcap.schema.models import EpisodeHeader
 from tupli_mcap.schema.times import EXPECTED, TimeSpan, span_of
 from tupli_mcap.schema.values import Scalar, classify
 
-__all__ = ["TIME_KEY", "bound", "check_keys", "comparisons", "filter_keys", "path_in"]
+__all__ = ["TIME_PATHS", "bound", "check_keys", "comparisons", "filter_keys", "path_in"]
 
 TIME_KEY: Final = "created_at"
+TIME_PATHS: Final = ((TIME_KEY,), ("run", "started"), ("run", "ended"))
 _MEANT: Final[Mapping[str, str]] = {"ended": TIME_KEY, "return": "episode_return", "steps": "n_tuples"}
 _ENDS: Final = ("terminal", "timeout", "interrupted", "")
 _KINDS: Final[Mapping[Any, str]] = {
@@ -113,8 +114,8 @@ def _bound(filter: BaseFilter, model: type[BaseModel], now: datetime.datetime) -
         parts = tuple(_bound(part, model, now) for part in filter.filters)
         return filter.model_copy(update={"filters": parts})
     name, *inside = path = path_in(filter.key or "", model)
-    if name == TIME_KEY and not inside:
-        return _in_time(filter, now)
+    if path in TIME_PATHS:
+        return _in_time(filter, join_key(path), now)
     kinds = _kinds_of(model, name)
     if inside and kinds:
         raise FilterError(f"filter key {filter.key!r}: {name} is {_one_of(kinds)} and has no parts")
@@ -149,29 +150,27 @@ def _may_be(kinds: frozenset[str], scalar: Scalar, ordered: bool) -> bool:
     return scalar.kind in kinds
 
 
-def _in_time(filter: BaseFilter, now: datetime.datetime) -> BaseFilter:
-    """A comparison with times, as comparisons of `created_at` with nanoseconds."""
+def _in_time(filter: BaseFilter, key: str, now: datetime.datetime) -> BaseFilter:
+    """A comparison with times, as comparisons of `key` with nanoseconds."""
+
+    def within(span: TimeSpan) -> BaseFilter:
+        return FilterAND(filters=[FilterGEQ(key=key, value=span.start), FilterLT(key=key, value=span.stop)])
+
     if filter.type is FilterType.IN:
-        return FilterOR(filters=[_within(_time(filter, value, now)) for value in filter.value])
+        return FilterOR(filters=[within(_time(filter, value, now)) for value in filter.value])
     span = _time(filter, filter.value, now)
     match filter.type:
         case FilterType.EQ:
-            return _within(span)
+            return within(span)
         case FilterType.NE:
-            return FilterNOT(filters=[_within(span)])
+            return FilterNOT(filters=[within(span)])
         case FilterType.GT:
-            return FilterGEQ(key=TIME_KEY, value=span.stop)
+            return FilterGEQ(key=key, value=span.stop)
         case FilterType.GEQ:
-            return FilterGEQ(key=TIME_KEY, value=span.start)
+            return FilterGEQ(key=key, value=span.start)
         case FilterType.LT:
-            return FilterLT(key=TIME_KEY, value=span.start)
-    return FilterLT(key=TIME_KEY, value=span.stop)
-
-
-def _within(span: TimeSpan) -> BaseFilter:
-    return FilterAND(
-        filters=[FilterGEQ(key=TIME_KEY, value=span.start), FilterLT(key=TIME_KEY, value=span.stop)]
-    )
+            return FilterLT(key=key, value=span.start)
+    return FilterLT(key=key, value=span.stop)
 
 
 def _time(filter: BaseFilter, value: object, now: datetime.datetime) -> TimeSpan:

@@ -159,7 +159,8 @@ class EpisodeHeader(DBItem):
 
     `end` is `terminal`, `timeout` or `interrupted` ("" where unknown); `episode_return` is the sum of its
     rewards, None where they are no numbers; `env` counts sub-environments from 0 and `episode` the episodes
-    of one recording; `recording` is its path relative to the storage, with forward slashes.
+    of one recording; `recording` is its path relative to the storage, with forward slashes. `run` is what the recording
+    says of its run: name, metadata, tags, split, environment, started and ended (ISO 8601 in UTC), and more.
     """
 
     benchmark_id: str
@@ -173,6 +174,7 @@ class EpisodeHeader(DBItem):
     env: int = 0
     episode: int = 0
     recording: str = ""
+    run: dict[str, Any] = Field(default_factory=dict)
 
 
 _HEADER_FIELDS = set(EpisodeHeader.model_fields)

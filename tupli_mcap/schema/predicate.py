@@ -11,7 +11,7 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from tupli_mcap.errors import FilterError
-from tupli_mcap.schema.facts import TIME_KEY, bound
+from tupli_mcap.schema.facts import TIME_PATHS, bound
 from tupli_mcap.schema.filters import BaseFilter, FilterType, path_of
 from tupli_mcap.schema.keys import join_key
 from tupli_mcap.schema.times import time_ns
@@ -58,7 +58,7 @@ def _predicate(filter: BaseFilter, *, timed: bool) -> Predicate:
             inner = _predicate(filter.filters[0], timed=timed)
             return lambda item: not inner(item)
     path, test = path_of(filter), scalar_test(filter)
-    if timed and path == (TIME_KEY,):
+    if timed and path in TIME_PATHS:
         return lambda item: (ns := time_ns(look_up(item, path))) is not None and test(Scalar("number", ns))
 
     def comparison(item: Item) -> bool:

@@ -11,11 +11,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import NotFoundError, RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.description import spread_of, state_of
+from tupli_mcap.recording.description import spread_of, state_of, success_rate
 from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
@@ -68,6 +71,8 @@ class ListedRecording(NamedTuple):
     return_mean: over the episodes that are left, None if there are none; without the `return_nan` whose return is
         NaN, and NaN itself where that is so of all. size: bytes of the file.
     state: "complete", "recording" (a writer is at work) or "recovered" (a writer did not finish).
+    name, environment, started (ISO 8601 in UTC): of its run. success: the share of the episodes that succeeded, among
+        those whose metadata say it; None if none do.
     """
 
     path: str
@@ -80,6 +85,10 @@ class ListedRecording(NamedTuple):
     benchmark_id: str = ""
     state: str = ""
     error: str | None = None
+    name: str = ""
+    environment: str = ""
+    started: str = ""
+    success: float | None = None
 
 
 class Compactable(NamedTuple):
@@ -165,8 +174,13 @@ def find_recordings(path: Path) -> list[Path]:
     return [path]
 
 
-def list_recordings(paths: Iterable[Path]) -> Iterator[ListedRecording]:
-    """The recordings of files and directories; one that cannot be read is listed with its error."""
+def list_recordings(
+    paths: Iterable[Path], choose: Callable[[Recording], Array] | None = None
+) -> Iterator[ListedRecording]:
+    """The recordings of files and directories; one that cannot be read is listed with its error.
+
+    `choose` gives the positions of the episodes that count; recordings without any are left out.
+    """
     for path in paths:
         try:
             found = find_recordings(path)
@@ -174,7 +188,9 @@ def list_recordings(paths: Iterable[Path]) -> Iterator[ListedRecording]:
             yield ListedRecording(str(path), error=str(err))
             continue
         for file in found:
-            yield _listed(file, path if path.is_dir() else None)
+            listed = _listed(file, path if path.is_dir() else None, choose)
+            if listed.episodes or listed.error or choose is None:
+                yield listed
 
 
 def compactable(root: Path) -> list[Compactable]:
@@ -195,14 +211,17 @@ def compactable(root: Path) -> list[Compactable]:
     return compactables
 
 
-def _listed(path: Path, root: Path | None) -> ListedRecording:
+def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] | None) -> ListedRecording:
     try:
         notes = Notes.read(path, root)
         with Recording(path) as recording:
             deleted = notes.about(recording.metadata).deleted
-            rows = recording.index
-            if deleted:
-                rows = rows[[int(number) not in deleted for number in rows["episode"]]]
+            numbers = recording.index["episode"]
+            if choose is not None:
+                kept = choose(recording)
+            else:
+                kept = np.flatnonzero(~np.isin(numbers, list(deleted)))
+            rows = recording.index[kept]
             returns = spread_of(rows["return"])
             return ListedRecording(
                 path=str(path),
@@ -214,6 +233,10 @@ def _listed(path: Path, root: Path | None) -> ListedRecording:
                 created_ns=recording.created_ns,
                 benchmark_id=recording.benchmark_id,
                 state=state_of(recording),
+                name=", ".join(dict.fromkeys(run.name for run in recording.runs)),
+                environment=recording.run.environment,
+                started=recording.run.started,
+                success=success_rate(recording, kept),
             )
     except (TupliError, OSError) as err:
         return ListedRecording(str(path), error=str(err))

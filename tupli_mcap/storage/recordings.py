@@ -339,6 +339,7 @@ class RecordingFiles:
                 entry.stamp._replace(mixed=_LIVE) if entry.live else entry.stamp,
                 uuid=entry.uuid,
                 benchmark_id=entry.benchmark_id,
+                runs=entry.runs,
                 rows=entry.rows,
             )
         return len(entry.numbers)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import gymnasium as gym
+import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError
@@ -24,12 +25,13 @@ from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import Captured
 from tupli_mcap.wrappers.labels import with_labels
+from tupli_mcap.wrappers.run import with_run
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
 if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession
 
-__all__ = ["EpisodeWrapper", "check_kind", "metadata_of", "wrong_kind"]
+__all__ = ["EpisodeWrapper", "check_kind", "metadata_of", "success_of", "with_success", "wrong_kind"]
 
 
 class EpisodeWrapper:
@@ -68,8 +70,10 @@ class EpisodeWrapper:
         captured = Captured(env, options.capture_env, options.attachments)
         self._spaces = spaces = with_stacks(env, spaces, options.stack_size)
         spaces.to_metadata()
-        options = replace(options, attachments=with_labels(captured, env, spaces, options.labels))
-        name = type(env.unwrapped).__name__ if env.spec is None else env.spec.id
+        environment = type(env.unwrapped).__name__ if env.spec is None else env.spec.id
+        attachments = with_run(with_labels(captured, env, spaces, options.labels), options, environment)
+        options = replace(options, attachments=attachments)
+        name = options.name or environment
         self.rotation = Rotation(path, options, format_version(spaces, options.image_format), name)
         self._plain = options.is_plain
         self._work = work = Work()
@@ -200,6 +204,27 @@ def metadata_of(callback: EpisodeMetadataCallback, step: Step) -> str:
         return jsonvalue.dumps_plain(dict(metadata))
     except (TypeError, ValueError) as err:
         raise RecordingError(f"metadata_callback: {err}") from err
+
+
+def success_of(info: Any) -> bool | None:
+    """Whether the info of an episode's last step says that the episode succeeded (`is_success`, `success`); None if it
+    does not say."""
+    if type(info) is dict and info:
+        for key in ("is_success", "success"):
+            said = info.get(key)
+            if isinstance(said, bool | np.bool_) or (
+                isinstance(said, int | float | np.number) and said in (0, 1)
+            ):
+                return bool(said)
+    return None
+
+
+def with_success(metadata: str, info: Any) -> str:
+    """Metadata (a JSON text) with what `success_of` an info says, unless they say it already."""
+    said = success_of(info)
+    if said is None or '"success"' in metadata:
+        return metadata
+    return jsonvalue.dumps_plain({**jsonvalue.loads(metadata), "success": said})
 
 
 def check_kind(env: object, *, vector: bool) -> None:

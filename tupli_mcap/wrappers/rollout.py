@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,14 @@ from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.recording.description import spread_of
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.write.options import RENDER_MODE, CaptureEnv, Mode, RecordInfo, RecordOptions
+from tupli_mcap.recording.write.options import (
+    RENDER_MODE,
+    Capture,
+    CaptureEnv,
+    Mode,
+    RecordInfo,
+    RecordOptions,
+)
 from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
@@ -64,6 +71,11 @@ def record_rollouts(
     capture_env: CaptureEnv = "spec",
     max_bytes: int | None = None,
     max_seconds: float | None = None,
+    name: str | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    tags: Sequence[str] = (),
+    split: str = "",
+    capture: Capture = "all",
     progress: Callable[[int], None] | None = None,
 ) -> RolloutSummary:
     """Records `steps` steps of a registered environment into the MCAP file `path`.
@@ -75,8 +87,8 @@ def record_rollouts(
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
-        mode, compression, record_info, durability, live, capture_env, max_bytes, max_seconds: as `RecordEpisodes` has
-            them.
+        mode, compression, record_info, durability, live, capture_env, max_bytes, max_seconds, name, metadata, tags,
+            split, capture: as `RecordEpisodes` has them.
         frames: as `RecordEpisodes` has it; the environment is made with render_mode="rgb_array".
         progress: called with the number of steps so far, a few hundred times.
 
@@ -91,6 +103,7 @@ def record_rollouts(
     options = RecordOptions(
         mode=mode, compression=compression, record_info=record_info, durability=durability, live=live,
         frames=frames, capture_env=capture_env, max_bytes=max_bytes, max_seconds=max_seconds,
+        name=name, metadata=metadata, tags=tags, split=split, capture=capture,
     )  # fmt: skip
     rollout = _Rollout(steps, seed, policy, _every(max(1, steps // _REPORTS), progress))
     with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if options.every else None)) as made:

@@ -19,12 +19,19 @@ from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.frames import FrameRecorder
-from tupli_mcap.recording.write.options import CaptureEnv, Mode, RecordInfo, RecordOptions, StepCallback
+from tupli_mcap.recording.write.options import (
+    Capture,
+    CaptureEnv,
+    Mode,
+    RecordInfo,
+    RecordOptions,
+    StepCallback,
+)
 from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback
-from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, metadata_of
+from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, metadata_of, success_of, with_success
 from tupli_mcap.wrappers.seeds import drawn_seed
 
 __all__ = ["RecordEpisodes"]
@@ -42,7 +49,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         path: the recording, or a directory: it gets a new file named by environment and time. Directories that are
             missing are made. `mode` "x" refuses to overwrite, "w" replaces, "a" continues it, or makes it.
         metadata_callback: called with every step (an RLTuple), returns the episode's metadata (a dict); reset after
-            it, and before the first one.
+            it, and before the first one. Where the last info says `is_success` or `success`, the metadata have it as
+            `success`, unless the callback says it.
         record_info: False, True (everything), a list of names, or a function from info to what is recorded.
         step_callback: called with every Step; returns entries to record with its info (log-probabilities, say).
         compression: "zstd", "lz4" or "none".
@@ -76,6 +84,11 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             is in the file, or it has been open so long, as soon as no episode is running: one that runs goes on in its
             file, however long it is. `path` is the file that is recorded to, `paths` are all of them. With mode "a" the
             last one is gone on with.
+        name, metadata, tags, split: of the run: what it is called ("ppo-seed3"; it names new files in a directory),
+            what was tried ({"algo": "ppo", "lr": 3e-4}), words for it, "train" or "eval". A recording that is gone on
+            with keeps the run it has.
+        capture: what the file says of this process. "all": its command line, git commit, host, versions of Python and
+            packages; "versions": these; "none".
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
@@ -115,6 +128,11 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         live: str | None = None,
         max_bytes: int | None = None,
         max_seconds: float | None = None,
+        name: str | None = None,
+        metadata: Mapping[str, Any] | None = None,
+        tags: Sequence[str] = (),
+        split: str = "",
+        capture: Capture = "all",
     ) -> None:
         check_kind(env, vector=False)
         super().__init__(env)
@@ -125,7 +143,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             capture_env=capture_env, attachments=attachments, labels=labels, flush_seconds=flush_seconds,
             journal_dir=journal_dir, chunk_size=chunk_size, durability=durability, frames=frames,
             frame_format=frame_format, image_format=image_format, stack_size=stack_size, live=live,
-            max_bytes=max_bytes, max_seconds=max_seconds,
+            max_bytes=max_bytes, max_seconds=max_seconds, name=name, metadata=metadata, tags=tags, split=split,
+            capture=capture,
         )  # fmt: skip
         self._metadata_callback = metadata_callback
         self._watches = options.has_callbacks or bool(options.every)
@@ -175,7 +194,12 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             put(action, state, reward, terminal, timeout)
             if self._plain:
                 if terminal or timeout:
-                    self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
+                    end = TERMINAL if terminal else TIMEOUT
+                    if success_of(result[4]) is None:
+                        self._recorder.leave_end(end)
+                    else:
+                        self._recorder.metadata = with_success("{}", result[4])
+                        self._recorder.end(end)
                 work.state = DONE
                 return result
         except StepError:
@@ -264,8 +288,9 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
 
     def _end(self, action: Any, result: Any) -> None:
         """The end of an episode that a step has ended."""
-        _, _, terminal, timeout, _ = result
+        _, _, terminal, timeout, info = result
         if terminal or timeout:
+            self._recorder.metadata = with_success(self._recorder.metadata, info)
             self._recorder.end(TERMINAL if terminal else TIMEOUT)
             self._work.ask(self._reset_callback)
 

@@ -21,7 +21,14 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.frames import VectorFrames
-from tupli_mcap.recording.write.options import CaptureEnv, Mode, RecordInfo, RecordOptions, StepCallback
+from tupli_mcap.recording.write.options import (
+    Capture,
+    CaptureEnv,
+    Mode,
+    RecordInfo,
+    RecordOptions,
+    StepCallback,
+)
 from tupli_mcap.recording.write.vector import VectorRecorder
 from tupli_mcap.recording.write.vector_infos import final_info_of, info_of
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
@@ -78,6 +85,11 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         stack_size: int | None = None,
         max_bytes: int | None = None,
         max_seconds: float | None = None,
+        name: str | None = None,
+        metadata: Mapping[str, Any] | None = None,
+        tags: Sequence[str] = (),
+        split: str = "",
+        capture: Capture = "all",
     ) -> None:
         check_kind(env, vector=True)
         super().__init__(env)
@@ -87,7 +99,8 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
             capture_env=capture_env, attachments=attachments, labels=labels, flush_seconds=flush_seconds,
             journal_dir=journal_dir, chunk_size=chunk_size, durability=durability, frames=frames,
             frame_format=frame_format, image_format=image_format, stack_size=stack_size, live=live,
-            max_bytes=max_bytes, max_seconds=max_seconds,
+            max_bytes=max_bytes, max_seconds=max_seconds, name=name, metadata=metadata, tags=tags, split=split,
+            capture=capture,
         )  # fmt: skip
         if reward_space is not None and reward_space.shape is None:
             raise SpaceError(

@@ -18,6 +18,7 @@ from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import INFO
+from tupli_mcap.recording.annotations import ANNOTATIONS_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.check.episodes import verify_episodes
 from tupli_mcap.recording.check.frames import verify_frames
@@ -30,6 +31,7 @@ from tupli_mcap.recording.recover.damaged import may_be_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.find_journal import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
 from tupli_mcap.recording.recover.prefix import head
+from tupli_mcap.recording.run import RUN_NAME
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
 __all__ = ["Problem", "VerifyReport", "verify_recording"]
@@ -184,7 +186,7 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
 
 
 def _carried(recording: Recording, structure: Structure, findings: Findings) -> None:
-    """The benchmark and the artifacts, by their digests."""
+    """The benchmark and the artifacts, by their digests; what is said of runs and episodes."""
     for name in recording.attachments:
         try:
             if name.startswith(_ARTIFACT):
@@ -193,6 +195,10 @@ def _carried(recording: Recording, structure: Structure, findings: Findings) -> 
                     findings.error("attachment", f"the artifact {name!r:.90} has the SHA-256 {found}")
             elif name == "benchmark.json":
                 _benchmark(recording, findings)
+            elif name == RUN_NAME:
+                _ = recording.runs
+            elif name == ANNOTATIONS_NAME:
+                _ = recording.annotations
             elif name == SIGNATURE_NAME:
                 with findings.following(structure.missing):
                     _signature(recording, structure, findings)

@@ -5,7 +5,8 @@ copy_episodes                     episodes of a recording into it
 copy_chunks                       chunks that can be copied as they are
 merge                             several recordings into one, with new numbers; one into several
 rewrite                           a recording with fewer episodes
-attach                            adds attachments
+attach, annotate                  adds attachments; says more about episodes and the run
+carry_runs                        what recordings say of runs and episodes, for one made of them
 repair                            `recover_recording`; write_repaired and repaired_frames write what it found
 replacing                         the new file takes the place of the old one
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import stat
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tupli_mcap.errors import RecordingError
@@ -23,8 +23,12 @@ __all__ = ["add_attachments"]
 _COPY = 1 << 22
 
 
-def add_attachments(path: str | os.PathLike[str], attachments: Mapping[str, tuple[str, bytes]]) -> None:
+def add_attachments(
+    path: str | os.PathLike[str], attachments: Mapping[str, tuple[str, bytes]], *, without: Sequence[str] = ()
+) -> None:
     """Adds attachments (name -> media type, bytes) behind the chunks of a recording, or replaces those of their name.
+
+    Those that `without` names are left out.
 
     The file is replaced in one rename: it is the old one or the new one, whatever happens to this process.
 
@@ -42,7 +46,7 @@ def add_attachments(path: str | os.PathLike[str], attachments: Mapping[str, tupl
                 raise RecordingError(
                     f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover` finishes it"
                 )
-            _replace(path, source, contents, attachments)
+            _replace(path, source, contents, attachments, without)
         finally:
             source.close()
     finally:
@@ -50,19 +54,29 @@ def add_attachments(path: str | os.PathLike[str], attachments: Mapping[str, tupl
 
 
 def _replace(
-    path: Path, source: Source, contents: Contents, attachments: Mapping[str, tuple[str, bytes]]
+    path: Path,
+    source: Source,
+    contents: Contents,
+    attachments: Mapping[str, tuple[str, bytes]],
+    without: Sequence[str],
 ) -> None:
     with replacing(path, 0o600) as (fd, _):
-        _write(fd, path, source, contents, attachments)
+        _write(fd, path, source, contents, attachments, without)
         os.fchmod(fd, stat.S_IMODE(path.stat().st_mode))
 
 
 def _write(
-    fd: int, path: Path, source: Source, contents: Contents, attachments: Mapping[str, tuple[str, bytes]]
+    fd: int,
+    path: Path,
+    source: Source,
+    contents: Contents,
+    attachments: Mapping[str, tuple[str, bytes]],
+    without: Sequence[str],
 ) -> None:
     container = Container(fd, str(path), "zstd")
     restore_container(container, contents, source)
-    kept = [index for index in container.attachment_indexes if index.name not in attachments]
+    gone = {*attachments, *without}
+    kept = [index for index in container.attachment_indexes if index.name not in gone]
     # the bytes of a replaced attachment are dropped where it is the last one; elsewhere they stay, unreferenced
     last = max(container.attachment_indexes, key=lambda index: index.offset, default=None)
     end = contents.data_end

@@ -19,13 +19,16 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.topics import INFO
+from tupli_mcap.recording.annotations import ANNOTATIONS_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
+from tupli_mcap.recording.edit.carry_runs import carry_runs
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
 from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.run import RUN_NAME
 from tupli_mcap.recording.signature_file import STATEMENTS
 
 __all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]
@@ -122,7 +125,7 @@ def _merge(
     now, first = time.time_ns(), sources[0]
     turns, next_episode = _numbered(sources, _turns(sources))
     target = Assembler(container)
-    target.begin(_metadata(first, next_episode=next_episode), attachments, now)
+    target.begin(_metadata(first, next_episode=next_episode), {**attachments, **carry_runs(turns)}, now)
     define(first, target)
     for recording in sources[1:]:
         _define_missing(recording, container)
@@ -265,7 +268,9 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
     with_environment = next((r for r in sources if _ENVIRONMENT[0] in r.attachments), None)
     for recording in sources:
         for name, info in recording.attachments.items():
-            if name in STATEMENTS or (name in _ENVIRONMENT and recording is not with_environment):
+            if name in (*STATEMENTS, RUN_NAME, ANNOTATIONS_NAME) or (
+                name in _ENVIRONMENT and recording is not with_environment
+            ):
                 continue
             data = recording.read_attachment(name)
             if attachments.setdefault(name, (info.media_type, data))[1] != data and name != "labels.json":

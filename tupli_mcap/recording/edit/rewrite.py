@@ -14,6 +14,7 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
+from tupli_mcap.recording.edit.carry_runs import carry_runs
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.recording import Recording
@@ -85,12 +86,13 @@ def write(
         for name, info in kept.items()
         if name not in left_out
     }
-    now, target = time.time_ns(), Assembler(container)
-    target.begin(metadata, {**own, **attachments}, now)
-    define(source, target)
     rows = source.index
     if numbers is not None:
         rows = rows[np.isin(rows["episode"], np.asarray(list(numbers), dtype=np.int64))]
+        own |= carry_runs([(source, rows, 0)])
+    now, target = time.time_ns(), Assembler(container)
+    target.begin(metadata, {**own, **attachments}, now)
+    define(source, target)
     cameras = camera_channels(source, container, frames) if source.num_envs else {}
     container.define_channels()
     if source.num_envs:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CAMERA",
     "RENDER_MODE",
+    "Capture",
     "CaptureEnv",
     "Mode",
     "RecordInfo",
@@ -35,6 +36,7 @@ __all__ = [
 
 Mode = Literal["x", "w", "a"]
 CaptureEnv = Literal["spec", "pickle"] | None
+Capture = Literal["all", "versions", "none"]
 RecordInfo = bool | Sequence[str] | Callable[[dict[str, Any]], Mapping[str, Any]]
 StepCallback = Callable[["Step"], Mapping[str, Any] | None]
 
@@ -76,6 +78,11 @@ class RecordOptions:
     live: str | None = None
     max_bytes: int | None = None
     max_seconds: float | None = None
+    name: str | None = None
+    metadata: Mapping[str, Any] | None = None
+    tags: Sequence[str] = ()
+    split: str = ""
+    capture: Capture = "all"
 
     def __post_init__(self) -> None:
         size, seconds, frames = self.chunk_size, self.flush_seconds, self.frames
@@ -96,6 +103,8 @@ class RecordOptions:
             raise RecordingError(
                 f"capture_env: expected 'spec', 'pickle' or None (nothing), found {self.capture_env!r:.80}"
             )
+        if self.capture not in ("all", "versions", "none"):
+            raise RecordingError(f"capture: expected 'all', 'versions' or 'none', found {self.capture!r:.80}")
         check_durability(self.durability)
         check_image_format(self.image_format)
         _check_directory(self.journal_dir)

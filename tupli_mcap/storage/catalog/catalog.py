@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, Select, and_, delete, func, insert, select, true
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound
 from tupli_mcap.schema.facts import path_in
@@ -142,10 +143,12 @@ class Catalog:
         uuid: str,
         benchmark_id: str,
         rows: Iterable[EpisodeRow],
+        runs: str = "[{}]",
     ) -> None:
         """Catalogue a recording, in place of what was known of it; all of it or nothing.
 
-        `rows` is consumed a chunk at a time while the catalog is locked for other writers.
+        `runs` is JSON: a list of those that its episodes are of. `rows` is consumed a chunk at a time while the catalog
+        is locked for other writers.
 
         Raises:
             FormatError: A row's metadata is no strict JSON object.
@@ -155,7 +158,7 @@ class Catalog:
         first = list(itertools.islice(remaining, _ROWS_AT_ONCE))  # read before the lock is taken
         with self._write() as connection:
             number, indexed = (
-                _add_recording(connection, relpath, stamp, uuid, benchmark_id),
+                _add_recording(connection, relpath, stamp, uuid, benchmark_id, runs),
                 _indexed(connection),
             )
             chunk = first
@@ -273,10 +276,23 @@ def _headers(
     rows = connection.execute(query.limit(limit).offset(offset or None))
     matches = None if filter is None or found.exact else bound_predicate(filter)
     width = len(_COLUMNS)
+    runs: dict[int, list[dict[str, Any]]] = {}
     for row in rows:
-        made = header(StoredRow(*row[:width]), *row[width:])
+        stored = StoredRow(*row[:width])
+        if stored.recording_id not in runs:
+            runs[stored.recording_id] = _runs_of(connection, stored.recording_id)
+        uuid, benchmark_id, path = row[width:]
+        made = header(stored, uuid, benchmark_id, path, runs[stored.recording_id][stored.run])
         if matches is None or matches(made):
             yield made
+
+
+def _runs_of(connection: Connection, recording_id: int) -> list[dict[str, Any]]:
+    """The runs that a recording's episodes are of, by their places."""
+    found: list[dict[str, Any]] = jsonvalue.loads(
+        connection.execute(select(RECORDING.c.runs).where(RECORDING.c.id == recording_id)).scalar_one()
+    )
+    return found
 
 
 def _indexed(connection: Connection) -> dict[tuple[str, ...], int]:
@@ -300,11 +316,13 @@ def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[t
 
 
 def _add_recording(
-    connection: Connection, relpath: str, stamp: RecordingStamp, uuid: str, benchmark_id: str
+    connection: Connection, relpath: str, stamp: RecordingStamp, uuid: str, benchmark_id: str, runs: str
 ) -> int:
     """Adds a recording without episodes, in place of what was known of it; returns its id."""
     _remove_recording(connection, relpath)
-    values = {"path": escape_text(relpath), "uuid": uuid, "benchmark_id": escape_text(benchmark_id)}
+    values = {
+        "path": escape_text(relpath), "uuid": uuid, "benchmark_id": escape_text(benchmark_id), "runs": runs
+    }  # fmt: skip
     added = connection.execute(insert(RECORDING).values(**values, **stamp._asdict()))
     (number,) = added.inserted_primary_key or (0,)
     return int(number)

@@ -23,6 +23,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 from typing import NamedTuple
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED
 from tupli_mcap.recording import Recording
@@ -42,13 +43,15 @@ _MOST_WORKERS = 8
 class Entry(NamedTuple):
     """A recording to catalogue.
 
-    stamp: taken before it was read. live: somebody writes to it. numbers: of all its episodes, deleted ones too.
+    stamp: taken before it was read. live: somebody writes to it. runs: JSON of a list. numbers: of all
+    its episodes, deleted ones too.
     """
 
     stamp: RecordingStamp
     live: bool
     uuid: str
     benchmark_id: str
+    runs: str
     numbers: Sequence[int]
     rows: Iterable[EpisodeRow]
 
@@ -66,7 +69,8 @@ def entry_of(root: Path, relative: str) -> Iterator[Entry]:
         live |= is_locked(path)  # a writer may have come or gone meanwhile
         numbers = recording.index["episode"].tolist()
         rows = _rows(recording, notes.about(recording.metadata), live=live)
-        yield Entry(stamp, live, recording.uuid, recording.benchmark_id, numbers, rows)
+        runs = jsonvalue.dumps([run.as_dict() for run in recording.runs])
+        yield Entry(stamp, live, recording.uuid, recording.benchmark_id, runs, numbers, rows)
 
 
 def read_ahead(root: Path, names: Sequence[str]) -> Generator[Entry | None]:
@@ -146,8 +150,8 @@ def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[Epi
     ]
     running = _running(columns[1], columns[3]) if live else set()
     local = json.dumps([LOCAL_USER])
-    for i, (number, env, length, end, total, created_at, seed, metadata) in enumerate(
-        zip(*columns, seeds, recording.all_metadata(), strict=True)
+    for i, (number, env, length, end, total, created_at, seed, metadata, run) in enumerate(
+        zip(*columns, seeds, recording.all_metadata(), recording.run_places, strict=True)
     ):
         if number in sidecar.deleted or i in running:
             continue
@@ -163,6 +167,7 @@ def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[Epi
             created_by=LOCAL_USER,
             published_in=local if groups is None else json.dumps(groups),
             metadata=metadata,
+            run=run,
         )
 
 

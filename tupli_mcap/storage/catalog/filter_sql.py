@@ -164,7 +164,7 @@ def _compared(filter: BaseFilter) -> Narrowed:
         return _exactly(filter, _INTEGERS[name], _bindable)
     if name == "id":
         return _of_ids(filter)
-    if filter.type is FilterType.NE:
+    if filter.type is FilterType.NE or name == "run":  # few runs have many episodes
         return _ALL
     if name in _NUMBERS:
         return Narrowed(_near(filter, _NUMBERS[name]), exact=False)

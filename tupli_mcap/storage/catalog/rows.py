@@ -29,7 +29,7 @@ class EpisodeRow(NamedTuple):
 
     `end` is `terminal`, `timeout` or `interrupted`; `created_at` is in ns since 1970 (UTC); `published_in` is the JSON
     text of a list of group names and `metadata` that of an object, strict JSON as `tupli_mcap.jsonvalue`
-    writes it.
+    writes it. `run` is the place of its run among those of the recording.
     """
 
     episode: int
@@ -42,6 +42,7 @@ class EpisodeRow(NamedTuple):
     created_by: str
     published_in: str
     metadata: str
+    run: int = 0
 
 
 class StoredRow(NamedTuple):
@@ -59,6 +60,7 @@ class StoredRow(NamedTuple):
     created_by: str
     published_in: str
     metadata: str
+    run: int
     exact: str | None
 
 
@@ -94,11 +96,12 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
         created_by=escape_text(row.created_by),
         published_in=row.published_in,
         metadata=_searchable(row.metadata),
+        run=row.run,
         exact=json.dumps(exact) if exact else None,
     )
 
 
-def header(row: StoredRow, uuid: str, benchmark_id: str, path: str) -> EpisodeHeader:
+def header(row: StoredRow, uuid: str, benchmark_id: str, path: str, run: dict[str, Any]) -> EpisodeHeader:
     """The header of a stored row; the other arguments come from its recording, as stored."""
     values = {
         "id": f"{uuid}-{row.episode}",
@@ -116,6 +119,7 @@ def header(row: StoredRow, uuid: str, benchmark_id: str, path: str) -> EpisodeHe
         "env": row.env,
         "episode": row.episode,
         "recording": unescape_text(path),
+        "run": run,
     }
     if row.exact is not None:
         values.update(json.loads(row.exact))

@@ -21,7 +21,7 @@ __all__ = [
 ]
 
 APPLICATION_ID: Final = 0x7475_706C  # "tupl": how SQLite tells whose file this is
-VERSION: Final = 4
+VERSION: Final = 5
 
 EPISODE_BITS: Final = 32
 """An episode's row id is its recording's id shifted left by this, plus its number: rows lie in file order."""
@@ -38,6 +38,7 @@ RECORDING: Final = Table(
     Column("mixed", BigInteger, nullable=False),
     Column("uuid", Text, nullable=False, index=True),
     Column("benchmark_id", Text, nullable=False, index=True),
+    Column("runs", Text, nullable=False),  # JSON: those that its episodes are of
 )
 
 EPISODE: Final = Table(
@@ -55,6 +56,7 @@ EPISODE: Final = Table(
     Column("created_by", Text, nullable=False),
     Column("published_in", Text, nullable=False),
     Column("metadata", Text, nullable=False),
+    Column("run", Integer, nullable=False),  # its place among the recording's
     Column("exact", Text),  # JSON of the fields of which the columns do not say all
 )
 

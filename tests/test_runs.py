@@ -1,0 +1,437 @@
+"""Runs: what a recording says of the run it is of, and annotations: what is said about episodes afterwards."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import jsonschema
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from typer.testing import CliRunner
+
+import tupli_mcap
+from tupli_mcap import FileStorage, FormatError, RecordEpisodes, Recording, RecordingError, TupliEnvWrapper
+from tupli_mcap.cli.app import app
+from tupli_mcap.errors import FilterError
+from tupli_mcap.recording import (
+    annotate_episodes,
+    edit_run,
+    merge_recordings,
+    rewrite_recording,
+    undo_annotation,
+    verify_recording,
+)
+from tupli_mcap.recording.edit.attach import add_attachments
+from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
+
+SCHEMAS = Path(__file__).parent.parent / "schemas"
+LONG_AGO = "2020-01-01"
+
+
+def record(path: Path, episodes: int = 3, **options: Any) -> Path:
+    with RecordEpisodes(gym.make("CartPole-v1"), path, **options) as env:
+        env.action_space.seed(0)
+        for seed in range(episodes):
+            env.reset(seed=seed)
+            ended = False
+            while not ended:
+                _, _, terminal, timeout, _ = env.step(env.action_space.sample())
+                ended = terminal or timeout
+        return env.path
+
+
+def check_schema(path: Path, name: str) -> Any:
+    document = json.loads(Recording(path).read_attachment(f"{name}.json"))
+    jsonschema.validate(document, json.loads((SCHEMAS / f"{name}.schema.json").read_text()))
+    return document
+
+
+def command(*words: str) -> str:
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+class TestRun:
+    def test_says_what_was_given_and_what_the_process_is(self, tmp_path: Path) -> None:
+        path = record(
+            tmp_path / "r.mcap",
+            name="ppo-3",
+            metadata={"lr": 3e-4, "net": [64, 64]},
+            tags=["a", "b"],
+            split="train",
+        )
+        run = Recording(path).run
+        assert (run.name, run.metadata, run.tags, run.split) == (
+            "ppo-3", {"lr": 3e-4, "net": [64, 64]}, ("a", "b"), "train",
+        )  # fmt: skip
+        assert run.environment == "CartPole-v1"
+        assert run.command == tuple(sys.orig_argv)
+        assert run.versions["numpy"] == np.__version__
+        assert len(run.id) == 32
+        assert LONG_AGO < run.started < run.ended
+        check_schema(path, "run")
+        assert verify_recording(path).ok
+
+    @pytest.mark.parametrize("capture", ["none", "versions"])
+    def test_keeps_the_process_out(self, capture: Any, tmp_path: Path) -> None:
+        run = Recording(record(tmp_path / "r.mcap", capture=capture, name="x")).run
+        assert (run.name, run.command, run.git, run.host) == ("x", (), {}, "")
+        assert bool(run.versions) == (capture == "versions")
+
+    def test_names_the_commit_of_the_program(self, tmp_path: Path) -> None:
+        (tmp_path / "program.py").write_text(
+            "import gymnasium as gym, tupli_mcap\n"
+            "env = tupli_mcap.RecordEpisodes(gym.make('CartPole-v1'), 'r.mcap', mode='w')\n"
+            "env.reset(); env.step(0); env.close()\n"
+            "print(tupli_mcap.Recording('r.mcap').run.git)\n"
+        )
+
+        def git(*words: str) -> str:
+            who = ["-c", "user.name=a", "-c", "user.email=a@b"]
+            done = subprocess.run(
+                ["git", *who, *words], cwd=tmp_path, check=True, capture_output=True, text=True
+            )
+            return done.stdout.strip()
+
+        def program() -> str:
+            words = [sys.executable, "program.py"]
+            return subprocess.run(words, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+
+        git("init", "-q")
+        git("add", "program.py")
+        git("commit", "-qm", "one")
+        commit = git("rev-parse", "HEAD")
+        assert program() == str({"commit": commit, "dirty": False}) + "\n"
+        with (tmp_path / "program.py").open("a") as file:
+            file.write("# changed\n")
+        assert "'dirty': True" in program()
+
+    def test_without_a_name_has_that_of_the_file(self, tmp_path: Path) -> None:
+        assert Recording(record(tmp_path / "walk.mcap")).run.name == "walk"
+        golden = Path(__file__).parent / "golden" / "constant_zstd.mcap"
+        old = Recording(golden).run
+        assert (old.name, old.metadata, old.id) == ("constant_zstd", {}, "")
+
+    def test_is_the_same_in_all_files_of_a_series(self, tmp_path: Path) -> None:
+        with RecordEpisodes(
+            gym.make("CartPole-v1"), tmp_path / "r.mcap", max_bytes=8000, chunk_size=1000, name="long"
+        ) as env:
+            for seed in range(60):
+                env.reset(seed=seed)
+                while not env.step(0)[2]:
+                    pass
+            paths = env.paths
+        assert len(paths) > 1
+        assert len({Recording(path).run.id for path in paths}) == 1
+
+    def test_names_the_file_in_a_directory(self, tmp_path: Path) -> None:
+        (tmp_path / "runs").mkdir()
+        assert record(tmp_path / "runs", name="a/b c").name.startswith("a_b_c_20")
+
+    @pytest.mark.parametrize(
+        "options",
+        [{"name": 3}, {"tags": "abc"}, {"tags": [3]}, {"metadata": [1]}, {"metadata": {"f": object()}},
+         {"split": None}, {"capture": "some"}],
+    )  # fmt: skip
+    def test_refuses_what_is_no_run(self, options: dict[str, Any], tmp_path: Path) -> None:
+        with pytest.raises(RecordingError):
+            record(tmp_path / "r.mcap", **options)
+        assert not list(tmp_path.iterdir())
+
+    def test_of_a_vector_environment(self, tmp_path: Path) -> None:
+        env = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync")
+        with RecordVectorEpisodes(env, tmp_path / "v.mcap", name="two", metadata={"n": 2}) as recorded:
+            recorded.reset(seed=0)
+            for _ in range(40):
+                recorded.step(np.zeros(2, np.int64))
+        assert Recording(tmp_path / "v.mcap").episodes[0].run.metadata == {"n": 2}
+
+    def test_in_filters_of_files_and_of_a_storage(self, tmp_path: Path) -> None:
+        storage = FileStorage(tmp_path / "lab")
+        for i, rate in enumerate((1e-4, 1e-2)):
+            record(tmp_path / f"{i}.mcap", name=f"ppo-{i}", metadata={"lr": rate})
+            env = TupliEnvWrapper(gym.make("CartPole-v1"), storage, name=f"ppo-{i}", metadata={"lr": rate})
+            env.store("cart")
+            for seed in range(3):
+                env.reset(seed=seed)
+                env.step(0)
+            env.close()
+        for source in (tmp_path / "*.mcap", storage):
+            ds = tupli_mcap.open(source)
+            assert len(ds) == 6
+            assert {episode.run.name for episode in ds.filter("run.metadata.lr < 1e-3")} == {"ppo-0"}
+            assert (
+                len(ds.filter("run.name = 'ppo-1' and run.started > '1d ago' and run.ended <= '2999-01-01'"))
+                == 3
+            )
+            assert len(ds.filter(f"run.started < '{LONG_AGO}'")) == 0
+            assert {"run.name", "run.metadata.lr", "run.started"} <= set(ds.keys)
+            sides = ds.split(0.5, by="run")
+            for side in sides:
+                assert len(side) % 3 == 0
+            with pytest.raises(FilterError, match="did you mean 'lr'"):
+                ds.filter("run.metadata.lrr > 3")
+            with pytest.raises(FilterError, match="did you mean 'started'"):
+                ds.filter("run.startd = 'x'")
+            with pytest.raises(FilterError, match="is a time"):
+                ds.filter("run.started > 3")
+
+    def test_of_each_episode_stays_when_recordings_are_merged(self, tmp_path: Path) -> None:
+        paths = [record(tmp_path / f"{i}.mcap", name=f"worker-{i}") for i in range(3)]
+        annotate_episodes(paths[1], {"success": True}, [0, 2])
+        merge_recordings(paths, tmp_path / "all.mcap")
+        merged = Recording(tmp_path / "all.mcap")
+        assert [episode.run.name for episode in merged.episodes] == [f"worker-{i // 3}" for i in range(9)]
+        assert [episode.metadata.get("success") for episode in merged.episodes] == [
+            None, None, None, True, None, True, None, None, None,
+        ]  # fmt: skip
+        check_schema(tmp_path / "all.mcap", "run")
+        rewrite_recording(merged, tmp_path / "some.mcap", episodes=[1, 5, 6])
+        some = Recording(tmp_path / "some.mcap")
+        assert [episode.run.name for episode in some.episodes] == ["worker-0", "worker-1", "worker-2"]
+        assert [episode.metadata for episode in some.episodes] == [{}, {"success": True}, {}]
+        assert len(tupli_mcap.open(tmp_path / "some.mcap").filter("run.name = 'worker-2'")) == 1
+        with pytest.raises(RecordingError, match="3 runs"):
+            edit_run(tmp_path / "all.mcap", name="x")
+        assert verify_recording(tmp_path / "some.mcap").ok
+
+    def test_can_be_edited(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap", metadata={"lr": 1, "old": 2})
+        before = Recording(path)
+        edit_run(path, name="dry", dry_run=True)
+        assert Recording(path).run == before.run
+        edit_run(path, name="better", metadata={"lr": 2, "old": None}, tags=["x"], split="eval")
+        after = Recording(path)
+        assert (after.run.name, after.run.metadata, after.run.tags, after.run.split) == (
+            "better", {"lr": 2}, ("x",), "eval",
+        )  # fmt: skip
+        assert (after.uuid, after.run.id, after.run.started) == (
+            before.uuid,
+            before.run.id,
+            before.run.started,
+        )
+        np.testing.assert_array_equal(after.read().states, before.read().states)
+        assert verify_recording(path).ok
+
+    @pytest.mark.parametrize(
+        "data",
+        [b"{", b"[]", b'{"runs": []}', b'{"runs": [3]}', b'{"runs": [{"name": 3}]}', b'{"runs": [{"tags": "a"}]}',
+         b'{"runs": [{}], "spans": [[1, 1]]}', b'{"runs": [{}], "spans": [[true, 0]]}', b"\xff"],
+    )  # fmt: skip
+    def test_that_is_damaged_is_said(self, data: bytes, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap")
+        add_attachments(path, {"run.json": ("application/json", data)})
+        recording = Recording(path)
+        assert recording.read().states.shape[1:] == (4,)
+        with pytest.raises(FormatError, match=r"run\.json"):
+            _ = recording.run
+        assert not verify_recording(path).ok
+
+
+class TestAnnotations:
+    def test_count_more_than_what_was_recorded(self, tmp_path: Path) -> None:
+        class Callback(tupli_mcap.EpisodeMetadataCallback):
+            def reset(self) -> None: ...
+
+            def __call__(self, tuple: Any) -> dict[str, Any]:
+                return {"score": 1, "success": False}
+
+        path = record(tmp_path / "r.mcap", metadata_callback=Callback())
+        ds = tupli_mcap.open(path)
+        ds[1].annotate(success=True, note="gripper slipped")
+        assert ds[1].metadata == {"score": 1, "success": True, "note": "gripper slipped"}
+        assert ds[0].metadata == {"score": 1, "success": False}
+        again = tupli_mcap.open(path)
+        assert [episode.number for episode in again.filter("metadata.success")] == [1]
+        assert Recording(path).recorded_metadata(1) == {"score": 1, "success": False}
+        annotate_episodes(path, {"note": None, "score": 2.5})
+        assert [episode.metadata for episode in Recording(path).episodes] == [
+            {"score": 2.5, "success": False},
+            {"score": 2.5, "success": True},
+            {"score": 2.5, "success": False},
+        ]
+        (first, last) = Recording(path).annotations.said
+        assert (first.episodes, last.episodes) == ([1], [0, 1, 2])
+        assert LONG_AGO < first.at <= last.at
+        check_schema(path, "annotations")
+        assert undo_annotation(path).values == {"note": None, "score": 2.5}
+        assert Recording(path).episodes[1].metadata["note"] == "gripper slipped"
+        assert verify_recording(path).ok
+
+    def test_are_seen_by_a_storage(self, tmp_path: Path) -> None:
+        storage = FileStorage(tmp_path / "lab")
+        env = TupliEnvWrapper(gym.make("CartPole-v1"), storage)
+        env.store("cart")
+        for seed in range(3):
+            env.reset(seed=seed)
+            env.step(0)
+        env.close()
+        assert len(storage.list_episodes()) == 3
+        (path,) = (tmp_path / "lab").rglob("*.mcap")
+        annotate_episodes(path, {"good": True}, [2])
+        assert [header.metadata for header in storage.list_episodes()] == [{}, {}, {"good": True}]
+        assert [header.episode for header in tupli_mcap.open(storage).filter("metadata.good")._headers] == [2]
+
+    def test_do_not_touch_steps(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap")
+        with path.open("rb") as file:
+            before = [(message.sequence, message.data) for _, _, message in make_reader(file).iter_messages()]
+        annotate_episodes(path, {"x": 1})
+        with path.open("rb") as file:
+            assert [(m.sequence, m.data) for _, _, m in make_reader(file).iter_messages()] == before
+
+    @pytest.mark.parametrize(
+        ("values", "episodes"), [({"x": 1}, [7]), ({}, [0]), ({"x": 1}, []), ({"x": object()}, [0])]
+    )
+    def test_refuse_what_has_no_meaning(self, values: Any, episodes: Any, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap")
+        before = path.read_bytes()
+        with pytest.raises(RecordingError):
+            annotate_episodes(path, values, episodes)
+        with pytest.raises(RecordingError, match="no annotation"):
+            undo_annotation(path)
+        assert path.read_bytes() == before
+
+    def test_wait_for_the_end_of_the_recording(self, tmp_path: Path) -> None:
+        with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+            env.reset()
+            env.step(0)
+            with pytest.raises(RecordingError):
+                annotate_episodes(tmp_path / "r.mcap", {"x": 1})
+
+    def test_take_a_signature_away_and_are_covered_by_one(self, tmp_path: Path) -> None:
+        from test_signing import write_key
+
+        from tupli_mcap.errors import SignatureError
+        from tupli_mcap.recording.sign.sign import sign_recording, verify_signature
+
+        key = write_key(tmp_path / "id")
+        path = record(tmp_path / "r.mcap")
+        sign_recording(path, key)
+        annotate_episodes(path, {"x": 1})
+        assert "signature.ed25519" not in Recording(path).attachments
+        sign_recording(path, key)
+        said = Recording(path).read_attachment("annotations.json")
+        assert verify_signature(Recording(path)).public_key == key.public_key
+        add_attachments(path, {"annotations.json": ("application/json", said.replace(b'"x": 1', b'"x": 2'))})
+        with pytest.raises(SignatureError):
+            verify_signature(Recording(path))
+
+    @pytest.mark.parametrize(
+        "data", [b"{}", b"[3]", b'[{"episodes": [-1], "values": {}, "by": "", "at": ""}]', b"\xff"]
+    )
+    def test_that_are_damaged_are_said(self, data: bytes, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap")
+        add_attachments(path, {"annotations.json": ("application/json", data)})
+        with pytest.raises(FormatError, match=r"annotations\.json"):
+            _ = Recording(path).annotations
+        assert not verify_recording(path).ok
+
+
+class Winning(gym.Env[Any, Any]):
+    """Says at its end whether it was won, as many goal environments do."""
+
+    observation_space = gym.spaces.Discrete(10)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, key: str = "is_success") -> None:
+        self.key = key
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        return 1, 1.0, True, False, {self.key: bool(action)}
+
+
+@pytest.mark.parametrize("record_info", [False, True])
+@pytest.mark.parametrize("key", ["is_success", "success"])
+def test_success_is_understood(key: str, record_info: bool, tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(Winning(key), path, record_info=record_info) as env:
+        for action in (1, 0, 1, 1):
+            env.reset()
+            env.step(action)
+    found = [episode.metadata for episode in Recording(path).episodes]
+    assert found == [{"success": True}, {"success": False}, {"success": True}, {"success": True}]
+    assert verify_recording(path).ok
+    (listed,) = json.loads(command("ls", str(path), "--json"))
+    assert listed["success"] == 0.75
+    assert "75%" in command("ls", str(path))
+    assert "75%" in command("info", str(path))
+
+
+class TestCommands:
+    def test_ls_filters_sorts_and_chooses_columns(self, tmp_path: Path) -> None:
+        for i in range(3):
+            record(tmp_path / f"{i}.mcap", episodes=i + 1, name=f"run-{i}", metadata={"lr": 10.0**-i})
+        lines = command("ls", str(tmp_path), "--sort", "-episodes", "--columns", "run,episodes").splitlines()
+        assert [line.split() for line in lines] == [
+            ["RUN", "EPISODES"], ["run-2", "3"], ["run-1", "2"], ["run-0", "1"],
+        ]  # fmt: skip
+        found = json.loads(
+            command("ls", str(tmp_path), "--filter", "run.metadata.lr < 0.5 and seed = 0", "--json")
+        )
+        assert [(one["name"], one["episodes"]) for one in found] == [("run-1", 1), ("run-2", 1)]
+        wrong = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "retrn"])
+        assert wrong.exit_code == 2
+        assert "did you mean 'return'" in wrong.output
+
+    def test_tag_and_edit(self, tmp_path: Path, capsys: Any) -> None:
+        path = str(record(tmp_path / "r.mcap"))
+        command("tag", path, "--episodes", "0,2", "success=true", "note=gripper slipped", "grade=1.5")
+        assert Recording(path).episodes[2].metadata == {
+            "success": True,
+            "note": "gripper slipped",
+            "grade": 1.5,
+        }
+        command("tag", path, "--filter", "metadata.grade > 1", "grade=", "--dry-run")
+        assert Recording(path).episodes[0].metadata["grade"] == 1.5
+        command("tag", path, "--filter", "metadata.grade > 1", "grade=")
+        assert "grade" not in Recording(path).episodes[0].metadata
+        command("tag", path, "--undo")
+        assert Recording(path).episodes[0].metadata["grade"] == 1.5
+        command(
+            "edit",
+            path,
+            "--name",
+            "best",
+            "--set",
+            "lr=0.5",
+            "--set",
+            "algo=ppo",
+            "--tag",
+            "x",
+            "--split",
+            "eval",
+        )
+        run = Recording(path).run
+        assert (run.name, run.metadata, run.tags, run.split) == (
+            "best",
+            {"lr": 0.5, "algo": "ppo"},
+            ("x",),
+            "eval",
+        )
+        for words in (["tag", path], ["tag", "x=1"], ["edit", path], ["edit", path, "--set", "novalue"]):
+            assert CliRunner().invoke(app, words).exit_code == 2
+
+    def test_record_says_what_run_it_is(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        command(
+            "record", "CartPole-v1", "-o", "runs/", "--steps", "20", "--name", "rnd", "--set", "policy=random",
+            "--tag", "a", "--split", "eval", "--capture", "none",
+        )  # fmt: skip
+        (path,) = Path("runs").iterdir()
+        assert path.name.startswith("rnd_20")
+        run = Recording(path).run
+        assert (run.name, run.metadata, run.tags, run.split, run.command) == (
+            "rnd", {"policy": "random"}, ("a",), "eval", (),
+        )  # fmt: skip
+        assert "policy=random" in command("info", str(path))

@@ -1,0 +1,95 @@
+"""What somebody said about episodes after they were recorded; kept as `annotations.json`.
+
+Each annotation gives values to some episodes. Later ones count more than earlier ones, and all of them more than the
+metadata that were recorded. A value of null takes a key away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import FormatError, RecordingError
+
+__all__ = ["ANNOTATIONS_MEDIA_TYPE", "ANNOTATIONS_NAME", "Annotation", "Annotations"]
+
+ANNOTATIONS_NAME: Final = "annotations.json"
+ANNOTATIONS_MEDIA_TYPE: Final = "application/json"
+_MOST: Final = 1 << 26  # bytes of `annotations.json`
+
+
+class Annotation(NamedTuple):
+    """`episodes` are their numbers, `by` the user's name, `at` a time (ISO 8601 in UTC)."""
+
+    episodes: list[int]
+    values: dict[str, Any]
+    by: str
+    at: str
+
+
+class Annotations:
+    """The annotations of a recording, in their order.
+
+    Raises:
+        FormatError: `data` is something else.
+    """
+
+    def __init__(self, data: bytes | None = None, where: str = "") -> None:
+        self.said: list[Annotation] = [] if data is None else _read(data, where)
+        self._of_episode: dict[int, list[Annotation]] = {}
+        for annotation in self.said:
+            for number in annotation.episodes:
+                self._of_episode.setdefault(number, []).append(annotation)
+
+    def of(self, episode: int) -> Sequence[Annotation]:
+        """Those of an episode (its number), the earliest first."""
+        return self._of_episode.get(episode, ())
+
+    def applied(self, episode: int, metadata: Mapping[str, Any]) -> dict[str, Any]:
+        """An episode's metadata with what was said about it."""
+        found = dict(metadata)
+        for annotation in self.of(episode):
+            for key, value in annotation.values.items():
+                if value is None:
+                    found.pop(key, None)
+                else:
+                    found[key] = value
+        return found
+
+    def to_json(self) -> bytes:
+        """The content of `annotations.json`.
+
+        Raises:
+            RecordingError: JSON cannot hold a value, or they are too many.
+        """
+        try:
+            data = jsonvalue.dumps_plain([annotation._asdict() for annotation in self.said]).encode()
+        except (TypeError, ValueError) as err:
+            raise RecordingError(f"annotation: {err}") from err
+        if len(data) > _MOST:
+            raise RecordingError(f"annotations: expected at most {_MOST} bytes, found {len(data)}")
+        return data
+
+
+def _read(data: bytes, where: str) -> list[Annotation]:
+    try:
+        document = jsonvalue.loads(data.decode())
+    except (FormatError, ValueError, RecursionError) as err:
+        raise FormatError(f"{where}: expected annotations as JSON, found something else: {err}") from err
+    if not isinstance(document, list) or not all(map(_is_annotation, document)):
+        raise FormatError(f"{where}: expected a list of annotations, see annotations.schema.json")
+    return [Annotation(one["episodes"], one["values"], one["by"], one["at"]) for one in document]
+
+
+def _is_annotation(value: object) -> bool:
+    if not isinstance(value, dict) or value.keys() != set(Annotation._fields):
+        return False
+    numbers = value["episodes"]
+    return (
+        isinstance(numbers, list)
+        and all(type(number) is int and 0 <= number < 1 << 32 for number in numbers)
+        and isinstance(value["values"], dict)
+        and isinstance(value["by"], str)
+        and isinstance(value["at"], str)
+    )

@@ -1,0 +1,130 @@
+"""Says more about episodes, and about the run, of a finished recording. Its steps stay as they are, byte for byte."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.recording.annotations import (
+    ANNOTATIONS_MEDIA_TYPE,
+    ANNOTATIONS_NAME,
+    Annotation,
+    Annotations,
+)
+from tupli_mcap.recording.edit.attach import add_attachments
+from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
+from tupli_mcap.schema.times import iso_utc
+
+__all__ = ["annotate_episodes", "edit_run", "undo_annotation"]
+
+
+def annotate_episodes(
+    path: str | os.PathLike[str],
+    values: Mapping[str, Any],
+    episodes: Sequence[int] | None = None,
+    *,
+    dry_run: bool = False,
+) -> list[int]:
+    """Gives episodes (their numbers; all by default) values that count more than the metadata that were recorded.
+
+    A value of None takes a key away. Who said it and when is kept. A signature is left out: it is of what was there.
+    The end of the file is written anew, in one rename.
+
+    Returns:
+        The numbers of the episodes.
+
+    Raises:
+        RecordingError: there are no such episodes, or no values; JSON cannot hold one; the recording is not finished,
+            or cannot be written.
+        FormatError: it is damaged.
+    """
+    with Recording(path) as recording:
+        known = recording.index["episode"].tolist()
+        chosen = known if episodes is None else sorted({int(number) for number in episodes})
+        missing = sorted(set(chosen) - set(known))
+        said = Annotations()
+        said.said = [*recording.annotations.said]
+    if missing:
+        raise RecordingError(f"{path} has no episode {missing[0]}; its episodes are {_some(known)}")
+    if not chosen or not values:
+        raise RecordingError(
+            f"expected episodes and values to give them, found {chosen!r:.60}, {values!r:.60}"
+        )
+    said.said.append(Annotation(chosen, dict(values), _user(), iso_utc(time.time_ns())))
+    _say(path, {ANNOTATIONS_NAME: (ANNOTATIONS_MEDIA_TYPE, said.to_json())}, dry_run=dry_run)
+    return chosen
+
+
+def undo_annotation(path: str | os.PathLike[str], *, dry_run: bool = False) -> Annotation:
+    """Takes back what was said about episodes last, and returns it.
+
+    Raises:
+        RecordingError: nothing was said; otherwise as `annotate_episodes`.
+    """
+    with Recording(path) as recording:
+        said = Annotations()
+        said.said = [*recording.annotations.said]
+    if not said.said:
+        raise RecordingError(f"{path} has no annotation to take back")
+    last = said.said.pop()
+    _say(path, {ANNOTATIONS_NAME: (ANNOTATIONS_MEDIA_TYPE, said.to_json())}, dry_run=dry_run)
+    return last
+
+
+def edit_run(
+    path: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    tags: Sequence[str] | None = None,
+    split: str | None = None,
+    dry_run: bool = False,
+) -> Run:
+    """Changes what a recording says of its run, and returns it; what is not given stays.
+
+    `metadata` are added to those that there are; a value of None takes a key away. The recording keeps its identity.
+
+    Raises:
+        RecordingError: as `annotate_episodes`; or the recording was made of several runs.
+    """
+    with Recording(path) as recording:
+        if len(recording.runs) > 1:
+            raise RecordingError(
+                f"{path} is made of {len(recording.runs)} runs; edit the recordings that it was made of, and merge them"
+            )
+        (said,) = recording.recorded_runs.runs
+    added = {**said.metadata, **(metadata or {})}
+    run = Run.given(
+        said.name if name is None else name,
+        {key: value for key, value in added.items() if value is not None},
+        said.tags if tags is None else tags,
+        said.split if split is None else split,
+    )
+    run = replace(said, name=run.name, metadata=run.metadata, tags=run.tags, split=run.split)
+    _say(path, {RUN_NAME: (RUN_MEDIA_TYPE, RecordedRuns([run]).to_json())}, dry_run=dry_run)
+    return run
+
+
+def _say(
+    path: str | os.PathLike[str], attachments: Mapping[str, tuple[str, bytes]], *, dry_run: bool
+) -> None:
+    if not dry_run:
+        add_attachments(path, attachments, without=[SIGNATURE_NAME])
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # a user without a name, as in a container
+        return ""
+
+
+def _some(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers[:5])) + (" …" if len(numbers) > 5 else "")

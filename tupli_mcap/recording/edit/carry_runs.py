@@ -1,0 +1,49 @@
+"""What recordings say of their runs, and of episodes afterwards, for one that is made of them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.recording.annotations import ANNOTATIONS_MEDIA_TYPE, ANNOTATIONS_NAME, Annotations
+from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
+
+__all__ = ["carry_runs"]
+
+
+def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple[str, bytes]]:
+    """The attachments that say of each episode which run it is of, and what was said about it.
+
+    Args:
+        parts: recordings in the order of their episodes in the new one: rows of their index, and what is added to the
+            numbers of these episodes.
+    """
+    runs: list[Run] = []
+    places: list[int] = []
+    annotations = Annotations()
+    several = len({recording.uuid for recording, _, _ in parts}) > 1  # files whose names are lost
+    for recording, rows, shift in parts:
+        said_runs = recording.runs if several else recording.recorded_runs.runs
+        at = np.searchsorted(recording.index["episode"], rows["episode"]).tolist()
+        for place in (recording.run_places[i] for i in at):
+            run = said_runs[place]
+            if run not in runs:
+                runs.append(run)
+            places.append(runs.index(run))
+        kept = set(rows["episode"].tolist())
+        for said in recording.annotations.said:
+            numbers = [number + shift for number in said.episodes if number in kept]
+            if numbers:
+                annotations.said.append(said._replace(episodes=numbers))
+    spans = [(len(list(same)), place) for place, same in itertools.groupby(places)]
+    found = {}
+    if runs and runs != [Run()]:
+        carried = RecordedRuns(runs, spans if len(runs) > 1 else ())
+        found[RUN_NAME] = (RUN_MEDIA_TYPE, carried.to_json())
+    if annotations.said:
+        found[ANNOTATIONS_NAME] = (ANNOTATIONS_MEDIA_TYPE, annotations.to_json())
+    return found

@@ -1,0 +1,169 @@
+"""What a recording says of the run it is of: a name, what was tried, where its code stood; kept as `run.json`.
+
+A run is one start of a program. All files that a wrapper goes on in are of the same run.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final, NamedTuple, Self
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.schema.times import iso_utc
+
+__all__ = ["MAX_RUN", "RUN_MEDIA_TYPE", "RUN_NAME", "RecordedRuns", "Run"]
+
+RUN_NAME: Final = "run.json"
+RUN_MEDIA_TYPE: Final = "application/json"
+MAX_RUN: Final = 1 << 20  # bytes of `run.json`
+_LISTS: Final = ("tags", "command")
+_TEXTS: Final = ("id", "name", "split", "environment", "started", "ended", "host")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run, as its recording says it. What is not known is empty.
+
+    id: 32 hex digits, the same in all files of the run. name: given by who recorded, else that of the file.
+    metadata: given by who recorded: the algorithm, its settings. tags: words for it. split: "train", "eval" or another
+    word. environment: the Gymnasium id, or else the class. started, ended: ISO 8601 in UTC. command: the arguments of
+    the process. git: `commit` and `dirty` of the program's directory. versions: of Python and of packages. host: the
+    machine's name.
+    """
+
+    id: str = ""
+    name: str = ""
+    metadata: dict[str, Any] = field(default_factory=dict)
+    tags: tuple[str, ...] = ()
+    split: str = ""
+    environment: str = ""
+    started: str = ""
+    ended: str = ""
+    command: tuple[str, ...] = ()
+    git: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    host: str = ""
+
+    @classmethod
+    def given(
+        cls, name: str | None, metadata: Mapping[str, Any] | None, tags: Sequence[str], split: str
+    ) -> Self:
+        """What somebody says of a run.
+
+        Raises:
+            RecordingError: a part is something else than text, or than JSON can hold.
+        """
+        if isinstance(tags, str) or not all(isinstance(tag, str) and tag for tag in tags):
+            raise RecordingError(f"tags: expected a list of words, found {tags!r:.80}")
+        for what, text in (("name", name or ""), ("split", split)):
+            if not isinstance(text, str) or len(text) > 1000:
+                raise RecordingError(
+                    f"{what}: expected a text of at most 1000 characters, found {text!r:.80}"
+                )
+        if metadata is not None and not isinstance(metadata, Mapping):
+            raise RecordingError(f"metadata: expected a dict, found {metadata!r:.80}")
+        run = cls(name=name or "", metadata=dict(metadata or {}), tags=tuple(tags), split=split)
+        RecordedRuns([run]).to_json()
+        return run
+
+    @classmethod
+    def of_document(cls, document: object, where: str) -> Self:
+        """A run as `run.json` has it; keys that are not known are left out.
+
+        Raises:
+            FormatError: it is something else.
+        """
+        if not isinstance(document, dict):
+            raise FormatError(f"{where}: expected a run as a JSON object, found {document!r:.80}")
+        said = {key: document[key] for key in cls.__dataclass_fields__ if key in document}
+        for key, value in said.items():
+            if key in _TEXTS:
+                good = isinstance(value, str)
+            elif key in _LISTS:
+                good = isinstance(value, list) and all(isinstance(text, str) for text in value)
+                said[key] = tuple(value) if good else value
+            else:
+                good = isinstance(value, dict)
+            if not good:
+                raise FormatError(f"{where}: found {value!r:.80} as the {key} of a run; see run.schema.json")
+        return cls(**said)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Its parts but command and versions, as plain values: what filters see (`run.name`, `run.metadata.lr`)."""
+        return {
+            key: list(value) if key in _LISTS else value
+            for key, value in vars(self).items()
+            if key not in ("command", "versions")
+        }
+
+    def known_as(self, name: str, environment: str, started_ns: int, ended_ns: int) -> Self:
+        """The same, with what its file says where the run itself does not."""
+        return replace(
+            self,
+            name=self.name or name,
+            environment=self.environment or environment,
+            started=self.started or (iso_utc(started_ns) if started_ns else ""),
+            ended=iso_utc(ended_ns) if ended_ns else "",
+        )
+
+
+class RecordedRuns(NamedTuple):
+    """The runs that the episodes of a recording are of.
+
+    runs: one, where the recording was not made of others. spans: (episodes, place in `runs`), by the order of episodes
+    in the index; episodes beyond the last span are of the last run.
+    """
+
+    runs: Sequence[Run]
+    spans: Sequence[tuple[int, int]] = ()
+
+    def places(self, episodes: int) -> list[int]:
+        """The place in `runs` of each episode."""
+        found = list(itertools.chain.from_iterable([place] * count for count, place in self.spans))[:episodes]
+        return found + [len(self.runs) - 1] * (episodes - len(found))
+
+    def to_json(self) -> bytes:
+        """The content of `run.json`: the parts that are not empty, but for `ended`, which the episodes say.
+
+        Raises:
+            RecordingError: JSON cannot hold the metadata, or they are too many.
+        """
+        runs = [
+            {key: value for key, value in asdict(run).items() if value and key != "ended"}
+            for run in self.runs
+        ]
+        document: dict[str, Any] = {"runs": runs}
+        if self.spans:
+            document["spans"] = [list(span) for span in self.spans]
+        try:
+            data = jsonvalue.dumps_plain(document).encode()
+        except (TypeError, ValueError) as err:
+            raise RecordingError(f"metadata of the run: {err}") from err
+        if len(data) > MAX_RUN:
+            raise RecordingError(f"metadata of the run: expected at most {MAX_RUN} bytes, found {len(data)}")
+        return data
+
+    @classmethod
+    def from_json(cls, data: bytes, where: str) -> Self:
+        """Raises FormatError unless it is what `to_json` makes."""
+        try:
+            document = jsonvalue.loads(data.decode())
+        except (FormatError, ValueError, RecursionError) as err:
+            raise FormatError(f"{where}: expected runs as JSON, found something else: {err}") from err
+        runs = document.get("runs") if isinstance(document, dict) else None
+        if not isinstance(runs, list) or not runs:
+            raise FormatError(f"{where}: expected at least one run, found {document!r:.80}")
+        spans = document.get("spans", [])
+        if not isinstance(spans, list) or not all(_is_span(span, len(runs)) for span in spans):
+            raise FormatError(f"{where}: found {spans!r:.80} as the spans of runs; see run.schema.json")
+        return cls([Run.of_document(run, where) for run in runs], [(span[0], span[1]) for span in spans])
+
+
+def _is_span(span: object, runs: int) -> bool:
+    if not isinstance(span, list) or len(span) != 2 or not all(type(number) is int for number in span):
+        return False
+    count, place = span
+    return bool(0 <= count < 1 << 32 and 0 <= place < runs)
