@@ -12,7 +12,7 @@ ENVS, STEPS, UPDATES = 8, 128, 12
 torch.manual_seed(1)
 
 envs = gym.make_vec("CartPole-v1", num_envs=ENVS, vectorization_mode="sync")
-envs = tupli_mcap.vector.RecordEpisodes(envs, "runs/")
+envs = tupli_mcap.vector.RecordEpisodes(envs, "runs/", name="ppo-seed1", metadata={"lr": 2.5e-3, "seed": 1})
 actor = nn.Sequential(nn.Linear(4, 64), nn.Tanh(), nn.Linear(64, 2))
 critic = nn.Sequential(nn.Linear(4, 64), nn.Tanh(), nn.Linear(64, 1))
 optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=2.5e-3)
@@ -53,6 +53,6 @@ for _ in range(UPDATES):
 envs.close()
 
 run = tupli_mcap.open(envs.path)
-print(run)
+print(run[0].run.name, run)
 for part in np.array_split(run.sort("ended").returns, 6):
     print(f"{part.mean():6.1f} " + "#" * int(part.mean() / 4))

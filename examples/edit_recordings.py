@@ -1,4 +1,4 @@
-"""What is good of a recording is kept: filtered, sorted, parted, saved; the rest is deleted."""
+"""What is good of a recording is kept: filtered, sorted, parted, annotated, saved; the rest is deleted."""
 
 from pathlib import Path
 
@@ -17,9 +17,14 @@ with tupli_mcap.RecordEpisodes(gym.make("CartPole-v1"), "all.mcap") as env:
 dataset = tupli_mcap.open("all.mcap")
 print("recorded ", dataset)
 
-good = dataset.filter("return > 25 and end == 'terminal'")
-print("good     ", good, "| best", good.sort("return", descending=True).head(3).returns)
+best = dataset.sort("return", descending=True)[0]
+best.annotate(
+    success=True, note="the longest one"
+)  # or: tupli-mcap tag all.mcap --episodes best success=true
+print("annotated", tupli_mcap.open("all.mcap").filter("metadata.success")[0].metadata)
 
+good = dataset.filter("return > 25 and end == 'terminal'")
+print("good     ", good)
 train, test = good.split(0.8, seed=0)
 for name, part in (("train", train), ("test", test)):
     path = part.save(f"{name}.mcap")

@@ -5,22 +5,10 @@ import gymnasium as gym
 import tupli_mcap
 
 
-class Note(tupli_mcap.EpisodeMetadataCallback):
-    """The same metadata for every episode of a run."""
-
-    def __init__(self, **metadata):
-        self.metadata = metadata
-
-    def reset(self):
-        pass
-
-    def __call__(self, step):
-        return self.metadata
-
-
 def record(policy, gain):
+    """Five episodes of pushing the way the pole leans, and turns."""
     with tupli_mcap.RecordEpisodes(
-        gym.make("CartPole-v1"), "runs/", metadata_callback=Note(policy=policy, gain=gain)
+        gym.make("CartPole-v1"), "runs/", name=policy, metadata={"gain": gain}, tags=["by hand"]
     ) as env:
         for seed in range(5):
             state, _ = env.reset(seed=seed)
@@ -34,17 +22,20 @@ record("angle", 0.0)
 record("angle and speed", 0.5)
 record("wrong sign", -0.3)
 
+# on the command line: tupli-mcap ls runs/ --filter 'run.started > "7d ago" and run.metadata.gain > 0'
 everything = tupli_mcap.open("runs/")
-print(everything, "\nkeys:", *everything.keys, "\n")
+print(everything)
+recent = everything.filter('run.started > "7d ago" and run.metadata.gain > 0')
+found = recent.filter("return > 150")
+print("found", len(found), "episodes of", {episode.run.name for episode in found})
 
-recent = everything.filter('ended >= "7d ago" and ended <= "today"')
-found = recent.filter("return > 150 and metadata.gain > 0")
-print(found, "of", {episode.metadata["policy"] for episode in found})
-print(*{episode.recording.name for episode in found}, "\n")
-
-table = everything.to_pandas("episodes")
+run = found[0].run
+print(f"{run.name!r}: {run.environment}, started {run.started}, {run.metadata}, tags {run.tags}")
 print(
-    table.groupby("metadata.policy").agg(
-        episodes=("return", "size"), mean_return=("return", "mean"), last=("ended", "max")
-    )
+    "made by",
+    " ".join(run.command),
+    "at commit",
+    run.git.get("commit", "none"),
+    "in",
+    found[0].recording.name,
 )

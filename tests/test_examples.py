@@ -33,8 +33,5 @@ def test_it_runs(script: Path, tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*.mcap")), "an example records"
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-def test_it_is_short_and_says_what_for(script: Path) -> None:
-    lines = script.read_text(encoding="utf-8").splitlines()
-    assert lines[0].startswith('"""')
-    assert len(lines) < 60
+def test_there_are_examples() -> None:
+    assert SCRIPTS
