@@ -193,9 +193,12 @@ class TestRecord:
             assert recording.benchmark.record.name == "CartPole-v1"
 
     def test_a_directory_gets_a_new_file_each_time(self, here: Path) -> None:
-        for _ in range(2):
-            ok("record", "CartPole-v1", "-o", "new/runs/", "--steps", 10)
-        assert len([Recording(path) for path in Path("new/runs").glob("CartPole-v1_*.mcap")]) == 2
+        made = [
+            run("record", "CartPole-v1", "-o", "new/runs/", "--steps", 10, "--json").json["path"]
+            for _ in range(2)
+        ]
+        assert sorted(made) == made
+        assert [Recording(path).num_steps for path in made] == [10, 10]
 
     def test_modes(self, here: Path) -> None:
         ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 40)
