@@ -267,14 +267,14 @@ def test_frames(tmp_path: Path) -> None:
 
 def test_evaluation(tmp_path: Path) -> None:
     train = VecRecordEpisodes(make_vec_env("CartPole-v1", n_envs=2, seed=1), f"{tmp_path}/train/")
-    test = VecRecordEpisodes(make_vec_env("CartPole-v1", seed=2), f"{tmp_path}/eval/")
+    test = VecRecordEpisodes(make_vec_env("CartPole-v1", seed=2), f"{tmp_path}/eval/", split="eval")
     model = PPO("MlpPolicy", VecNormalize(train), n_steps=64, n_epochs=1, device="cpu")
     model.learn(
         256, EvalCallback(VecNormalize(test, training=False), n_eval_episodes=2, eval_freq=64, verbose=0)
     )
     train.close(), test.close()
     assert open_dataset(tmp_path / "train").n_steps == 256
-    assert len(open_dataset(tmp_path / "eval").filter("end == 'terminal'")) >= 2
+    assert len(open_dataset(tmp_path / "eval").filter("run.split == 'eval'")) >= 2
 
 
 @pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])

@@ -46,7 +46,8 @@ class VecRecordEpisodes(VecEnvWrapper):  # type: ignore[misc]  # its types are n
 
     What it sees is recorded, and what it returns is what it got: inside `VecNormalize` that is what the environments
     gave, around it what the policy learns from. An episode's final state is `terminal_observation` of its last info;
-    it ends as a timeout where `TimeLimit.truncated` says so. `EvalCallback` needs both environments wrapped alike.
+    it ends as a timeout where `TimeLimit.truncated` says so. `EvalCallback` needs both environments wrapped alike;
+    `split="eval"` marks what is recorded of the second one.
     `make_vec_env(..., wrapper_class=RecordEpisodes, wrapper_kwargs={"path": "runs/"})` makes a file of each
     sub-environment instead.
 
