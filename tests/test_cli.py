@@ -192,11 +192,20 @@ class TestRecord:
             assert len(recording) == told["episodes"]
             assert recording.benchmark.record.name == "CartPole-v1"
 
+    def test_a_directory_gets_a_new_file_each_time(self, here: Path) -> None:
+        made = [
+            run("record", "CartPole-v1", "-o", "new/runs/", "--steps", 10, "--json").json["path"]
+            for _ in range(2)
+        ]
+        assert sorted(made) == made
+        assert [Recording(path).num_steps for path in made] == [10, 10]
+
     def test_modes(self, here: Path) -> None:
         ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 40)
         before = Path("a.mcap").read_bytes()
         assert fails("record", "CartPole-v1", "-o", "a.mcap") == (
-            "a.mcap exists and is not overwritten; choose another path, or --mode a to append, w to replace"
+            "a.mcap exists and is not overwritten; choose another path, or --mode a to append, w to replace; "
+            "a directory gets a new file each time"
         )
         assert Path("a.mcap").read_bytes() == before
         told = run("record", "CartPole-v1", "-o", "a.mcap", "--steps", 30, "--mode", "a", "--json").json

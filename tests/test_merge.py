@@ -428,6 +428,13 @@ class TestSplit:
         assert parts[0].copied > 0
         assert len({Recording(part.path).uuid for part in parts}) == len(parts) > 2
 
+    def test_missing_directories_are_made(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap")
+        merge_recordings([path], tmp_path / "a" / "all.mcap")
+        split_recording(path, tmp_path / "b" / "c" / "part.mcap", episodes=3)
+        assert (tmp_path / "a" / "all.mcap").is_file()
+        assert (tmp_path / "b" / "c" / "part_0001.mcap").is_file()
+
     def test_by_bytes(self, tmp_path: Path) -> None:
         path = record(tmp_path / "run.mcap", steps=1500, record_info=False)
         parts = split_recording(path, tmp_path / "part.mcap", max_bytes=100_000)

@@ -470,6 +470,9 @@ def test_statistics_of_what_follows_have_a_name_of_their_own(dataset: Dataset) -
 def test_what_cannot_be_saved_there(dataset: Dataset, tmp_path: Path) -> None:
     with pytest.raises(TupliError, match="is a directory; give the path of a file"):
         dataset.save(tmp_path)
+    with pytest.raises(TupliError, match="is a directory; give the path of a file"):
+        dataset.save(f"{tmp_path}/new/")
+    assert not (tmp_path / "new").exists()
     copy = dataset.head(5).save(tmp_path / "copy.mcap")
     with pytest.raises(TupliError, match="is one of the recordings themselves"):
         tupli_mcap.open(copy).head(1).save(copy, overwrite=True)

@@ -642,9 +642,10 @@ def test_a_directory_gets_a_new_file_each_time(tmp_path: Path, vector: bool) -> 
                 env.step(env.action_space.sample())
                 paths.append(env.path)
         assert {path.parent for path in paths[-4:]} == {Path(folder)}
+        assert sorted(paths[-4:]) == paths[-4:]
     assert len(set(paths)) == 8
     for path in paths:
-        assert re.fullmatch(r"CartPole-v1_\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d(-\d)?\.mcap", path.name)
+        assert re.fullmatch(r"CartPole-v1_\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d(_\d\d)?\.mcap", path.name)
         assert len(Recording(path)) == (2 if vector else 1)
 
 
@@ -676,6 +677,12 @@ def test_missing_directories_are_made(tmp_path: Path) -> None:
         with RecordEpisodes(gym.make("CartPole-v1"), path, mode=mode) as env:  # type: ignore[arg-type]
             roll(env, 1)
         assert len(Recording(path)) == 1
+
+
+def test_a_metadata_callback_without_reset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="metadata_callback: expected an EpisodeMetadataCallback"):
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", metadata_callback=lambda step: {})  # type: ignore[arg-type, return-value]
+    assert not any(tmp_path.iterdir())
 
 
 def test_existing_files_and_bad_places_are_refused(tmp_path: Path) -> None:

@@ -581,7 +581,7 @@ def test_targets(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"a\.mcap is never overwritten"):
         recover_recording(path, path, overwrite=True)
     with pytest.raises(RecordingError, match="cannot be written"):
-        recover_recording(path, tmp_path / "none" / "x.mcap")
+        recover_recording(path, other / "x.mcap")
     with pytest.raises(RecordingError, match="does not exist"):
         recover_recording(tmp_path / "none.mcap")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "other.mcap"]

@@ -15,6 +15,7 @@ from tupli_mcap import RecordEpisodes
 EXTRAS = (
     "pandas", "pyarrow", "rerun", "foxglove", "torch", "torchrl", "tensordict", "torchdata", "tensorflow",
     "matplotlib", "d3rlpy", "fsspec", "requests", "aiohttp", "cryptography", "PIL", "ale_py", "h5py", "IPython",
+    "stable_baselines3",
 )  # fmt: skip
 HEAVY = (*EXTRAS, "gymnasium", "numpy", "pydantic", "sqlalchemy", "sqlite3", "mcap", "zstandard", "rich")
 DATABASE = ("sqlalchemy", "sqlite3", "asyncio", "ssl")

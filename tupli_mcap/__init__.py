@@ -1,6 +1,6 @@
 """Record reinforcement-learning episodes as MCAP files, index them into datasets, train on them, hand them on.
 
-wrappers, vector           record an environment, or many
+wrappers, vector, sb3      record an environment, or many
 recording                  one file: read, written, recovered, edited, checked, signed
 journal, mcap, messages    what protects the steps of a killed process; the container; what is in it
 spaces, environment        leaves of Gymnasium's spaces; environments as data, and rebuilt
@@ -100,8 +100,8 @@ _HOMES = {
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 _MODULES = (
-    "benchmark", "dataset", "doctor", "errors", "plots", "recording", "replay", "schema", "storage", "torch", "trust",
-    "vector", "viewer",
+    "benchmark", "dataset", "doctor", "errors", "plots", "recording", "replay", "sb3", "schema", "storage", "torch",
+    "trust", "vector", "viewer",
 )  # fmt: skip
 
 __all__ = sorted(_HOME_OF)

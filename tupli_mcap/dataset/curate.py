@@ -77,14 +77,15 @@ def filter_recording(
     return report._replace(size=target.stat().st_size)
 
 
-def save(dataset: Dataset, target: Path, *, overwrite: bool) -> Path:
+def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool) -> Path:
     """See `Dataset.save`."""
+    target = Path(place)
     chosen: dict[str, list[int]] = {}
     for header in dataset._headers:
         chosen.setdefault(header.recording, []).append(header.episode)
     if not chosen:
         raise DatasetError("expected episodes to save, found none")
-    if target.is_dir():
+    if target.is_dir() or os.fspath(place).endswith(os.sep):
         raise DatasetError(f"{target} is a directory; give the path of a file (.mcap)")
     if target.exists() and not overwrite:
         raise DatasetError(f"{target} exists; choose another path, or overwrite it")

@@ -427,7 +427,7 @@ class Dataset(RandomAccess):
             RecordingError: it cannot be written.
             SpaceError: two recordings have different spaces.
         """
-        return curate.save(self, Path(target), overwrite=overwrite)
+        return curate.save(self, target, overwrite=overwrite)
 
     def map(
         self,

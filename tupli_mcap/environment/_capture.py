@@ -180,7 +180,8 @@ def _told_of_many(envs: Any) -> tuple[str | None, dict[str, Any] | None]:
     name = getattr(spec, "id", None)
     if not isinstance(name, str):
         return None, None
-    if type(envs) is not gym.vector.AsyncVectorEnv or "wrappers" in spec.kwargs:
+    is_of_one = getattr(envs, "spec_is_of_one", False)
+    if not is_of_one and (type(envs) is not gym.vector.AsyncVectorEnv or "wrappers" in spec.kwargs):
         return name, None
     kwargs = {key: value for key, value in spec.kwargs.items() if key not in _OF_MAKE_VEC}
     try:

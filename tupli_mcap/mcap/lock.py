@@ -217,7 +217,8 @@ class FileLock:
 
 def _exists(path: Path) -> RecordingError:
     return RecordingError(
-        f'{path} exists and is not overwritten; choose another path, or mode="a" to append, "w" to replace'
+        f'{path} exists and is not overwritten; choose another path, or mode="a" to append, "w" to replace; '
+        "a directory gets a new file each time"
     )
 
 

@@ -31,7 +31,7 @@ from tupli_mcap.wrappers.stacks import format_version, with_stacks
 if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession
 
-__all__ = ["EpisodeWrapper", "check_kind", "metadata_of", "success_of", "with_success"]
+__all__ = ["EpisodeWrapper", "check_kind", "metadata_of", "success_of", "with_success", "wrong_kind"]
 
 
 class EpisodeWrapper:
@@ -228,13 +228,28 @@ def with_success(metadata: str, info: Any) -> str:
 
 
 def check_kind(env: object, *, vector: bool) -> None:
-    """Raises RecordingError if an environment is single where a vector one is expected, or the other way round."""
-    if isinstance(env, gym.Env if vector else gym.vector.VectorEnv):
-        expected, found = ("vector", "single") if vector else ("single", "vector")
-        raise RecordingError(
-            f"expected a {expected} environment, found the {found} environment {type(env).__name__}; "
-            f"use tupli_mcap.{'' if vector else 'vector.'}RecordEpisodes"
-        )
+    """Raises RecordingError unless an environment is Gymnasium's, and single or a vector one as expected."""
+    if not isinstance(env, gym.vector.VectorEnv if vector else gym.Env):
+        raise wrong_kind(env, "a vector environment" if vector else "a single environment")
+
+
+def wrong_kind(env: object, expected: str) -> RecordingError:
+    """The error for what is no environment, or one of another kind; it names the recorder of that kind."""
+    libraries = {cls.__module__.partition(".")[0] for cls in type(env).__mro__}
+    name = type(env).__name__
+    if isinstance(env, gym.Env):
+        found = f"the single environment {name}; use tupli_mcap.RecordEpisodes"
+    elif isinstance(env, gym.vector.VectorEnv):
+        found = f"the vector environment {name}; use tupli_mcap.vector.RecordEpisodes"
+    elif "stable_baselines3" in libraries:
+        found = f"the VecEnv {name} of Stable-Baselines3; use tupli_mcap.sb3.VecRecordEpisodes"
+    elif "pettingzoo" in libraries:
+        found = f"the PettingZoo environment {name}; there is no recorder of several agents yet; EpisodeWriter records it, an agent a stream"
+    elif isinstance(env, str):
+        found = f"{env!r:.60}; make it: gymnasium.make({env!r:.60})"
+    else:
+        found = f"{name}, which is no gymnasium.Env"
+    return RecordingError(f"expected {expected}, found {found}")
 
 
 def _close_recordings(work: Work, live: LiveSession | None) -> None:

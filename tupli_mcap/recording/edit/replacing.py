@@ -17,10 +17,13 @@ __all__ = ["replacing", "tidy"]
 def replacing(goal: Path, permissions: int = 0o666) -> Iterator[tuple[int, Path]]:
     """A descriptor and the path of a file that becomes `goal`, synced, when the block ends without an error.
 
+    Directories that are missing are made.
+
     Raises:
         RecordingError: the system refuses, here or in the block; `goal` is as it was.
     """
     try:
+        goal.parent.mkdir(parents=True, exist_ok=True)
         with files.replacing(goal) as new:
             fd = files.create(new, permissions)
             try:

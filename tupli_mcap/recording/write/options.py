@@ -105,6 +105,12 @@ class RecordOptions:
             )
         if self.capture not in ("all", "versions", "none"):
             raise RecordingError(f"capture: expected 'all', 'versions' or 'none', found {self.capture!r:.80}")
+        callback = self.metadata_callback
+        if callback is not None and not (callable(callback) and callable(getattr(callback, "reset", None))):
+            raise RecordingError(
+                "metadata_callback: expected an EpisodeMetadataCallback, which is called with each step and has "
+                f"reset(), found {callback!r:.80}; what is the same for all episodes of a run is metadata="
+            )
         check_durability(self.durability)
         check_image_format(self.image_format)
         _check_directory(self.journal_dir)

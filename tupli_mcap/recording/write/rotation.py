@@ -80,7 +80,7 @@ class Rotation:
         """A path in a directory at which nothing is."""
         stem = f"{self._name}_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
         for k in itertools.count(1):
-            path = folder / f"{stem}{'' if k == 1 else f'-{k}'}.mcap"
+            path = folder / f"{stem}{'' if k == 1 else f'_{k:02}'}.mcap"  # sorted by name they are in order
             if not os.path.lexists(path):
                 break
         return path

@@ -1,0 +1,242 @@
+"""`VecRecordEpisodes` for `VecEnv`s of Stable-Baselines3: the vector recorder, shown one as Gymnasium's."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector.utils import batch_space
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import Array
+from tupli_mcap.errors import missing_extra
+from tupli_mcap.recording.write.writer import ResetFacts
+from tupli_mcap.wrappers.base import wrong_kind
+from tupli_mcap.wrappers.vector import RecordEpisodes
+
+try:
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import (
+        DummyVecEnv,
+        SubprocVecEnv,
+        VecEnv,
+        VecEnvWrapper,
+        VecFrameStack,
+    )
+except ImportError as err:
+    raise missing_extra("tupli_mcap.sb3 needs stable-baselines3", "sb3") from err
+
+__all__ = ["VecRecordEpisodes"]
+
+_FINAL = "terminal_observation"
+_TIMEOUT = "TimeLimit.truncated"
+
+
+class VecRecordEpisodes(VecEnvWrapper):  # type: ignore[misc]  # its types are not followed
+    """Records every sub-environment of a Stable-Baselines3 `VecEnv` into the MCAP file `path`.
+
+        venv = VecRecordEpisodes(make_vec_env("CartPole-v1", n_envs=4), "runs/")
+        PPO("MlpPolicy", venv).learn(100_000)
+        venv.close()
+
+    What it sees is recorded, and what it returns is what it got: inside `VecNormalize` that is what the environments
+    gave, around it what the policy learns from. An episode's final state is `terminal_observation` of its last info;
+    it ends as a timeout where `TimeLimit.truncated` says so. `EvalCallback` needs both environments wrapped alike;
+    `split="eval"` marks what is recorded of the second one.
+    `make_vec_env(..., wrapper_class=RecordEpisodes, wrapper_kwargs={"path": "runs/"})` makes a file of each
+    sub-environment instead.
+
+    Args:
+        venv: `DummyVecEnv`, `SubprocVecEnv`, a wrapper around one, or a `VecEnv` of your own.
+        path: the recording, or a directory, which gets a new file named by environment and time.
+        options: those of `tupli_mcap.RecordEpisodes`, and what `tupli_mcap.vector.RecordEpisodes` says of them.
+
+    Raises:
+        MissingExtraError: Stable-Baselines3 is not installed (at import; extra `sb3`).
+        RecordingError: no `VecEnv`; else as `tupli_mcap.RecordEpisodes`.
+
+    Not thread-safe.
+    """
+
+    def __init__(self, venv: VecEnv, path: str | os.PathLike[str], **options: Any) -> None:
+        if not isinstance(venv, VecEnv):
+            raise wrong_kind(venv, "a VecEnv of Stable-Baselines3")
+        super().__init__(venv)
+        options.setdefault("stack_size", _stack_size(venv))
+        self._shown = StableBaselinesVecEnv(venv)
+        self._recorder = _Recorder(self._shown, path, **options)
+        self._shown.tells_infos = self._recorder.uses_infos
+        self._actions: Any = None
+
+    @property
+    def path(self) -> Path:
+        """The file that is recorded to."""
+        return self._recorder.path
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that this wrapper has recorded to, in their order."""
+        return self._recorder.paths
+
+    def step_async(self, actions: Any) -> None:
+        self._actions = actions
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> Any:
+        self._recorder.step(self._actions)
+        return self._shown.result
+
+    def reset(self) -> Any:
+        return self._recorder.reset()[0]
+
+    def flush(self) -> None:
+        """Writes everything recorded so far into chunks; the journal already protects it."""
+        self._recorder.flush()
+
+    def close(self) -> None:
+        """Finishes the recording, then closes the environments. Calling it twice is fine.
+
+        Raises:
+            RecordingError: the disk refuses; everything that was recorded is safe.
+        """
+        self._recorder.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> Literal[False]:
+        self.close()
+        return False
+
+
+class StableBaselinesVecEnv(gym.vector.VectorEnv[Any, Any, Any]):
+    """A `VecEnv` as an environment of Gymnasium's under same-step autoreset.
+
+    `step` waits for the step that was sent to the `VecEnv` before.
+
+    Attributes:
+        envs: the sub-environments in this process, without the Monitor of `make_vec_env`, which changes no step.
+        spec: of the first sub-environment, wherever it lives, without that Monitor; None if it says nothing of it.
+        spec_is_of_one: what `spec` makes is a sub-environment.
+        tells_infos: `step` returns infos also where no episode ends.
+        result: what the `VecEnv` returned last.
+    """
+
+    spec_is_of_one = True
+    closed = True  # else Gymnasium closes the environments when this is collected
+
+    def __init__(self, venv: VecEnv) -> None:
+        self._venv = venv
+        self.num_envs = n = venv.num_envs
+        self.single_observation_space, self.single_action_space = venv.observation_space, venv.action_space
+        self.observation_space = batch_space(venv.observation_space, n)
+        self.action_space = batch_space(venv.action_space, n)
+        self.metadata = {**(getattr(venv, "metadata", None) or {}), "autoreset_mode": "SameStep"}
+        self.render_mode = venv.render_mode
+        self.envs = [_unmonitored(env) for env in getattr(venv.unwrapped, "envs", ())]
+        self.spec = _spec_of(venv)
+        self.tells_infos = True
+        self.result: Any = None
+        self._nobody = np.zeros(n, np.bool_)
+
+    def asked(self) -> tuple[Sequence[int | None], Sequence[Any]]:
+        """The seeds and options that the next reset passes to the sub-environments."""
+        base, nothing = self._venv.unwrapped, [None] * self.num_envs
+        return getattr(base, "_seeds", nothing), getattr(base, "_options", nothing)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> Any:
+        states = self._venv.reset()
+        return states, self._reset_infos()
+
+    def step(self, actions: Any) -> Any:
+        self.result = states, rewards, dones, infos = self._venv.step_wait()
+        rewards = np.asarray(rewards, np.float64)  # as they are stored
+        done = np.asarray(dones)
+        if not any(done.tolist()):
+            return states, rewards, self._nobody, self._nobody, infos if self.tells_infos else {}
+        done = done.astype(np.bool_)
+        timeouts = done & np.array([bool(info.get(_TIMEOUT)) for info in infos])
+        return states, rewards, done & ~timeouts, timeouts, self._with_final_infos(states, done, infos)
+
+    def render(self) -> Any:
+        return self._venv.get_images()
+
+    def close(self, **kwargs: Any) -> None:
+        self._venv.close()
+
+    def _reset_infos(self) -> list[Any]:
+        """What the last resets of the sub-environments returned; others than Stable-Baselines3's do not keep that."""
+        base = self._venv.unwrapped
+        known = isinstance(base, DummyVecEnv | SubprocVecEnv)
+        return list(base.reset_infos) if known else [{}] * self.num_envs
+
+    def _with_final_infos(self, states: Any, done: Array, infos: Sequence[Any]) -> list[Any]:
+        """The infos of a batch, of those who are `done` as of the reset, with what the step told under `final_info`."""
+        found, resets = list(infos), self._reset_infos()
+        for i in np.flatnonzero(done).tolist():
+            final = {key: value for key, value in infos[i].items() if key != _FINAL}
+            found[i] = {**resets[i], "final_info": final}
+            if infos[i].get(_FINAL) is not None:
+                found[i][_FINAL] = _as_in(states, infos[i][_FINAL])
+        return found
+
+
+class _Recorder(RecordEpisodes):
+    """Finds the seeds and options of a reset where a `VecEnv` keeps them."""
+
+    env: StableBaselinesVecEnv
+
+    @property
+    def uses_infos(self) -> bool:
+        """True if infos of steps are recorded, or given to a callback."""
+        return self._watches
+
+    def _facts(self, seed: Any, unseeded: list[bool], options: str, infos: Any) -> list[ResetFacts]:
+        facts = super()._facts(self._seeds, unseeded, options, infos)
+        texts = [jsonvalue.dumps_any(one) if one else "" for one in self._options]
+        return [one._replace(options=text) for one, text in zip(facts, texts, strict=True)]
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self._seeds, self._options = self.env.asked()
+        return super().reset()
+
+
+def _as_in(states: Any, state: Any) -> Any:
+    """One state in the dtypes of a batch, to which a `VecEnv` casts all states but final ones."""
+    if isinstance(states, dict):
+        return {key: _as_in(batch, state[key]) for key, batch in states.items()}
+    if isinstance(states, tuple):
+        return tuple(_as_in(batch, one) for batch, one in zip(states, state, strict=True))
+    return np.asarray(state, states.dtype)
+
+
+def _unmonitored(env: Any) -> Any:
+    return env.env if isinstance(env, Monitor) else env
+
+
+def _stack_size(venv: VecEnv) -> int | None:
+    """How many frames the outermost `VecFrameStack` stacks."""
+    while isinstance(venv, VecEnvWrapper):
+        if isinstance(venv, VecFrameStack):
+            stack_size: int = venv.stacked_obs.n_stack
+            return stack_size
+        venv = venv.venv
+    return None
+
+
+def _spec_of(venv: VecEnv) -> Any:
+    try:
+        spec = venv.get_attr("spec", 0)[0]
+        wrappers = spec.additional_wrappers
+    except Exception:  # noqa: BLE001 - a `VecEnv` of anybody's class may have no such thing
+        return None
+    if wrappers and wrappers[-1].entry_point == f"{Monitor.__module__}:{Monitor.__name__}":
+        return replace(spec, additional_wrappers=wrappers[:-1])
+    return spec
