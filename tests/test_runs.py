@@ -368,6 +368,34 @@ def test_success_is_understood(key: str, record_info: bool, tmp_path: Path) -> N
     assert "75%" in command("info", str(path))
 
 
+@pytest.mark.parametrize("autoreset", list(gym.vector.AutoresetMode))
+@pytest.mark.parametrize("record_info", [False, True])
+def test_success_of_sub_environments_is_understood(autoreset: Any, record_info: bool, tmp_path: Path) -> None:
+    class Sometimes(Winning):
+        """Its first two episodes say nothing."""
+
+        episodes = 0
+
+        def step(self, action: Any) -> Any:
+            self.episodes += 1
+            info = {} if self.episodes < 3 else {"is_success": bool(action)}
+            return 1, 1.0, True, False, info
+
+    env = gym.vector.SyncVectorEnv([Sometimes, Sometimes], autoreset_mode=autoreset)
+    with RecordVectorEpisodes(env, tmp_path / "v.mcap", record_info=record_info) as recorded:
+        recorded.reset(seed=0)
+        for _ in range(12):
+            _, _, terminals, _, _ = recorded.step(np.array([1, 0]))
+            if autoreset == gym.vector.AutoresetMode.DISABLED:
+                recorded.reset(options={"reset_mask": terminals})
+    recording = Recording(tmp_path / "v.mcap")
+    assert len(recording) >= 10
+    for env_number in (0, 1):
+        found = [episode.metadata for episode in recording.episodes if episode.env == env_number]
+        assert found == [{}] * 2 + [{"success": env_number == 0}] * (len(found) - 2)
+    assert verify_recording(tmp_path / "v.mcap").ok
+
+
 class TestCommands:
     def test_ls_filters_sorts_and_chooses_columns(self, tmp_path: Path) -> None:
         for i in range(3):

@@ -4,10 +4,10 @@ recording, episode, frames    `Recording`, and what it gives
 open, contents                opening a file: everything that is known of it then
 index, limits                 the episode index, and whether it can be true
 channels, file_series         the channels that a layout needs; the files of a series
-run, annotations              what is said of the run, and of episodes afterwards
 description, series           what `info` shows
 blocks                        whole episodes in bounded memory
 signature_file                the attachment that a signature is
+about/                        what is said of the run, and of episodes afterwards
 columns/, recover/            from rows to columns; from what a killed process left to episodes
 write/, edit/, check/, sign/  new recordings; out of others; whether they are right; who vouches for them
 """
@@ -18,10 +18,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from tupli_mcap.journal.file import journal_path
+from tupli_mcap.recording.about.run import Run
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.episode import Episode, Episodes, Step
 from tupli_mcap.recording.recording import RecordedBenchmark, Recording
-from tupli_mcap.recording.run import Run
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.check.verify import Problem, VerifyReport, verify_recording

@@ -12,6 +12,7 @@ from tupli_mcap import jsonvalue, signing
 from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
+from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.edit.made_of import made_of
@@ -162,10 +163,9 @@ def success_rate(recording: Recording, positions: Array) -> float | None:
     for i in positions.tolist():
         if 'success"' not in texts[i]:
             continue
-        metadata = recording.episode_metadata(i)
-        value = metadata.get("success", metadata.get("is_success"))
-        if isinstance(value, bool | int | float) and value in (0, 1):
-            said.append(bool(value))
+        found = success_of(recording.episode_metadata(i))
+        if found is not None:
+            said.append(found)
     return sum(said) / len(said) if said else None
 
 

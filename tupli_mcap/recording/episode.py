@@ -15,10 +15,10 @@ from tupli_mcap.recording.columns.fields import GymnasiumNames
 from tupli_mcap.schema import RLTuple
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording.about.run import Run
     from tupli_mcap.recording.columns.read import Columns
     from tupli_mcap.recording.frames import Frames
     from tupli_mcap.recording.recording import Recording
-    from tupli_mcap.recording.run import Run
 
 __all__ = ["Episode", "Episodes", "Step", "item_getter", "reward_getter"]
 

@@ -24,7 +24,8 @@ from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
-from tupli_mcap.recording.annotations import ANNOTATIONS_NAME, Annotations
+from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, Annotations
+from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.fields import FIVE, field_names
 from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
@@ -34,7 +35,6 @@ from tupli_mcap.recording.episode import Episodes
 from tupli_mcap.recording.frames import Cameras, Frames
 from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
 from tupli_mcap.recording.open import read_contents
-from tupli_mcap.recording.run import MAX_RUN, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, voucher
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf

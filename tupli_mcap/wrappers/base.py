@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import gymnasium as gym
-import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError
@@ -31,7 +30,7 @@ from tupli_mcap.wrappers.stacks import format_version, with_stacks
 if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession
 
-__all__ = ["EpisodeWrapper", "check_kind", "metadata_of", "success_of", "with_success", "wrong_kind"]
+__all__ = ["EpisodeWrapper", "check_kind", "metadata_of", "wrong_kind"]
 
 
 class EpisodeWrapper:
@@ -206,27 +205,6 @@ def metadata_of(callback: EpisodeMetadataCallback, step: Step) -> str:
         raise RecordingError(f"metadata_callback: {err}") from err
 
 
-def success_of(info: Any) -> bool | None:
-    """Whether the info of an episode's last step says that the episode succeeded (`is_success`, `success`); None if it
-    does not say."""
-    if type(info) is dict and info:
-        for key in ("is_success", "success"):
-            said = info.get(key)
-            if isinstance(said, bool | np.bool_) or (
-                isinstance(said, int | float | np.number) and said in (0, 1)
-            ):
-                return bool(said)
-    return None
-
-
-def with_success(metadata: str, info: Any) -> str:
-    """Metadata (a JSON text) with what `success_of` an info says, unless they say it already."""
-    said = success_of(info)
-    if said is None or '"success"' in metadata:
-        return metadata
-    return jsonvalue.dumps_plain({**jsonvalue.loads(metadata), "success": said})
-
-
 def check_kind(env: object, *, vector: bool) -> None:
     """Raises RecordingError unless an environment is Gymnasium's, and single or a vector one as expected."""
     if not isinstance(env, gym.vector.VectorEnv if vector else gym.Env):
@@ -244,7 +222,7 @@ def wrong_kind(env: object, expected: str) -> RecordingError:
     elif "stable_baselines3" in libraries:
         found = f"the VecEnv {name} of Stable-Baselines3; use tupli_mcap.sb3.VecRecordEpisodes"
     elif "pettingzoo" in libraries:
-        found = f"the PettingZoo environment {name}; there is no recorder of several agents yet; EpisodeWriter records it, an agent a stream"
+        found = f"the PettingZoo environment {name}; EpisodeWriter records it by hand, an agent a stream"
     elif isinstance(env, str):
         found = f"{env!r:.60}; make it: gymnasium.make({env!r:.60})"
     else:

@@ -16,7 +16,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
-from tupli_mcap.recording.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.schema.times import iso_utc
 

@@ -17,6 +17,7 @@ from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.about.success import success_of, with_success
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.frames import FrameRecorder
 from tupli_mcap.recording.write.options import (
@@ -31,7 +32,7 @@ from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
 from tupli_mcap.schema import EpisodeMetadataCallback
-from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, metadata_of, success_of, with_success
+from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, metadata_of
 from tupli_mcap.wrappers.seeds import drawn_seed
 
 __all__ = ["RecordEpisodes"]

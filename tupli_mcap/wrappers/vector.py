@@ -18,6 +18,7 @@ from tupli_mcap.errors import SpaceError, StepError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.about.success import tells_success, with_success
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.frames import VectorFrames
@@ -169,8 +170,12 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
     def _end(self, taken: Any, result: Any) -> None:
         """The ends of the episodes that the batch has ended."""
         _, _, terminals, timeouts, infos = result
-        if self._watches:
-            self._recorder.note_metadata(self._texts)
+        texts = self._texts
+        if infos and tells_success(infos):
+            final = [final_info_of(infos, i, self.num_envs) for i in range(self.num_envs)]
+            texts = [with_success(text, info) for text, info in zip(texts, final, strict=True)]
+        if self._watches or texts is not self._texts:
+            self._recorder.note_metadata(texts)
         self._recorder.finish(terminals, infos)
         if self._callbacks is not None:
             self._work.ask(self._forget, np.flatnonzero(taken[0] & np.logical_or(terminals, timeouts)))

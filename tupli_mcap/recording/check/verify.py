@@ -18,7 +18,8 @@ from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import INFO
-from tupli_mcap.recording.annotations import ANNOTATIONS_NAME
+from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
+from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.check.episodes import verify_episodes
 from tupli_mcap.recording.check.frames import verify_frames
@@ -31,7 +32,6 @@ from tupli_mcap.recording.recover.damaged import may_be_recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.find_journal import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
 from tupli_mcap.recording.recover.prefix import head
-from tupli_mcap.recording.run import RUN_NAME
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
 __all__ = ["Problem", "VerifyReport", "verify_recording"]

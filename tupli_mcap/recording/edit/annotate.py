@@ -10,15 +10,15 @@ from dataclasses import replace
 from typing import Any
 
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.recording.annotations import (
+from tupli_mcap.recording.about.annotations import (
     ANNOTATIONS_MEDIA_TYPE,
     ANNOTATIONS_NAME,
     Annotation,
     Annotations,
 )
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
 

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.recording.annotations import ANNOTATIONS_MEDIA_TYPE, ANNOTATIONS_NAME, Annotations
+from tupli_mcap.recording.about.annotations import ANNOTATIONS_MEDIA_TYPE, ANNOTATIONS_NAME, Annotations
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
 
 __all__ = ["carry_runs"]
 

@@ -19,7 +19,8 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.topics import INFO
-from tupli_mcap.recording.annotations import ANNOTATIONS_NAME
+from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
+from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.carry_runs import carry_runs
@@ -29,7 +30,6 @@ from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
 from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.run import RUN_NAME
 from tupli_mcap.recording.signature_file import STATEMENTS
 
 __all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]

@@ -15,6 +15,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.about.success import tells_success
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.infos import InfoRecorder
 from tupli_mcap.recording.write.rows.contract import BatchStore
@@ -144,6 +145,9 @@ class VectorRecorder:
             any_done = flags != self._none
             if any_done:
                 terminals, timeouts = self._plain(terminals, timeouts, done, flags)
+            if any_done and infos and self._derives and tells_success(infos):
+                self.derives_episodes = False  # ends have metadata, which rows do not tell
+                self._write_pending()
             finals = self._finals(done, states, infos) if any_done and (infos or not resets.is_plain) else {}
             holes = self._ended if self._any_ended and resets.mode == "NextStep" else None
             active = None if holes is None else ~holes
