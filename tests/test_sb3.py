@@ -332,7 +332,7 @@ def test_wrong_pairings_name_the_right_one(tmp_path: Path) -> None:
         (
             RecordEpisodes,
             Parallel(),
-            "the PettingZoo environment Parallel; there is no recorder of several agents",
+            "the PettingZoo environment Parallel; EpisodeWriter records it by hand",
         ),
         (RecordEpisodes, "CartPole-v1", r"found 'CartPole-v1'; make it: gymnasium.make\('CartPole-v1'\)"),
         (RecordVector, None, "found NoneType, which is no gymnasium.Env"),
