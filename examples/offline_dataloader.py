@@ -22,7 +22,7 @@ dataset = tupli_mcap.open("expert.mcap")
 print("recorded", dataset, "with returns from", dataset.returns.min(), "to", dataset.returns.max())
 train, test = dataset.filter("return > 100").split(0.8, seed=0)
 
-scale = train.stats(["states"])["state"]
+scale = train.stats(["states"])["states"]
 mean, std = (torch.as_tensor(value, dtype=torch.float32) for value in (scale.mean, scale.std))
 policy = nn.Sequential(nn.Linear(8 * 4, 64), nn.ReLU(), nn.Linear(64, 2))
 optimizer = torch.optim.Adam(policy.parameters(), lr=1e-3)

@@ -306,16 +306,16 @@ def test_a_loader_in_one_call(dataset: Dataset) -> None:
 def test_statistics_are_those_of_numpy(dataset: Dataset) -> None:
     states = dataset.read(["states"]).states.astype(np.float64)
     found = dataset.stats()
-    assert set(found) == {"state", "action", "reward"}
-    state = found["state"]
+    assert set(found) == {"states", "actions", "rewards"}
+    state = found["states"]
     assert state.count.tolist() == [len(states)] * 4
     np.testing.assert_allclose(state.mean, states.mean(axis=0), rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(state.std, states.std(axis=0), rtol=1e-6)
     assert np.array_equal(state.min, states.min(axis=0)) and np.array_equal(state.max, states.max(axis=0))
     for q, values in state.quantiles.items():
         np.testing.assert_allclose(values, np.quantile(states, q, axis=0), rtol=1e-6, atol=1e-9)
-    assert found["reward"].mean.shape == ()
-    assert set(dataset.stats(["observations"])) == {"state"}
+    assert found["rewards"].mean.shape == ()
+    assert set(dataset.stats(["observations"])) == {"states"}
     with pytest.raises(TupliError, match="found none"):
         dataset.head(0).stats()
 
@@ -457,10 +457,10 @@ def test_an_episode_is_the_same_however_it_was_opened(dataset: Dataset, runs: Pa
 
 def test_statistics_of_what_follows_have_a_name_of_their_own(dataset: Dataset) -> None:
     found = dataset.stats(["states", "next_states"])
-    assert set(found) == {"state", "next_state"}
+    assert set(found) == {"states", "next_states"}
     next_states = dataset.read(["next_states"]).next_states
     np.testing.assert_allclose(
-        found["next_state"].mean, next_states.mean(axis=0, dtype=np.float64), rtol=1e-6
+        found["next_states"].mean, next_states.mean(axis=0, dtype=np.float64), rtol=1e-6
     )
     for field in ("terminals", "times", "infos"):
         with pytest.raises(TupliError, match="expected fields from states, actions, rewards, next_states"):
@@ -501,7 +501,7 @@ def test_images_come_to_arrow(tmp_path: Path) -> None:
     table = dataset.to_arrow()
     cams = dataset.read(["states"]).states["cam"]
     assert np.array_equal(np.array(table.column("state['cam']").to_pylist(), np.uint8), cams)
-    assert set(dataset.stats()) == {"state['x']", "action", "reward"}
+    assert set(dataset.stats()) == {"states['x']", "actions", "rewards"}
 
 
 def test_tensors_are_recorded_as_arrays(tmp_path: Path) -> None:

@@ -277,7 +277,7 @@ class TestAnnotations:
         (path,) = (tmp_path / "lab").rglob("*.mcap")
         annotate_episodes(path, {"good": True}, [2])
         assert [header.metadata for header in storage.list_episodes()] == [{}, {}, {"good": True}]
-        assert [header.episode for header in tupli_mcap.open(storage).filter("metadata.good")._headers] == [2]
+        assert [header.episode for header in tupli_mcap.open(storage).filter("metadata.good").headers] == [2]
 
     def test_do_not_touch_steps(self, tmp_path: Path) -> None:
         path = record(tmp_path / "r.mcap")
@@ -463,3 +463,20 @@ class TestCommands:
             "rnd", {"policy": "random"}, ("a",), "eval", (),
         )  # fmt: skip
         assert "policy=random" in command("info", str(path))
+
+    def test_info_of_a_directory(self, tmp_path: Path) -> None:
+        for i in range(2):
+            annotate_episodes(record(tmp_path / f"{i}.mcap", name=f"run-{i}"), {"success": i == 0, "k": 1})
+        text = command("info", str(tmp_path))
+        for expected in ("run-0, run-1", "CartPole-v1", "6 (6 terminal)", "50%", "3 different", "k, success"):
+            assert expected in text
+        found = json.loads(command("info", str(tmp_path), "--json"))
+        assert (found["recordings"], found["episodes"], found["success"]) == (2, 6, 0.5)
+
+    def test_episodes_of_several_files_in_order(self, tmp_path: Path) -> None:
+        paths = [str(record(tmp_path / f"{i}.mcap", name=f"run-{i}")) for i in range(2)]
+        found = json.loads(command("episodes", *paths, "--sort", "-return", "--limit", "3", "--json"))
+        returns = [one["episode_return"] for one in found]
+        assert len(returns) == 3
+        assert returns == sorted(returns, reverse=True)
+        assert found[0]["run"]["name"] in ("run-0", "run-1")

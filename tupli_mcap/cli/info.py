@@ -14,6 +14,7 @@ from tupli_mcap.cli.options import FilterText, Json, Limit, filter_of, open_stor
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
+    counted,
     number,
     numbers,
     print_facts,
@@ -100,6 +101,58 @@ def ls(
         raise typer.Exit(1)
 
 
+def _print_directory(path: Path, *, as_json: bool) -> None:
+    """Facts about all recordings of a directory."""
+    from tupli_mcap import open as open_dataset
+    from tupli_mcap.recording.about.success import success_of
+    from tupli_mcap.recording.description import spread_of
+
+    dataset = open_dataset(path)
+    headers = dataset.headers
+    said = [found for header in headers if (found := success_of(header.metadata)) is not None]
+    ends: dict[str, int] = {}
+    for header in headers:
+        ends[header.end] = ends.get(header.end, 0) + 1
+    seeds = {header.seed for header in headers} - {None}
+    recordings = len({header.recording for header in headers})
+    runs = list(dict.fromkeys(str(header.run.get("name", "")) for header in headers))
+    environments = sorted(
+        {str(header.run["environment"]) for header in headers if header.run.get("environment")}
+    )
+    keys = sorted({key for header in headers for key in header.metadata})
+    lengths, returns = spread_of(dataset.lengths), spread_of(dataset.returns)
+    rate = sum(said) / len(said) if said else None
+    if as_json:
+        print_json(
+            {
+                "directory": str(path), "recordings": recordings, "runs": runs, "environments": environments,
+                "episodes": len(headers), "ends": ends, "steps": dataset.n_steps,
+                "lengths": None if lengths is None else lengths._asdict(),
+                "returns": None if returns is None else returns._asdict(),
+                "success": rate, "seeds": len(seeds), "metadata": keys,
+            }
+        )  # fmt: skip
+        return
+    shown = ", ".join(f"{count:,} {name}" for name, count in ends.items())
+    lines = {
+        "directory": str(path),
+        "recordings": number(recordings),
+        "runs": _some(runs),
+        "environments": _some(environments),
+        "episodes": number(len(headers)) + (f" ({shown})" if shown else ""),
+        "steps": number(dataset.n_steps) + _spread_text(lengths, len(headers), " an episode"),
+        "return": _spread_text(returns, len(headers)).removeprefix(", "),
+        "success": "" if rate is None else f"{rate:.0%} of the {counted(len(said), 'episode')} that say it",
+        "seeds": f"{number(len(seeds))} different" if seeds else "",
+        "metadata": _some(keys),
+    }
+    print_facts([(name, text) for name, text in lines.items() if text])
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:8]) + (f" and {number(len(names) - 8)} more" if len(names) > 8 else "")
+
+
 def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[str]:
     if text is not None:
         names = [name.strip().lower() for name in text.split(",")]
@@ -162,19 +215,25 @@ def _print_runs(items: Sequence[ListedRecording], names: Sequence[str]) -> None:
 
 
 def info(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or a URL.")],
+    file: Annotated[
+        str, typer.Argument(metavar="FILE|DIR", help="A recording (a path or a URL), or a directory of them.")
+    ],
     as_json: Json = False,
 ) -> None:
-    """Show what is in a recording.
+    """Show what is in a recording, or in all of a directory.
 
     Spaces, benchmark, statistics, returns and lengths of episodes, how rewards, actions and states are
     distributed, channels and attachments. Of long recordings, only some steps are read; of URLs, none.
+    Of a directory: its runs, environments and episodes, and the keys of their metadata.
     """
     from dataclasses import asdict
 
     from tupli_mcap.recording import Recording
     from tupli_mcap.recording.description import describe
 
+    if "://" not in file and Path(file).is_dir():
+        _print_directory(Path(file), as_json=as_json)
+        return
     with Recording(file) as recording:
         description = describe(recording)
         if not as_json:
@@ -197,30 +256,36 @@ def info(
 
 
 def episodes(
-    path: Annotated[
-        Path,
-        typer.Argument(metavar="FILE|STORAGE", help="A recording, or a storage's directory.", readable=False),
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", readable=False)
     ],
     filter_text: FilterText = None,
+    sort: Annotated[
+        str | None,
+        typer.Option(metavar="KEY", help="Order by return, steps, …; -KEY puts the largest first."),
+    ] = None,
     limit: Limit = None,
     as_json: Json = False,
 ) -> None:
-    """List episodes of a recording or a storage.
+    """List episodes of recordings, directories and storages.
 
-    Filters compare keys of episodes (steps, return, end, seed, env, ended, metadata.<name>, ...) with
+    Filters compare keys of episodes (steps, return, end, seed, env, ended, metadata.<name>, run.<name>, ...) with
     = != > >= < <= in, and join with and, or, not. Times are "2026-11-23", "2026-11-23 03:31:07", "yesterday",
-    "7d ago", ...: a text means all of the time that it names.
+    "last tuesday", "7d ago", ...: a text means all of the time that it names.
     """
     wanted = filter_of(filter_text)
     headers: Sequence[EpisodeHeader]
-    if path.is_dir():
-        with open_storage(path) as storage:
+    if sort is None and len(paths) == 1 and paths[0].is_dir():  # which looks up so many only
+        with open_storage(paths[0]) as storage:
             headers = storage.list_episodes(wanted, limit=limit)
     else:
-        from tupli_mcap.dataset import TupliDataset
+        from tupli_mcap import open as open_dataset
 
-        dataset = TupliDataset.from_files(path)
-        headers = (dataset if wanted is None else dataset.with_episode_filter(wanted)).preview()[:limit]
+        found = open_dataset(paths[0] if len(paths) == 1 else paths)
+        found = found if wanted is None else found.filter(wanted)
+        if sort is not None:
+            found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
+        headers = found.headers[:limit]
     print_episodes(headers, as_json=as_json)
 
 

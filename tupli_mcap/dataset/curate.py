@@ -81,7 +81,7 @@ def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool) ->
     """See `Dataset.save`."""
     target = Path(place)
     chosen: dict[str, list[int]] = {}
-    for header in dataset._headers:
+    for header in dataset.headers:
         chosen.setdefault(header.recording, []).append(header.episode)
     if not chosen:
         raise DatasetError("expected episodes to save, found none")
@@ -120,7 +120,7 @@ def relabel(
     if target.exists() and not overwrite:
         raise DatasetError(f"{target} exists; choose another path, or overwrite it")
     target.parent.mkdir(parents=True, exist_ok=True)
-    names = list(dict.fromkeys(header.recording for header in dataset._headers))
+    names = list(dict.fromkeys(header.recording for header in dataset.headers))
     with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
         chosen = save(dataset, Path(folder) / target.name, overwrite=False)
         with Recording(chosen) as recording:

@@ -126,32 +126,37 @@ class Dataset(RandomAccess):
     # ---- episodes
 
     @property
-    def _headers(self) -> Sequence[EpisodeHeader]:
+    def headers(self) -> Sequence[EpisodeHeader]:
+        """The facts about the episodes, in their order, without their steps."""
         if self._listed is None:
             self._listed = self._source.episodes(None, self._filter)
             if not self._listed and self._filter is not None:
                 self._check_metadata(self._filter, self._source.episodes(None, None))
         return self._listed
 
+    @property
+    def _headers(self) -> Sequence[EpisodeHeader]:
+        return self.headers
+
     def __len__(self) -> int:
         """The number of episodes."""
-        return len(self._headers)
+        return len(self.headers)
 
     @property
     def n_steps(self) -> int:
         """The number of steps of all episodes."""
-        return sum(header.n_tuples for header in self._headers)
+        return sum(header.n_tuples for header in self.headers)
 
     @property
     def lengths(self) -> Array:
         """Steps of each episode: int64 (episodes,)."""
-        return np.array([header.n_tuples for header in self._headers], np.int64)
+        return np.array([header.n_tuples for header in self.headers], np.int64)
 
     @property
     def returns(self) -> Array:
         """The sum of each episode's rewards: float64 (episodes,), NaN where the rewards are no numbers."""
         return np.array(
-            [np.nan if header.episode_return is None else header.episode_return for header in self._headers]
+            [np.nan if header.episode_return is None else header.episode_return for header in self.headers]
         )
 
     @overload
@@ -165,7 +170,7 @@ class Dataset(RandomAccess):
             IndexError: there is no such episode.
             DatasetError: it is no number, slice, list of numbers or mask.
         """
-        headers = self._headers
+        headers = self.headers
         if isinstance(chosen, int | np.integer) and not isinstance(chosen, bool):
             try:
                 return self._episode(headers[chosen])
@@ -176,7 +181,7 @@ class Dataset(RandomAccess):
         return self._of([headers[i] for i in _places(chosen, len(headers))])
 
     def __iter__(self) -> Iterator[Episode]:
-        for header in self._headers:
+        for header in self.headers:
             yield self._episode(header)
 
     def _episode(self, header: EpisodeHeader) -> Episode:
@@ -191,7 +196,7 @@ class Dataset(RandomAccess):
     def example(self) -> Recording | None:
         """One of the recordings, for its spaces and labels; of a dataset that filters left empty, one they left out.
         None where there is none at all."""
-        headers = self._headers or self._source.episodes(None, None)
+        headers = self.headers or self._source.episodes(None, None)
         return self._recordings.get(headers[0].recording) if headers else None
 
     def _of(self, headers: Sequence[EpisodeHeader]) -> Dataset:
@@ -213,7 +218,7 @@ class Dataset(RandomAccess):
                 is none of these.
         """
         if callable(test) and not isinstance(test, BaseFilter):
-            return self._of([header for header in self._headers if test(self._episode(header))])
+            return self._of([header for header in self.headers if test(self._episode(header))])
         wanted = parse_filter(test) if isinstance(test, str) else test
         check_keys(wanted, EpisodeHeader)
         if self._listed is None:
@@ -254,26 +259,26 @@ class Dataset(RandomAccess):
             DatasetError: values that have no order among each other.
         """
         if callable(key):
-            values = [key(self._episode(header)) for header in self._headers]
+            values = [key(self._episode(header)) for header in self.headers]
         elif isinstance(key, str):
-            values = [self._value(header, key) for header in self._headers]
+            values = [self._value(header, key) for header in self.headers]
         else:
             raise DatasetError(
                 f"expected a key to sort by, such as 'return', or a function, found {key!r:.80}"
             )
         if values and isinstance(key, str) and all(value is None for value in values):
-            self._check_metadata(F(key) == True, self._headers)  # noqa: E712 - an expression
+            self._check_metadata(F(key) == True, self.headers)  # noqa: E712 - an expression
         places = [i for i, value in enumerate(values) if value is not None and value == value]
         try:
             ordered = sorted(places, key=lambda i: values[i], reverse=descending)
         except (TypeError, ValueError) as err:
             raise DatasetError(f"cannot sort by {key!r}: {err}") from err
         rest = sorted(set(range(len(values))) - set(places))
-        return self._of([self._headers[i] for i in [*ordered, *rest]])
+        return self._of([self.headers[i] for i in [*ordered, *rest]])
 
     def head(self, n: int) -> Dataset:
         """The first `n` episodes, or as many as there are."""
-        return self._of(self._headers[: _count(n)])
+        return self._of(self.headers[: _count(n)])
 
     def sample(self, n: int, *, seed: int | None = None) -> Dataset:
         """`n` different episodes (or as many as there are), drawn at random, in the order in which they were drawn."""
@@ -296,7 +301,7 @@ class Dataset(RandomAccess):
         if not isinstance(fraction, int | float | np.number) or not 0 <= fraction <= 1:
             raise DatasetError(f"expected a fraction from 0 to 1, found {fraction!r:.80}")
         parts: tuple[list[EpisodeHeader], list[EpisodeHeader]] = ([], [])
-        for header in self._headers:
+        for header in self.headers:
             name = header.id if by is None else repr(self._value(header, by))
             digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
             parts[int.from_bytes(digest[:8], "big") >= fraction * 2**64].append(header)
@@ -305,8 +310,8 @@ class Dataset(RandomAccess):
     @property
     def keys(self) -> list[str]:
         """What filters, `sort` and `split` may name: the facts about episodes, and the metadata that some have."""
-        own = {"metadata." + key for header in self._headers for key in header.metadata}
-        runs = {id(header.run): header.run for header in self._headers}.values()
+        own = {"metadata." + key for header in self.headers for key in header.metadata}
+        runs = {id(header.run): header.run for header in self.headers}.values()
         own |= {"run." + key for run in runs for key in run if key != "metadata"}
         own |= {"run.metadata." + key for run in runs for key in run.get("metadata", {})}
         return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own)
@@ -331,12 +336,12 @@ class Dataset(RandomAccess):
             SpaceError: the steps of two recordings do not fit into one array; the message says which.
         """
         wanted = field_names(fields, FIELDS, DatasetError)
-        if not self._headers and (example := self.example) is not None:
+        if not self.headers and (example := self.example) is not None:
             return example.read([], wanted)
-        names = list(dict.fromkeys(header.recording for header in self._headers))
+        names = list(dict.fromkeys(header.recording for header in self.headers))
         place = {name: i for i, name in enumerate(names)}
-        order = np.argsort([place[header.recording] for header in self._headers], kind="stable")
-        headers = [self._headers[i] for i in order]
+        order = np.argsort([place[header.recording] for header in self.headers], kind="stable")
+        headers = [self.headers[i] for i in order]
         columns, selected, _ = read_columns(self._source, headers, wanted)
         if (np.diff(order) < 0).any():
             ends = np.cumsum(selected.lengths)
@@ -349,14 +354,14 @@ class Dataset(RandomAccess):
     @property
     def steps(self) -> Steps:
         if self._steps is None:
-            groups = itertools.groupby(self._headers, key=lambda header: header.recording)
+            groups = itertools.groupby(self.headers, key=lambda header: header.recording)
             self._steps = RecordedSteps(
                 (ListedEpisodes.of(name, group) for name, group in groups), self._recordings.lent
             )
         return self._steps
 
     def _step_seconds(self) -> float | None:
-        names = dict.fromkeys(header.recording for header in self._headers)
+        names = dict.fromkeys(header.recording for header in self.headers)
         known = {self._recordings.get(name).labels.step_seconds for name in names}
         return known.pop() if len(known) == 1 else None
 
@@ -369,6 +374,8 @@ class Dataset(RandomAccess):
         num_workers: int = 0,
         fields: Sequence[str] | None = None,
         seed: int | None = None,
+        drop_last: bool = False,
+        **chosen: Any,
     ) -> Any:
         """A PyTorch `DataLoader` of batches: dicts of tensors (`batch["states"]`, shape (batch, length, ...)).
 
@@ -376,6 +383,8 @@ class Dataset(RandomAccess):
             length: of windows of steps that follow each other within an episode; without it, single transitions.
             fields: as for `windows`, or for `transitions`.
             seed: of the order; drawn if it is None.
+            drop_last: leaves a last batch out that is not full.
+            chosen: of windows: stride, pad, history; of transitions: n_step, discount.
 
         Raises:
             MissingExtraError: PyTorch is not installed.
@@ -383,14 +392,22 @@ class Dataset(RandomAccess):
         """
         from tupli_mcap.torch.loader import loader
 
-        chosen: dict[str, Any] = {} if fields is None else {"fields": fields}
+        if fields is not None:
+            chosen["fields"] = fields
         items = self.transitions(**chosen) if length is None else self.windows(length, **chosen)
-        return loader(items, batch_size=batch_size, shuffle=shuffle, num_workers=num_workers, seed=seed)
+        return loader(
+            items,
+            batch_size=batch_size,
+            shuffle=shuffle,
+            num_workers=num_workers,
+            seed=seed,
+            drop_last=drop_last,
+        )
 
     def stats(
         self, fields: Sequence[str] = ("states", "actions", "rewards")
     ) -> Mapping[str, FieldStatistics]:
-        """Count, mean, std, min, max and quantiles of each leaf (`state`, `state['arm']`, `action`, `reward`).
+        """Count, mean, std, min, max and quantiles of each leaf (`states`, or `states['arm']`; `actions`, `rewards`).
 
         Steps are read a block at a time. Images, and leaves of variable size (texts, graphs), have no statistics.
 
@@ -462,11 +479,11 @@ class Dataset(RandomAccess):
 
     def __str__(self) -> str:
         """As `repr`, of episodes that have been listed."""
-        _ = self._headers
+        _ = self.headers
         return repr(self)
 
     def _repr_html_(self) -> str:
-        return display.html("Dataset", display.Facts(repr(self._source), self._headers, None, {}))
+        return display.html("Dataset", display.Facts(repr(self._source), self.headers, None, {}))
 
 
 def _places(chosen: object, count: int) -> list[int]:

@@ -75,7 +75,8 @@ def statistics_of(dataset: Dataset, fields: Sequence[str]) -> dict[str, FieldSta
 
 
 def _name(field: str, leaf: Leaf) -> str:
-    return f"next_{leaf.path}" if field == "next_states" else leaf.path
+    root = leaf.path.partition("[")[0]  # "state" of "state['arm']"
+    return field + leaf.path.removeprefix(root)
 
 
 def _of(leaf: Leaf, known: ElementStatistics, sample: Array) -> FieldStatistics:

@@ -52,7 +52,7 @@ def arrow(dataset: Dataset, level: Level) -> pa.Table:
 
 
 def _episode_columns(dataset: Dataset) -> dict[str, Any]:
-    headers = dataset._headers
+    headers = dataset.headers
     columns: dict[str, Any] = {
         "id": [header.id for header in headers],
         "episode": np.arange(len(headers)),  # as in the table of steps

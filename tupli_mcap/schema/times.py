@@ -19,8 +19,8 @@ from tupli_mcap.arrays import Array
 __all__ = ["TimeSpan", "iso_utc", "iso_utc_each", "local_text", "span_of", "text_of", "time_ns"]
 
 EXPECTED: Final = (
-    'a time, such as "2026-11-23", "2026-11-23 03:31:07", "2026-11-23T03:31:07+01:00", "today", "yesterday", "7d ago" '
-    "(w, d, h, min), or nanoseconds since 1970"
+    'a time, such as "2026-11-23", "2026-11-23 03:31:07", "2026-11-23T03:31:07+01:00", "today", "yesterday", '
+    '"last tuesday", "7d ago" (w, d, h, min), or nanoseconds since 1970'
 )
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _MICROSECOND: Final = datetime.timedelta(microseconds=1)
@@ -30,6 +30,7 @@ _ISO: Final = re.compile(
     re.ASCII | re.IGNORECASE,
 )
 _AGO: Final = re.compile(r"(\d{1,9}) ?(min|h|d|w) ago", re.ASCII | re.IGNORECASE)
+_WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
 _UNITS: Final = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 _EARLIEST_NS: Final = 10**17  # 1973: what is less is no time in nanoseconds, but in seconds or milliseconds
 
@@ -61,6 +62,11 @@ def _span_of_text(text: str, now: datetime.datetime) -> TimeSpan:
     word = text.lower()
     if word in ("today", "yesterday"):
         return _day(now.astimezone().date() - datetime.timedelta(days=word == "yesterday"))
+    weekday = word.removeprefix("last ")
+    if weekday in _WEEKDAYS:  # before today
+        today = now.astimezone().date()
+        back = (today.weekday() - _WEEKDAYS.index(weekday) - 1) % 7 + 1
+        return _day(today - datetime.timedelta(days=back))
     ago = _AGO.fullmatch(text)
     if ago is not None:
         return _span(now - datetime.timedelta(**{_UNITS[ago[2].lower()]: int(ago[1])}), _MICROSECOND)

@@ -15,7 +15,13 @@ __all__ = ["loader"]
 
 
 def loader(
-    items: Items[Any], *, batch_size: int, shuffle: bool, num_workers: int, seed: int | None
+    items: Items[Any],
+    *,
+    batch_size: int,
+    shuffle: bool,
+    num_workers: int,
+    seed: int | None,
+    drop_last: bool,
 ) -> DataLoader[Any]:
     """See `Dataset.loader`."""
     generator = None if seed is None else Generator().manual_seed(seed)
@@ -26,5 +32,6 @@ def loader(
         num_workers=num_workers,
         collate_fn=collate,
         generator=generator,
+        drop_last=drop_last,
         persistent_workers=num_workers > 0,
     )
