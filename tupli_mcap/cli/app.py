@@ -258,7 +258,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     ),
     "view": ("view run.mcap", "view run.mcap --episodes best,worst --compare", "view lab/ --web"),
     "plot": ("plot run.mcap -o report.html", "plot a.mcap b.mcap -o compared.png"),
-    "render": ("render run.mcap -o best.mp4",),
+    "render": ("render run.mcap -o best.mp4", "render run.mcap -o first.gif --episodes first --rerun"),
     "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning"),
     "verify": ("verify run.mcap", "verify run.mcap --rerun --episodes 0,4,10-19"),
     "filter": ("filter run.mcap 'return > 100 and metadata.success' -o good.mcap",),

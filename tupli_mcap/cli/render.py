@@ -59,20 +59,26 @@ def render(
     width: _Width = None,
     frame_format: _FrameFormat = _Format.png,
     trust: _Trust = False,
+    rerun: Annotated[
+        bool, typer.Option("--rerun", help="Take the episodes again, also where pictures were recorded.")
+    ] = False,
     force: _Force = False,
     as_json: Json = False,
 ) -> None:
-    """Render episodes that were recorded without pictures.
+    """Make a film of episodes, or pictures of episodes that have none.
 
-    Rebuilds the environment, takes the episodes again, and compares every step with the recording, bit for
-    bit. The frames go into a copy of the recording (as /camera/render), into an MP4, or into a GIF.
+    An MP4 or GIF shows the pictures that were recorded: frames, or an image of the states. Nothing is executed.
+
+    Where there are none, with --rerun, and for a .mcap, the environment is rebuilt, takes the episodes again, and
+    every step is compared with the recording, bit for bit. The frames go into a copy of the recording (as
+    /camera/render), into an MP4, or into a GIF.
 
     Of a storage, best and worst are those of all its recordings; other choices have to be of one recording.
 
     Where the replay differs from the recording, rendering ends: the frames before that are written, the
     difference is named, and the exit code is 1. So is it for an episode that cannot be replayed.
     """
-    from tupli_mcap.replay import render
+    from tupli_mcap.replay import film, has_pictures, render
 
     # no window is opened: pygame need not look for a screen
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -80,6 +86,13 @@ def render(
         _chosen(source, episodes, filter_of(filter_text)) as (recording, chosen),
         step_progress(sum(map(len, chosen)), "rendering") as progress,
     ):
+        if output.suffix.lower() != ".mcap" and not rerun and all(map(has_pictures, chosen)):
+            count = film(chosen, output, overwrite=force)
+            if as_json:
+                print_json({"path": str(output), "pictures": count, "recorded": True})
+            else:
+                say(f"{output}: {counted(count, 'recorded picture')}")
+            return
         report = render(
             recording,
             output,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, overload
@@ -233,6 +234,22 @@ class Episode(GymnasiumNames):
         from tupli_mcap import viewer
 
         return viewer.send(self._recording, stream, [self.number])
+
+    def video(
+        self,
+        target: str | os.PathLike[str],
+        *,
+        camera: str | None = None,
+        fps: float | None = None,
+        overwrite: bool = False,
+    ) -> int:
+        """Writes the recorded pictures (frames, or an image of the states) as ".mp4" or ".gif"; nothing is executed.
+
+        See `tupli_mcap.replay.film` for the arguments and errors; it returns how many pictures there are.
+        """
+        from tupli_mcap.replay import film
+
+        return film([self], target, camera=camera, fps=fps, overwrite=overwrite)
 
     @cached_property
     def frames(self) -> Frames:

@@ -1,0 +1,127 @@
+"""Films of recorded pictures: nothing is executed for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import av
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from PIL import Image
+from typer.testing import CliRunner
+
+import tupli_mcap
+from tupli_mcap import RecordEpisodes, Recording, RecordingError
+from tupli_mcap.cli.app import app
+from tupli_mcap.replay import film
+
+
+class Camera(gym.Env[Any, Any]):
+    """Its state is a picture of one grey, darker by 40 a step."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+    action_space = spaces.Discrete(2)
+    render_mode = "rgb_array"
+
+    def __init__(self, shape: tuple[int, ...] = (20, 30, 3)) -> None:
+        self.observation_space = spaces.Dict(
+            wrist=spaces.Box(0, 255, shape, np.uint8), pose=spaces.Box(-1, 1, (2,), np.float32)
+        )
+
+    def seen(self) -> Any:
+        shape = self.observation_space["wrist"].shape
+        return {"wrist": np.full(shape, 250 - 40 * self.t, np.uint8), "pose": np.zeros(2, np.float32)}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.t = 0
+        return self.seen(), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        return self.seen(), 0.0, self.t == 5, False, {}
+
+    def render(self) -> Any:
+        return np.full((16, 16, 3), 10 * self.t, np.uint8)
+
+
+def record(path: Path, env: gym.Env[Any, Any], episodes: int = 2, **options: Any) -> Path:
+    with RecordEpisodes(env, path, capture_env=None, **options) as recorded:
+        for _ in range(episodes):
+            recorded.reset()
+            while not recorded.step(0)[2]:
+                pass
+    return path
+
+
+def shown(path: Path) -> list[int]:
+    """The mean brightness of each picture."""
+    if path.suffix == ".gif":
+        with Image.open(path) as image:
+            found = []
+            for i in range(getattr(image, "n_frames", 1)):
+                image.seek(i)
+                found.append(round(float(np.asarray(image.convert("RGB")).mean())))
+            return found
+    with av.open(str(path)) as container:
+        return [round(float(frame.to_ndarray(format="rgb24").mean())) for frame in container.decode(video=0)]
+
+
+@pytest.mark.parametrize("kind", [".mp4", ".gif"])
+@pytest.mark.parametrize("shape", [(20, 30, 3), (20, 30, 1)])
+def test_of_an_image_in_the_states(kind: str, shape: tuple[int, ...], tmp_path: Path) -> None:
+    episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera(shape)))[1]
+    assert episode.video(tmp_path / f"film{kind}") == 5
+    np.testing.assert_allclose(shown(tmp_path / f"film{kind}"), [250, 210, 170, 130, 90], atol=6)
+
+
+def test_of_a_camera_or_of_an_image_by_choice(tmp_path: Path) -> None:
+    recording = Recording(record(tmp_path / "r.mcap", Camera(), frames=True))
+    episodes = list(recording.episodes)
+    assert film(episodes, tmp_path / "a.gif") == 12
+    np.testing.assert_allclose(shown(tmp_path / "a.gif"), [0, 10, 20, 30, 40, 50] * 2, atol=3)
+    assert film(episodes[:1], tmp_path / "b.gif", camera="state['wrist']", fps=5) == 5
+    with pytest.raises(RecordingError, match="it has render, state"):
+        film(episodes, tmp_path / "c.gif", camera="front")
+
+
+def test_of_a_stack_its_newest_frame(tmp_path: Path) -> None:
+    class Gray(Camera):
+        def __init__(self) -> None:
+            self.observation_space = spaces.Box(0, 255, (20, 30), np.uint8)
+
+        def seen(self) -> Any:
+            return np.full((20, 30), 250 - 40 * self.t, np.uint8)
+
+    env = gym.wrappers.FrameStackObservation(Gray(), 4)
+    episode = tupli_mcap.open(record(tmp_path / "r.mcap", env))[0]
+    episode.video(tmp_path / "film.gif")
+    np.testing.assert_allclose(shown(tmp_path / "film.gif"), [250, 210, 170, 130, 90], atol=3)
+
+
+def test_refuses_what_has_no_meaning(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", gym.make("CartPole-v1"), 1)
+    with pytest.raises(RecordingError, match="no pictures"):
+        Recording(path).episodes[0].video(tmp_path / "x.gif")
+    episode = Recording(record(tmp_path / "c.mcap", Camera())).episodes[0]
+    for name in ("x.txt", "c.mcap"):
+        with pytest.raises(RecordingError, match="expected a name"):
+            episode.video(tmp_path / name)
+    episode.video(tmp_path / "x.gif")
+    with pytest.raises(RecordingError, match="exists"):
+        episode.video(tmp_path / "x.gif")
+    episode.video(tmp_path / "x.gif", overwrite=True)
+
+
+def test_command(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", Camera())
+    done = CliRunner().invoke(app, ["render", str(path), "-o", str(tmp_path / "f.gif"), "--episodes", "all"])
+    assert done.exit_code == 0, done.output
+    assert "10 recorded pictures" in done.output
+    assert len(shown(tmp_path / "f.gif")) == 10
+    again = CliRunner().invoke(app, ["render", str(path), "-o", str(tmp_path / "g.gif"), "--rerun"])
+    assert again.exit_code == 1
+    assert "carries no environment" in again.output

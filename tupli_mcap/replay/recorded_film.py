@@ -1,0 +1,110 @@
+"""Films of pictures that were recorded: of a camera's frames, or of an image in the states. Nothing is executed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.messages.images.pictures import Picture
+from tupli_mcap.recording import Episode
+from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.replay.movie import check_movie, write_movie
+from tupli_mcap.spaces.leaves import Leaf
+
+__all__ = ["film", "has_pictures"]
+
+_KINDS = (".mp4", ".gif")
+_FPS = 30.0
+_BLOCK = 256  # states that are in memory together
+
+
+def has_pictures(episode: Episode) -> bool:
+    """Whether frames of the episode were recorded, or its states have an image."""
+    return bool(len(episode.frames) or episode.recording.layout.images)
+
+
+def film(
+    episodes: Sequence[Episode],
+    target: str | os.PathLike[str],
+    *,
+    camera: str | None = None,
+    fps: float | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Writes recorded pictures of episodes, one episode after another, as ".mp4" (extra `video`) or ".gif" (`frames`).
+
+    Args:
+        camera: whose frames; or the path of an image in the states, such as `state['wrist']`. By default the camera
+            "render", or else the first one, or else the first image. Of a stack, the newest frame.
+        fps: pictures a second; by default what the recording says of its steps, or 30.
+
+    Returns:
+        How many pictures.
+
+    Raises:
+        RecordingError: there is no such picture, or the target exists (and not `overwrite`), or cannot be written.
+        MissingExtraError: PyAV or Pillow is not installed.
+    """
+    goal = Path(target)
+    kind = goal.suffix.lower()
+    if kind not in _KINDS:
+        raise RecordingError(f"{goal}: expected a name that ends in {' or '.join(_KINDS)}")
+    if goal.exists() and not overwrite:
+        raise RecordingError(
+            f"{goal} exists and is not replaced; give another name, or allow it with --force"
+        )
+    if fps is not None and not 0 < fps <= 1000:
+        raise RecordingError(f"fps: expected a number from 0 to 1000, found {fps!r:.40}")
+    check_movie(kind)
+    if not episodes:
+        raise RecordingError("expected episodes to film, found none")
+    recording = episodes[0].recording
+    parts = [_pictures(episode, camera) for episode in episodes]
+    count = sum(number for number, _ in parts)
+    seconds = recording.labels.step_seconds
+    pictures = (picture for _, drawn in parts for picture in drawn)
+    with replacing(goal) as (_, path):
+        write_movie(path, kind, pictures, count, fps or (1 / seconds if seconds else _FPS))
+    return count
+
+
+def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Picture]]:
+    recording, images = episode.recording, {leaf.path: leaf for leaf in episode.recording.layout.images}
+    if camera in images:
+        return len(episode), _of_states(episode, images[camera])
+    if camera is not None and camera not in recording.cameras:
+        known = [*recording.cameras, *images]
+        raise RecordingError(
+            f"{recording.name} has no pictures {camera!r:.80}; it has {', '.join(known) or 'none'}"
+        )
+    frames = recording.frames(episode.position, camera)
+    if len(frames):
+        return len(frames), iter(frames)
+    if camera is None and images:
+        return len(episode), _of_states(episode, next(iter(images.values())))
+    raise RecordingError(
+        f"{recording.name}: no pictures of episode {episode.number} were recorded; `tupli-mcap render` takes it again"
+    )
+
+
+def _of_states(episode: Episode, leaf: Leaf) -> Iterator[Picture]:
+    for first in range(0, len(episode), _BLOCK):
+        values = leaf.get(episode[first : first + _BLOCK].states)
+        for value in values:
+            yield _as_picture(value, leaf)
+
+
+def _as_picture(value: Array, leaf: Leaf) -> Picture:
+    """An image, or the newest frame of a stack, as height x width x 3."""
+    if leaf.kind == "stack":
+        value = value[..., -1] if leaf.frames_last else value[-1]
+    if value.ndim == 2:
+        value = value[:, :, None]
+    if value.shape[2] == 1:
+        value = np.repeat(value, 3, axis=2)
+    return np.ascontiguousarray(value[:, :, :3])
