@@ -65,7 +65,7 @@ def render(
     force: _Force = False,
     as_json: Json = False,
 ) -> None:
-    """Make a film of episodes, or pictures of episodes that have none.
+    """Make a film of episodes, or pictures of those without.
 
     An MP4 or GIF shows the pictures that were recorded: frames, or an image of the states. Nothing is executed.
 
