@@ -89,7 +89,7 @@ def record(path: Path, kind: str, durability: str, steps: int, chunk_size: int =
     n = 3 if kind == "vector" else 1
     counts = [0] * n
     story.truth = [[] for _ in range(n)]
-    options: Any = {"chunk_size": chunk_size, "durability": durability, "attachments": {}}
+    options: Any = {"chunk_size": chunk_size, "durability": durability, "attachments": {}, "capture": "none"}
     with (
         mock.patch.object(writer, "sync_file", sync_file),
         mock.patch.object(journals.Journal, "sync", sync_journal),

@@ -247,7 +247,7 @@ def test_a_registered_class_is_noted_by_its_name(tmp_path: Path) -> None:
 def test_nothing_is_noted_where_nothing_is_to_be(tmp_path: Path) -> None:
     record_in(gym.make("CartPole-v1"), tmp_path / "r.mcap", capture_env=None)
     with Recording(tmp_path / "r.mcap") as recording:
-        assert recording.attachments.keys() <= {"episodes.index"}
+        assert recording.attachments.keys() == {"run.json"}
         assert not recording.labels
         with pytest.raises(RecordingError, match="carries no environment"):
             _ = recording.benchmark

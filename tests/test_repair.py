@@ -665,11 +665,11 @@ def test_no_step_saved_is_a_failure(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["recover", str(path)])
     assert result.exit_code == 1
     said = " ".join(result.output.split())  # lines are broken where paths are long
-    assert f"{path}: none of its 60 steps could be saved; 2 attachments saved to" in said
+    assert f"{path}: none of its 60 steps could be saved; 3 attachments saved to" in said
     with Recording(tmp_path / "a.recovered.mcap") as recording:
         assert (recording.num_steps, list(recording.attachments)) == (
             0,
-            ["benchmark.json", "env.cloudpickle"],
+            ["benchmark.json", "env.cloudpickle", "run.json"],
         )
 
 
@@ -696,7 +696,7 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
     assert verify_recording(str(report.target)).problems == []
 
 
-@pytest.mark.parametrize("lost", ["benchmark.json", "env.cloudpickle"])
+@pytest.mark.parametrize("lost", ["benchmark.json", "env.cloudpickle", "run.json"])
 def test_appending_makes_no_environment_of_two_halves(lost: str, tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", steps=60, capture_env="pickle")
     hit(path, next(item for item in places(path) if item.attachment and item.attachment.name == lost))

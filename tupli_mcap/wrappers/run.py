@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import socket
 import subprocess
 import sys
 import time
@@ -47,7 +46,7 @@ def with_run(
         run = replace(run, versions=_versions())
     if options.capture == "all":
         command = tuple(argument[:_LONGEST] for argument in sys.orig_argv[:100])
-        run = replace(run, command=command, git=_git(_program_folder()), host=socket.gethostname())
+        run = replace(run, command=command, git=_git(_program_folder()), host=os.uname().nodename)
     return {**attachments, RUN_NAME: (RUN_MEDIA_TYPE, RecordedRuns([run]).to_json())}
 
 
