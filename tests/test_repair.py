@@ -696,7 +696,7 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
     assert verify_recording(str(report.target)).problems == []
 
 
-@pytest.mark.parametrize("lost", ["benchmark.json", "env.cloudpickle", "run.json"])
+@pytest.mark.parametrize("lost", ["benchmark.json", "env.cloudpickle"])
 def test_appending_makes_no_environment_of_two_halves(lost: str, tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", steps=60, capture_env="pickle")
     hit(path, next(item for item in places(path) if item.attachment and item.attachment.name == lost))
