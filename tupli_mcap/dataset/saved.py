@@ -44,7 +44,7 @@ _BROKEN = (ValueError, TypeError, SyntaxError, OverflowError, RecursionError, Me
 
 class _Manifest(BaseModel):
     """What a directory says of its columns. `episodes` are headers as JSON texts: few who open columns need them, and
-    reading them takes longer than all the rest."""
+    reading them takes longer than all the rest. `runs` are the runs that they are of, by the places that they name."""
 
     format: Literal["tupli_mcap columns"] = "tupli_mcap columns"
     version: Literal[1] = 1
@@ -54,6 +54,7 @@ class _Manifest(BaseModel):
     steps: int = Field(ge=1)
     breaks: int = Field(ge=1)
     episodes: list[str]
+    runs: list[str] = Field(default_factory=list)
 
 
 def _plan(layout: StepLayout, manifest: _Manifest) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
@@ -89,13 +90,16 @@ def save_columns(
             "remove it"
         )
     layout = _layout_of(steps)
+    runs = {id(header.run): header.run for header in headers}
+    places = {run: i for i, run in enumerate(runs)}
     manifest = _Manifest(
         identity=steps.identity,
         spaces=layout.to_metadata(),
         step_seconds=step_seconds,
         steps=len(steps),
         breaks=len(steps.breaks),
-        episodes=[_text_of(header) for header in headers],
+        episodes=[_text_of(header, places[id(header.run)]) for header in headers],
+        runs=[jsonvalue.dumps(run) for run in runs.values()],
     )
     with os_errors("columns cannot be saved to", place):
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -126,9 +130,10 @@ def _layout_of(steps: Steps) -> StepLayout:
     return StepLayout(layout.observation_space, layout.action_space, layout.reward_space, dtypes)
 
 
-def _text_of(header: EpisodeHeader) -> str:
+def _text_of(header: EpisodeHeader, run: int) -> str:
+    """A header as JSON; its run is a place in the manifest's `runs`, for many episodes are of one."""
     try:
-        return jsonvalue.dumps(dict(header))
+        return jsonvalue.dumps({**dict(header), "run": run})
     except ValueError as err:  # it is one level deeper here
         raise DatasetError(f"episode {header.id}: its metadata cannot be saved: {err}") from err
 
@@ -201,8 +206,13 @@ class SavedColumns(RandomAccess):
     @cached_property
     def _headers(self) -> Sequence[EpisodeHeader]:
         try:
-            return [EpisodeHeader.model_validate(jsonvalue.loads(text)) for text in self._manifest.episodes]
-        except (FormatError, ValidationError) as err:
+            runs = [jsonvalue.loads(text) for text in self._manifest.runs]
+            found = [jsonvalue.loads(text) for text in self._manifest.episodes]
+            for header in found:
+                if isinstance(header.get("run"), int):
+                    header["run"] = runs[header["run"]]
+            return [EpisodeHeader.model_validate(header) for header in found]
+        except (FormatError, ValidationError, IndexError, AttributeError) as err:
             raise _defect(self._directory / _MANIFEST, "headers of episodes", _first_line(err)) from err
 
     def _values_now(self) -> Callable[[F | BaseFilter], Array]:

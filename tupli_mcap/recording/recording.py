@@ -330,9 +330,9 @@ class Recording:
         """
         rows = self.index
         ended = int(rows["end_time"].max()) if len(rows) else 0
-        name, environment = PurePosixPath(self.name).stem, self._environment_name
-        said = self.recorded_runs
-        return [run.known_as(name, environment, self.created_ns, ended) for run in said.runs]
+        said, name = self.recorded_runs.runs, PurePosixPath(self.name).stem
+        environment = "" if all(run.environment for run in said) else self._environment_name
+        return [run.known_as(name, environment, self.created_ns, ended) for run in said]
 
     @cached_property
     def run_places(self) -> list[int]:
