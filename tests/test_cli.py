@@ -1064,7 +1064,7 @@ class TestProgram:
     def test_usage_errors(self, here: Path) -> None:
         assert fails("lss", code=2).startswith("No such command 'lss'")
         assert fails("ls", "--no-such-option", code=2).startswith("No such option")
-        assert fails("info", code=2) == "Missing argument 'FILE'; see tupli-mcap info --help"
+        assert fails("info", code=2) == "Missing argument 'FILE|DIR'; see tupli-mcap info --help"
 
     def test_debug_shows_the_traceback(self, here: Path) -> None:
         for args in (("--debug", "info", "none.mcap"), ("info", "none.mcap", "--debug")):

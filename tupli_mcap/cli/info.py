@@ -26,6 +26,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import can_print, fail, say, terminal_width
+from tupli_mcap.errors import RecordingError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -106,7 +107,10 @@ def _print_directory(path: Path, *, as_json: bool) -> None:
     from tupli_mcap import open as open_dataset
     from tupli_mcap.recording.about.success import success_of
     from tupli_mcap.recording.description import spread_of
+    from tupli_mcap.storage.listing import find_recordings
 
+    if not find_recordings(path):
+        raise RecordingError(f"{path} is a directory; it holds no recording (.mcap)")
     dataset = open_dataset(path)
     headers = dataset.headers
     said = [found for header in headers if (found := success_of(header.metadata)) is not None]

@@ -24,7 +24,7 @@ from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
-from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, Annotations
+from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, MAX_ANNOTATIONS, Annotations
 from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.fields import FIVE, field_names
@@ -363,9 +363,13 @@ class Recording:
     @cached_property
     def annotations(self) -> Annotations:
         """What was said about its episodes after they were recorded; FormatError if that is damaged."""
-        if ANNOTATIONS_NAME not in self.attachments:
+        info = self.attachments.get(ANNOTATIONS_NAME)
+        if info is None:
             return Annotations()
-        return Annotations(self.read_attachment(ANNOTATIONS_NAME), f"{self.name}: {ANNOTATIONS_NAME}")
+        where = f"{self.name}: {ANNOTATIONS_NAME}"
+        if info.size > MAX_ANNOTATIONS:
+            raise FormatError(f"{where}: expected at most {MAX_ANNOTATIONS} bytes, found {info.size}")
+        return Annotations(self.read_attachment(ANNOTATIONS_NAME), where)
 
     def annotate(self, episodes: Sequence[int] | None, values: Mapping[str, Any]) -> None:
         """Gives episodes (their numbers; None: all) values that count more than the metadata that were recorded.

@@ -12,11 +12,11 @@ from typing import Any, Final, NamedTuple
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError
 
-__all__ = ["ANNOTATIONS_MEDIA_TYPE", "ANNOTATIONS_NAME", "Annotation", "Annotations"]
+__all__ = ["ANNOTATIONS_MEDIA_TYPE", "ANNOTATIONS_NAME", "MAX_ANNOTATIONS", "Annotation", "Annotations"]
 
 ANNOTATIONS_NAME: Final = "annotations.json"
 ANNOTATIONS_MEDIA_TYPE: Final = "application/json"
-_MOST: Final = 1 << 26  # bytes of `annotations.json`
+MAX_ANNOTATIONS: Final = 1 << 26  # bytes of `annotations.json`
 
 
 class Annotation(NamedTuple):
@@ -67,8 +67,8 @@ class Annotations:
             data = jsonvalue.dumps_plain([annotation._asdict() for annotation in self.said]).encode()
         except (TypeError, ValueError) as err:
             raise RecordingError(f"annotation: {err}") from err
-        if len(data) > _MOST:
-            raise RecordingError(f"annotations: expected at most {_MOST} bytes, found {len(data)}")
+        if len(data) > MAX_ANNOTATIONS:
+            raise RecordingError(f"annotations: expected at most {MAX_ANNOTATIONS} bytes, found {len(data)}")
         return data
 
 

@@ -122,7 +122,8 @@ class RecordedRuns(NamedTuple):
 
     def places(self, episodes: int) -> list[int]:
         """The place in `runs` of each episode."""
-        found = list(itertools.chain.from_iterable([place] * count for count, place in self.spans))[:episodes]
+        each = itertools.chain.from_iterable(itertools.repeat(place, count) for count, place in self.spans)
+        found = list(itertools.islice(each, episodes))
         return found + [len(self.runs) - 1] * (episodes - len(found))
 
     def to_json(self) -> bytes:
