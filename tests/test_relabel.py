@@ -17,7 +17,7 @@ import tupli_mcap
 from tupli_mcap import RecordEpisodes, Recording, RecordingError
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
-from tupli_mcap.recording import made_of, merge_recordings, verify_recording
+from tupli_mcap.recording import made_of, merge_recordings, say_made_of, verify_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
 SCHEMA = Path(__file__).parent.parent / "schemas" / "made_of.schema.json"
@@ -147,3 +147,11 @@ def test_says_of_which_recordings_it_was_made(tmp_path: Path) -> None:
     assert len(said["earlier"][0]["sources"]) == 2
     assert "seed" in said["query"]
     assert made_of(Recording(paths[0])) is None
+
+
+def test_sources_are_named_without_folders_and_queries(tmp_path: Path) -> None:
+    recording = Recording(record(tmp_path / "r.mcap"))
+    recording.name = "https://host/data/x.mcap?X-Amz-Signature=SECRET/3"
+    ((_, data),) = say_made_of([recording], "merge").values()
+    assert json.loads(data)["sources"][0]["name"] == "x.mcap"
+    assert recording.run.name == "x"

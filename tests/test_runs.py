@@ -480,3 +480,62 @@ class TestCommands:
         assert len(returns) == 3
         assert returns == sorted(returns, reverse=True)
         assert found[0]["run"]["name"] in ("run-0", "run-1")
+
+
+class TestOfStrangers:
+    """What a file says that somebody made to do harm."""
+
+    def put(self, path: Path, name: str, document: Any) -> Path:
+        add_attachments(path, {name: ("application/json", json.dumps(document).encode())})
+        return path
+
+    def test_spans_take_no_memory(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap")
+        self.put(
+            path, "run.json", {"runs": [{}, {"name": "b"}], "spans": [[1, 0], [2**32 - 1, 1], [2**32 - 1, 0]]}
+        )
+        assert Recording(path).run_places == [0, 1, 1]
+        assert [header.run["name"] for header in tupli_mcap.open(path).headers] == ["r", "b", "b"]
+
+    @pytest.mark.parametrize("name", ["run.json", "annotations.json"])
+    def test_what_was_recorded_stays_readable(self, name: str, tmp_path: Path) -> None:
+        path = self.put(record(tmp_path / "r.mcap"), name, "junk")
+        with pytest.warns(UserWarning, match=name):
+            assert len(tupli_mcap.open(path).read().rewards) > 0
+        storage = FileStorage(tmp_path)
+        with pytest.warns(UserWarning, match=name):
+            assert len(storage.list_episodes()) == 3
+
+    def test_commands_show_odd_values(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap")
+        array = {"$numpy": {"dtype": "<f8", "shape": [2], "data": "AAAAAAAAAAAAAAAAAAAAAA=="}}
+        self.put(path, "run.json", {"runs": [{"git": {"commit": "a\u001b[31m", "dirty": array}}]})
+        assert "\x1b" not in command("info", str(path))
+        self.put(path, "run.json", {"runs": [{"metadata": {"$dict": [[1, 2]]}}]})
+        with pytest.raises(FormatError, match="metadata of a run"):
+            _ = Recording(path).run
+
+
+def test_a_value_that_is_called_success_is_no_success(tmp_path: Path) -> None:
+    class Callback(tupli_mcap.EpisodeMetadataCallback):
+        def reset(self) -> None: ...
+
+        def __call__(self, tuple: Any) -> dict[str, Any]:
+            return {"outcome": "success"}
+
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(Winning(), path, metadata_callback=Callback()) as env:
+        env.reset()
+        env.step(1)
+    assert Recording(path).episodes[0].metadata == {"outcome": "success", "success": True}
+
+
+def test_keys_are_texts(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap")
+    for change in (
+        lambda: edit_run(path, metadata={(1, 2): 2}),  # type: ignore[dict-item]
+        lambda: annotate_episodes(path, {1: 2}),  # type: ignore[dict-item]
+        lambda: annotate_episodes(path, {"a": 2}, [1.9]),  # type: ignore[list-item]
+    ):
+        with pytest.raises(RecordingError, match="expected"):
+            change()

@@ -390,7 +390,7 @@ def _run_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
         "tags": ", ".join(run.get("tags", ())),
         "settings": ", ".join(f"{key}={_short(value)}" for key, value in run.get("metadata", {}).items()),
         "command": " ".join(run.get("command", ())),
-        "commit": f"{git.get('commit', '')!s:.12}{', with changes' if git.get('dirty') else ''}"
+        "commit": f"{git.get('commit', '')!s:.12}{', with changes' if git.get('dirty') is True else ''}"
         if git
         else "",
         "host": run.get("host", ""),

@@ -227,9 +227,8 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
     ]
     columns.append(iso_utc_each(index["end_time"]))
     uuid, benchmark_id = recording.uuid, recording.benchmark_id
-    runs = [run.as_dict() for run in recording.runs]
     for number, env, length, end, total, has_seed, seed, ended, metadata, run in zip(
-        *columns, recording.all_metadata(), recording.run_places, strict=True
+        *columns, recording.all_metadata(), recording.listed_runs(), strict=True
     ):
         if number in deleted:
             continue
@@ -250,7 +249,7 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
                 "env": env,
                 "episode": number,
                 "recording": name,
-                "run": runs[run],
+                "run": run,
             }
         )
 

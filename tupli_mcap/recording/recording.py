@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -25,7 +26,7 @@ from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, MAX_ANNOTATIONS, Annotations
-from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run
+from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run, file_name
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.fields import FIVE, field_names
 from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
@@ -227,7 +228,7 @@ class Recording:
     def created_ns(self) -> int:
         """Wall clock (ns) when the recording was made."""
         text = self.metadata.get("created_ns", "0")
-        return int(text) if text.isdecimal() else 0
+        return int(text) if text.isdecimal() and len(text) <= 19 else 0
 
     @property
     def layout(self) -> StepLayout:
@@ -330,7 +331,7 @@ class Recording:
         """
         rows = self.index
         ended = int(rows["end_time"].max()) if len(rows) else 0
-        said, name = self.recorded_runs.runs, PurePosixPath(self.name).stem
+        said, name = self.recorded_runs.runs, PurePosixPath(file_name(self.name)).stem
         environment = "" if all(run.environment for run in said) else self._environment_name
         return [run.known_as(name, environment, self.created_ns, ended) for run in said]
 
@@ -371,6 +372,29 @@ class Recording:
             raise FormatError(f"{where}: expected at most {MAX_ANNOTATIONS} bytes, found {info.size}")
         return Annotations(self.read_attachment(ANNOTATIONS_NAME), where)
 
+    @property
+    def _said(self) -> Annotations:
+        """`annotations`; none, with a warning, where they are damaged: what was recorded stays readable."""
+        try:
+            return self.annotations
+        except FormatError as err:
+            warnings.warn(f"{err}; the metadata are those that were recorded", UserWarning, stacklevel=3)
+            self.annotations = Annotations()
+            return self.annotations
+
+    def listed_runs(self) -> list[dict[str, Any]]:
+        """The run of each episode as filters see it; that of the file alone, with a warning, where it is damaged."""
+        try:
+            runs, places = self.runs, self.run_places
+        except FormatError as err:
+            warnings.warn(f"{err}; the run is not known", UserWarning, stacklevel=2)
+            runs, places = (
+                [Run().known_as(PurePosixPath(file_name(self.name)).stem, "", self.created_ns, 0)],
+                [],
+            )
+        found = [run.as_dict() for run in runs]
+        return [found[place] for place in places] or found * len(self.index)
+
     def annotate(self, episodes: Sequence[int] | None, values: Mapping[str, Any]) -> None:
         """Gives episodes (their numbers; None: all) values that count more than the metadata that were recorded.
 
@@ -390,7 +414,7 @@ class Recording:
     def episode_metadata(self, i: int) -> dict[str, Any]:
         """The metadata of episode `i`, with what was said about it later."""
         number = int(self.index["episode"][i])
-        return self.annotations.applied(number, self.recorded_metadata(i))
+        return self._said.applied(number, self.recorded_metadata(i))
 
     def recorded_metadata(self, i: int) -> dict[str, Any]:
         """The metadata of episode `i` as they were recorded."""
@@ -404,9 +428,9 @@ class Recording:
     def all_metadata(self) -> list[str]:
         """The metadata of all episodes as JSON texts; "{}" where there is none."""
         texts = [self._contents.index.metadata_text(i) for i in range(len(self.index))]
-        if self.annotations.said:
+        if self._said.said:
             for i, number in enumerate(self.index["episode"].tolist()):
-                if self.annotations.of(number):
+                if self._said.of(number):
                     texts[i] = jsonvalue.dumps(self.episode_metadata(i))
         return texts
 

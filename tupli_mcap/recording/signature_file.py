@@ -32,7 +32,14 @@ _PURPOSE = b"tupli_mcap signature v1\0"
 _HEX_KEY = r"^[0-9a-f]{64}$"
 # What an environment is rebuilt from, and what is said of runs and episodes, must be signed; other attachments may be
 # added later.
-_COVERED_KINDS = ("benchmark.json", "env.cloudpickle", "artifacts/", "run.json", "annotations.json")
+_COVERED_KINDS = (
+    "benchmark.json",
+    "env.cloudpickle",
+    "artifacts/",
+    "run.json",
+    "annotations.json",
+    "made_of.json",
+)
 
 
 class _Document(BaseModel):

@@ -39,7 +39,7 @@ class Annotations:
         self.said: list[Annotation] = [] if data is None else _read(data, where)
         self._of_episode: dict[int, list[Annotation]] = {}
         for annotation in self.said:
-            for number in annotation.episodes:
+            for number in dict.fromkeys(annotation.episodes):
                 self._of_episode.setdefault(number, []).append(annotation)
 
     def of(self, episode: int) -> Sequence[Annotation]:

@@ -8,13 +8,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import PurePosixPath
 from typing import Any, Final, NamedTuple, Self
+from urllib.parse import urlsplit
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.schema.times import iso_utc
 
-__all__ = ["MAX_RUN", "RUN_MEDIA_TYPE", "RUN_NAME", "RecordedRuns", "Run"]
+__all__ = ["MAX_RUN", "RUN_MEDIA_TYPE", "RUN_NAME", "RecordedRuns", "Run", "file_name"]
 
 RUN_NAME: Final = "run.json"
 RUN_MEDIA_TYPE: Final = "application/json"
@@ -63,8 +65,10 @@ class Run:
                 raise RecordingError(
                     f"{what}: expected a text of at most 1000 characters, found {text!r:.80}"
                 )
-        if metadata is not None and not isinstance(metadata, Mapping):
-            raise RecordingError(f"metadata: expected a dict, found {metadata!r:.80}")
+        if metadata is not None and not (isinstance(metadata, Mapping) and all(map(_is_text, metadata))):
+            raise RecordingError(
+                f"metadata: expected a dict with keys that are texts, found {metadata!r:.80}"
+            )
         run = cls(name=name or "", metadata=dict(metadata or {}), tags=tuple(tags), split=split)
         RecordedRuns([run]).to_json()
         return run
@@ -86,7 +90,7 @@ class Run:
                 good = isinstance(value, list) and all(isinstance(text, str) for text in value)
                 said[key] = tuple(value) if good else value
             else:
-                good = isinstance(value, dict)
+                good = isinstance(value, dict) and all(map(_is_text, value))
             if not good:
                 raise FormatError(f"{where}: found {value!r:.80} as the {key} of a run; see run.schema.json")
         return cls(**said)
@@ -108,6 +112,12 @@ class Run:
             started=self.started or (iso_utc(started_ns) if started_ns else ""),
             ended=iso_utc(ended_ns) if ended_ns else "",
         )
+
+
+def file_name(name: str) -> str:
+    """The last part of a path, or of a URL without its query."""
+    path = urlsplit(name).path if "://" in name else name
+    return PurePosixPath(path).name
 
 
 class RecordedRuns(NamedTuple):
@@ -161,6 +171,10 @@ class RecordedRuns(NamedTuple):
         if not isinstance(spans, list) or not all(_is_span(span, len(runs)) for span in spans):
             raise FormatError(f"{where}: found {spans!r:.80} as the spans of runs; see run.schema.json")
         return cls([Run.of_document(run, where) for run in runs], [(span[0], span[1]) for span in spans])
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
 
 
 def _is_span(span: object, runs: int) -> bool:

@@ -30,14 +30,17 @@ def success_of(said: Any) -> bool | None:
 def with_success(metadata: str, info: Any) -> str:
     """Metadata (a JSON text) with what the info of the last step says, unless they say it already."""
     said = success_of(info)
-    if said is None or any(f'"{key}"' in metadata for key in KEYS):
+    if said is None:
         return metadata
-    return jsonvalue.dumps_plain({**jsonvalue.loads(metadata), "success": said})
+    known = jsonvalue.loads(metadata)
+    return (
+        metadata if any(key in known for key in KEYS) else jsonvalue.dumps_plain({**known, "success": said})
+    )
 
 
 def tells_success(infos: Any) -> bool:
     """Whether the infos of a batch of sub-environments say it of one of them."""
     found = [infos] if isinstance(infos, Mapping) else infos
     finals = [info["final_info"] for info in found if "final_info" in info]
-    finals = [one for final in finals for one in ([final] if isinstance(final, Mapping) else final)]
-    return any(key in info for info in [*found, *finals] if info for key in KEYS)
+    finals = [one for final in finals for one in ([final] if isinstance(final, Mapping | None) else final)]
+    return any(key in info for info in [*found, *finals] if isinstance(info, Mapping) for key in KEYS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import operator
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -47,12 +48,17 @@ def annotate_episodes(
     """
     with Recording(path) as recording:
         known = recording.index["episode"].tolist()
-        chosen = known if episodes is None else sorted({int(number) for number in episodes})
+        try:
+            chosen = known if episodes is None else sorted({operator.index(number) for number in episodes})
+        except TypeError as err:
+            raise RecordingError(f"expected numbers of episodes, found {episodes!r:.80}") from err
         missing = sorted(set(chosen) - set(known))
         said = Annotations()
         said.said = [*recording.annotations.said]
     if missing:
         raise RecordingError(f"{path} has no episode {missing[0]}; its episodes are {_some(known)}")
+    if not all(isinstance(key, str) for key in values):
+        raise RecordingError(f"expected keys that are texts, found {list(values)!r:.80}")
     if not chosen or not values:
         raise RecordingError(
             f"expected episodes and values to give them, found {chosen!r:.60}, {values!r:.60}"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
-from pathlib import PurePath
 from typing import Any, Final
 
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.about.run import file_name
 from tupli_mcap.recording.recording import Recording
 
 __all__ = ["MADE_OF_NAME", "made_of", "say_made_of"]
@@ -30,7 +30,9 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
         **facts,
         "sources": [
             {
-                "name": PurePath(recording.name).name,  # folders are nobody else's business
+                "name": file_name(
+                    recording.name
+                ),  # folders, and what a URL says besides, are nobody else's business
                 "uuid": recording.uuid,
                 "episodes": len(recording),
                 "sha256": hashlib.sha256(
@@ -40,10 +42,18 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
             for recording in sources
         ],
     }
-    earlier = [said for recording in sources if (said := made_of(recording)) is not None]
-    if earlier:
-        document["earlier"] = earlier
-    return {MADE_OF_NAME: (_MEDIA_TYPE, json.dumps(document, ensure_ascii=False).encode())}
+    earlier = [said for recording in sources if (said := _said(recording)) is not None]
+    data = json.dumps({**document, "earlier": earlier} if earlier else document).encode()
+    if len(data) > _MOST:
+        data = json.dumps(document).encode()
+    return {MADE_OF_NAME: (_MEDIA_TYPE, data)}
+
+
+def _said(recording: Recording) -> dict[str, Any] | None:
+    try:
+        return made_of(recording)
+    except FormatError:  # damaged, which says nothing of the steps
+        return None
 
 
 def made_of(recording: Recording) -> dict[str, Any] | None:

@@ -69,7 +69,9 @@ def entry_of(root: Path, relative: str) -> Iterator[Entry]:
         live |= is_locked(path)  # a writer may have come or gone meanwhile
         numbers = recording.index["episode"].tolist()
         rows = _rows(recording, notes.about(recording.metadata), live=live)
-        runs = jsonvalue.dumps([run.as_dict() for run in recording.runs])
+        each = recording.listed_runs()
+        known = {id(run): run for run in each}
+        runs = jsonvalue.dumps(list(known.values()))
         yield Entry(stamp, live, recording.uuid, recording.benchmark_id, runs, numbers, rows)
 
 
@@ -151,7 +153,7 @@ def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[Epi
     running = _running(columns[1], columns[3]) if live else set()
     local = json.dumps([LOCAL_USER])
     for i, (number, env, length, end, total, created_at, seed, metadata, run) in enumerate(
-        zip(*columns, seeds, recording.all_metadata(), recording.run_places, strict=True)
+        zip(*columns, seeds, recording.all_metadata(), _places(recording), strict=True)
     ):
         if number in sidecar.deleted or i in running:
             continue
@@ -169,6 +171,12 @@ def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[Epi
             metadata=metadata,
             run=run,
         )
+
+
+def _places(recording: Recording) -> list[int]:
+    """The place of each episode's run among the different ones, in their order."""
+    places: dict[int, int] = {}
+    return [places.setdefault(id(run), len(places)) for run in recording.listed_runs()]
 
 
 def _running(envs: Sequence[int], ends: Sequence[int]) -> set[int]:
