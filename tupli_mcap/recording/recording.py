@@ -372,16 +372,6 @@ class Recording:
             raise FormatError(f"{where}: expected at most {MAX_ANNOTATIONS} bytes, found {info.size}")
         return Annotations(self.read_attachment(ANNOTATIONS_NAME), where)
 
-    @property
-    def _said(self) -> Annotations:
-        """`annotations`; none, with a warning, where they are damaged: what was recorded stays readable."""
-        try:
-            return self.annotations
-        except FormatError as err:
-            warnings.warn(f"{err}; the metadata are those that were recorded", UserWarning, stacklevel=3)
-            self.annotations = Annotations()
-            return self.annotations
-
     def listed_runs(self) -> list[dict[str, Any]]:
         """The run of each episode as filters see it; that of the file alone, with a warning, where it is damaged."""
         try:
@@ -414,7 +404,7 @@ class Recording:
     def episode_metadata(self, i: int) -> dict[str, Any]:
         """The metadata of episode `i`, with what was said about it later."""
         number = int(self.index["episode"][i])
-        return self._said.applied(number, self.recorded_metadata(i))
+        return self.annotations.applied(number, self.recorded_metadata(i))
 
     def recorded_metadata(self, i: int) -> dict[str, Any]:
         """The metadata of episode `i` as they were recorded."""
@@ -428,9 +418,9 @@ class Recording:
     def all_metadata(self) -> list[str]:
         """The metadata of all episodes as JSON texts; "{}" where there is none."""
         texts = [self._contents.index.metadata_text(i) for i in range(len(self.index))]
-        if self._said.said:
+        if self.annotations.said:
             for i, number in enumerate(self.index["episode"].tolist()):
-                if self._said.of(number):
+                if self.annotations.of(number):
                     texts[i] = jsonvalue.dumps(self.episode_metadata(i))
         return texts
 
