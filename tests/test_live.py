@@ -78,7 +78,9 @@ def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
     try:
         wait_for(lambda: answers(port))
         yield process
-        time.sleep(0.5)  # for what is on its way
+        size = -1
+        while out.exists() and size != (size := out.stat().st_size):  # something is on its way
+            time.sleep(1)
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)

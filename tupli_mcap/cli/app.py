@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from tupli_mcap.cli import bundle, doctor, edit, info, record, render, replay, storage, trust, verify
+from tupli_mcap.cli import bundle, doctor, edit, info, lists, record, render, replay, storage, trust, verify
 from tupli_mcap.cli.terminal import (
     fail,
     flush,
@@ -201,9 +201,9 @@ def _help(
 _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
     "Record": {"record": record.record},
     "Look": {
-        "ls": info.ls,
+        "ls": lists.ls,
         "info": info.info,
-        "episodes": info.episodes,
+        "episodes": lists.episodes,
         "view": replay.replay,
         "plot": render.plot,
         "render": render.render,

@@ -1,105 +1,45 @@
-"""Commands that look into recordings: ls, info, episodes."""
+"""The command info: what is in a recording, or in all of a directory."""
 
 from __future__ import annotations
 
 import math
-from functools import partial
-from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import FilterText, Json, Limit, filter_of, open_storage
+from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
     counted,
     number,
-    numbers,
     print_facts,
     print_json,
     print_table,
     print_wrapped,
     short_ids,
+    short_value,
     time_of,
-    when,
 )
-from tupli_mcap.cli.terminal import can_print, fail, say, terminal_width
+from tupli_mcap.cli.terminal import can_print, say, terminal_width
 from tupli_mcap.errors import RecordingError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from typing import Any
 
     from tupli_mcap.recording import Recording
     from tupli_mcap.recording.description import RecordingDescription, Spread
     from tupli_mcap.recording.series import Series
-    from tupli_mcap.schema import EpisodeHeader
-    from tupli_mcap.storage.listing import ListedRecording
 
-__all__ = ["episodes", "info", "ls", "print_episodes", "sparkline"]
+__all__ = ["info", "sparkline"]
 
-_ROOMY = 100  # columns of a terminal on which metadata and times fit side by side
 BLOCKS = "▁▂▃▄▅▆▇█"
 PLAIN = ".:-=+*#@"  # where blocks cannot be printed
 _WIDEST, _NARROWEST = 40, 8
 _OTHERS = 44  # columns of a line beside its blocks
 _LONGEST_NAME = 24
-_LS_COLUMNS = {  # column of `ls`: field of `ListedRecording`
-    "recording": "path", "run": "name", "environment": "environment", "episodes": "episodes", "steps": "steps",
-    "return": "return_mean", "success": "success", "started": "started", "size": "size", "state": "state",
-}  # fmt: skip
-
-
-def ls(
-    paths: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="PATH", help="Files, directories, storages; here by default.", readable=False),
-    ] = None,
-    filter_text: FilterText = None,
-    sort: Annotated[
-        str | None, typer.Option(metavar="COLUMN", help="Order by a column; -COLUMN puts the largest first.")
-    ] = None,
-    columns: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help=f"Which columns, of {', '.join(_LS_COLUMNS)}.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """List recordings in files and directories: their runs.
-
-    RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; or recovered:
-    its writer was killed or failed, and all steps that were finished are there, if its journal is.
-    Deleted episodes of a storage are not counted; with --filter, only episodes that it is true of are.
-    """
-    from tupli_mcap.storage.listing import list_recordings
-
-    wanted = filter_of(filter_text)
-    choose = None
-    if wanted is not None:
-        from tupli_mcap.dataset.which import candidates
-
-        choose = partial(candidates, filter=wanted)
-    listed = list(list_recordings(paths or [Path()], choose))
-    good = [item for item in listed if item.error is None]
-    if sort is not None:
-        key = _column_key(sort.removeprefix("-"))
-        values = [(key(item), item) for item in good]
-        known = sorted(
-            (pair for pair in values if pair[0] is not None), key=itemgetter(0), reverse=sort.startswith("-")
-        )
-        good = [item for _, item in [*known, *(pair for pair in values if pair[0] is None)]]
-    bad = [item for item in listed if item.error is not None]
-    if as_json:
-        print_json(
-            [item._asdict() for item in [*good, *bad]] if sort else [item._asdict() for item in listed]
-        )
-    elif good or not listed:
-        _print_runs(good, _chosen_columns(columns, good))
-    for item in bad:
-        fail(item.error or "")
-    if bad:
-        raise typer.Exit(1)
 
 
 def _print_directory(path: Path, *, as_json: bool) -> None:
@@ -157,67 +97,6 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:8]) + (f" and {number(len(names) - 8)} more" if len(names) > 8 else "")
 
 
-def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[str]:
-    if text is not None:
-        names = [name.strip().lower() for name in text.split(",")]
-        for name in names:
-            _column_key(name)
-        return names
-    roomy = (terminal_width() or _ROOMY) >= _ROOMY
-    names = ["recording", *(["run", "environment"] * roomy), "episodes", "steps", "return"]
-    names += ["success"] * any(item.success is not None for item in items)
-    return [*names, *(["started"] * roomy), "size", "state"]
-
-
-def _column_key(name: str) -> Callable[[ListedRecording], Any]:
-    """What a column is ordered by."""
-    field = _LS_COLUMNS.get(name.lower())
-    if field is None:
-        from tupli_mcap.errors import did_you_mean
-
-        raise typer.BadParameter(
-            f"there is no column {name!r}{did_you_mean(name, list(_LS_COLUMNS))}; there are {', '.join(_LS_COLUMNS)}"
-        )
-
-    def key(item: ListedRecording) -> Any:
-        value = getattr(item, field)
-        return None if isinstance(value, float) and math.isnan(value) else value
-
-    return key
-
-
-def _print_runs(items: Sequence[ListedRecording], names: Sequence[str]) -> None:
-    from tupli_mcap.recording.description import nan_text
-
-    means = numbers([None if r.return_nan == r.episodes else r.return_mean for r in items])
-    columns, cells = [], []
-    for name in names:
-        left = {"recording": "start", "run": "end", "environment": "end"}.get(name)
-        if name in ("recording", "run", "environment", "started", "state"):
-            columns.append(Column(name.upper(), shrink=left))  # type: ignore[arg-type]
-        else:
-            columns.append(Column(name.upper(), "right"))
-        cells.append(
-            {
-                "recording": lambda: [short_ids(r.path) for r in items],
-                "run": lambda: [r.name for r in items],
-                "environment": lambda: [r.environment for r in items],
-                "episodes": lambda: [number(r.episodes) for r in items],
-                "steps": lambda: [number(r.steps) for r in items],
-                "return": lambda: means,
-                "success": lambda: ["" if r.success is None else f"{r.success:.0%}" for r in items],
-                "started": lambda: [when(r.started) for r in items],
-                "size": lambda: [bytes_of(r.size) for r in items],
-                "state": lambda: [r.state for r in items],
-            }[name]()
-        )
-    notes = [nan_text(r.return_nan, r.episodes) for r in items]
-    if any(notes) and "return" in names:
-        columns.append(Column("NOTE ON RETURN", shrink="end"))
-        cells.append(notes)
-    print_table(columns, list(zip(*cells, strict=True)), empty="no recordings")
-
-
 def info(
     file: Annotated[
         str, typer.Argument(metavar="FILE|DIR", help="A recording (a path or a URL), or a directory of them.")
@@ -257,86 +136,6 @@ def info(
             [(short_ids(a["name"]), a["media_type"], bytes_of(a["size"])) for a in description.attachments],
             empty="",
         )
-
-
-def episodes(
-    paths: Annotated[
-        list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", readable=False)
-    ],
-    filter_text: FilterText = None,
-    sort: Annotated[
-        str | None,
-        typer.Option(metavar="KEY", help="Order by return, steps, …; -KEY puts the largest first."),
-    ] = None,
-    limit: Limit = None,
-    as_json: Json = False,
-) -> None:
-    """List episodes of recordings, directories and storages.
-
-    Filters compare keys of episodes (steps, return, end, seed, env, ended, metadata.<name>, run.<name>, ...) with
-    = != > >= < <= in, and join with and, or, not. Times are "2026-11-23", "2026-11-23 03:31:07", "yesterday",
-    "last tuesday", "7d ago", ...: a text means all of the time that it names.
-    """
-    wanted = filter_of(filter_text)
-    headers: Sequence[EpisodeHeader]
-    if sort is None and len(paths) == 1 and paths[0].is_dir():  # which looks up so many only
-        with open_storage(paths[0]) as storage:
-            headers = storage.list_episodes(wanted, limit=limit)
-    else:
-        from tupli_mcap import open as open_dataset
-
-        found = open_dataset(paths[0] if len(paths) == 1 else paths)
-        found = found if wanted is None else found.filter(wanted)
-        if sort is not None:
-            found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
-        headers = found.headers[:limit]
-    print_episodes(headers, as_json=as_json)
-
-
-def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
-    """Print episodes as a table or as JSON."""
-    if as_json:
-        print_json([header.model_dump() for header in headers])
-        return
-    several = len({header.recording for header in headers}) > 1
-    roomy = (terminal_width() or _ROOMY) >= _ROOMY
-    several_envs = any(header.env for header in headers)
-    returns = numbers([header.episode_return for header in headers])
-    columns = (
-        *([Column("ID")] if several else [Column("EPISODE", "right")]),
-        *([Column("ENV", "right")] if several_envs else []),
-        Column("STEPS", "right"),
-        Column("RETURN", "right"),
-        Column("END"),
-        Column("SEED", "right"),
-        *([Column("ENDED")] if roomy else []),
-        Column("METADATA", shrink="end"),
-    )
-    rows = []
-    for header, total in zip(headers, returns, strict=True):
-        rows.append(
-            (
-                short_ids(header.id) if several else str(header.episode),
-                *([str(header.env)] if several_envs else []),
-                number(header.n_tuples),
-                total,
-                header.end,
-                "" if header.seed is None else str(header.seed),
-                *([when(header.created_at)] if roomy else []),
-                ", ".join(f"{key}={_short(value)}" for key, value in header.metadata.items()),
-            )
-        )
-    print_table(columns, rows, empty="no episodes")
-
-
-def _short(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, str):
-        return value
-    from tupli_mcap.jsonvalue import shown
-
-    return shown(value)
 
 
 def _spreads(description: RecordingDescription) -> dict[str, dict[str, float] | None]:
@@ -388,7 +187,9 @@ def _run_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
         "run": run.get("name", ""),
         "split": run.get("split", ""),
         "tags": ", ".join(run.get("tags", ())),
-        "settings": ", ".join(f"{key}={_short(value)}" for key, value in run.get("metadata", {}).items()),
+        "settings": ", ".join(
+            f"{key}={short_value(value)}" for key, value in run.get("metadata", {}).items()
+        ),
         "command": " ".join(run.get("command", ())),
         "commit": f"{git.get('commit', '')!s:.12}{', with changes' if git.get('dirty') is True else ''}"
         if git

@@ -21,6 +21,7 @@ __all__ = [
     "print_table",
     "print_wrapped",
     "short_ids",
+    "short_value",
     "time_of",
     "when",
 ]
@@ -141,6 +142,17 @@ def number(value: float | None, decimals: int = 2) -> str:
     if abs(value) >= 1e9 or abs(value) < 10.0**-decimals:
         return f"{value:.3g}"
     return f"{value:,.{decimals}f}"
+
+
+def short_value(value: object) -> str:
+    """A value of metadata in a table."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, str):
+        return value
+    from tupli_mcap.jsonvalue import shown
+
+    return shown(value)
 
 
 def counted(count: int, noun: str) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tupli_mcap.cli.info import print_episodes
+from tupli_mcap.cli.lists import print_episodes
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
     FilterText,

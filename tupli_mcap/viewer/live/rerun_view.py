@@ -19,7 +19,7 @@ __all__ = ["RerunView"]
 
 _TRY_AGAIN = 1.0  # seconds between two looks for a viewer that is not there
 _PATIENCE = 0.5  # seconds for a viewer to take what it was sent
-_FAREWELL = 1.5  # the same for the rest, when the rollout is over
+_FAREWELL = 5.0  # the same for the rest, when the rollout is over
 _STARTING = 20.0  # seconds for a viewer that we have started to answer
 
 

@@ -1,0 +1,223 @@
+"""Commands that list: ls lists recordings, episodes lists episodes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from tupli_mcap.cli.options import FilterText, Json, Limit, filter_of, open_storage
+from tupli_mcap.cli.output import (
+    Column,
+    bytes_of,
+    number,
+    numbers,
+    print_json,
+    print_table,
+    short_ids,
+    short_value,
+    when,
+)
+from tupli_mcap.cli.terminal import fail, terminal_width
+from tupli_mcap.errors import did_you_mean
+
+if TYPE_CHECKING:
+    from tupli_mcap.schema import EpisodeHeader
+    from tupli_mcap.storage.listing import ListedRecording
+
+__all__ = ["episodes", "ls", "print_episodes"]
+
+_ROOMY = 100  # columns of a terminal on which metadata and times fit side by side
+_Cells = Callable[["Sequence[ListedRecording]"], list[str]]
+
+
+class _Listed(NamedTuple):
+    """A column of `ls`: the field of `ListedRecording` that orders by it, and its cells."""
+
+    field: str
+    column: Column
+    cells: _Cells
+
+
+def _each(text: Callable[[ListedRecording], str]) -> _Cells:
+    return lambda items: [text(item) for item in items]
+
+
+def _means(items: Sequence[ListedRecording]) -> list[str]:
+    return numbers([None if r.return_nan == r.episodes else r.return_mean for r in items])
+
+
+_COLUMNS = {
+    "recording": _Listed("path", Column("RECORDING", shrink="start"), _each(lambda r: short_ids(r.path))),
+    "run": _Listed("name", Column("RUN", shrink="end"), _each(lambda r: r.name)),
+    "environment": _Listed(
+        "environment", Column("ENVIRONMENT", shrink="end"), _each(lambda r: r.environment)
+    ),
+    "episodes": _Listed("episodes", Column("EPISODES", "right"), _each(lambda r: number(r.episodes))),
+    "steps": _Listed("steps", Column("STEPS", "right"), _each(lambda r: number(r.steps))),
+    "return": _Listed("return_mean", Column("RETURN", "right"), _means),
+    "success": _Listed(
+        "success",
+        Column("SUCCESS", "right"),
+        _each(lambda r: "" if r.success is None else f"{r.success:.0%}"),
+    ),
+    "started": _Listed("started", Column("STARTED"), _each(lambda r: when(r.started))),
+    "size": _Listed("size", Column("SIZE", "right"), _each(lambda r: bytes_of(r.size))),
+    "state": _Listed("state", Column("STATE"), _each(lambda r: r.state)),
+}
+
+
+def ls(
+    paths: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="PATH", help="Files, directories, storages; here by default.", readable=False),
+    ] = None,
+    filter_text: FilterText = None,
+    sort: Annotated[
+        str | None, typer.Option(metavar="COLUMN", help="Order by a column; -COLUMN puts the largest first.")
+    ] = None,
+    columns: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help=f"Which columns, of {', '.join(_COLUMNS)}.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """List recordings in files and directories: their runs.
+
+    RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; or recovered:
+    its writer was killed or failed, and all steps that were finished are there, if its journal is.
+    Deleted episodes of a storage are not counted; with --filter, only episodes that it is true of are.
+    """
+    from tupli_mcap.storage.listing import list_recordings
+
+    wanted = filter_of(filter_text)
+    choose = None
+    if wanted is not None:
+        from tupli_mcap.dataset.which import candidates
+
+        choose = partial(candidates, filter=wanted)
+    listed = list(list_recordings(paths or [Path()], choose))
+    if sort is not None:
+        listed = _sorted(listed, _column(sort.removeprefix("-")).field, descending=sort.startswith("-"))
+    good = [item for item in listed if item.error is None]
+    if as_json:
+        print_json([item._asdict() for item in listed])
+    elif good or not listed:
+        _print_runs(good, _chosen_columns(columns, good))
+    bad = [item for item in listed if item.error is not None]
+    for item in bad:
+        fail(item.error or "")
+    if bad:
+        raise typer.Exit(1)
+
+
+def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -> list[ListedRecording]:
+    """Those without a value, and those that cannot be read, come last."""
+
+    def key(item: ListedRecording) -> Any:
+        value = getattr(item, field)
+        return None if item.error or (isinstance(value, float) and math.isnan(value)) else value
+
+    known = [item for item in items if key(item) is not None]
+    return [*sorted(known, key=key, reverse=descending), *(item for item in items if key(item) is None)]
+
+
+def _column(name: str) -> _Listed:
+    if name.lower() not in _COLUMNS:
+        raise typer.BadParameter(
+            f"there is no column {name!r}{did_you_mean(name, list(_COLUMNS))}; there are {', '.join(_COLUMNS)}"
+        )
+    return _COLUMNS[name.lower()]
+
+
+def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[_Listed]:
+    if text is not None:
+        return [_column(name.strip()) for name in text.split(",")]
+    roomy = (terminal_width() or _ROOMY) >= _ROOMY
+    names = ["recording", *(["run", "environment"] * roomy), "episodes", "steps", "return"]
+    names += ["success"] * any(item.success is not None for item in items)
+    return [_COLUMNS[name] for name in [*names, *(["started"] * roomy), "size", "state"]]
+
+
+def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed]) -> None:
+    from tupli_mcap.recording.description import nan_text
+
+    columns, cells = [one.column for one in chosen], [one.cells(items) for one in chosen]
+    notes = [nan_text(r.return_nan, r.episodes) for r in items]
+    if any(notes) and _COLUMNS["return"] in chosen:
+        columns.append(Column("NOTE ON RETURN", shrink="end"))
+        cells.append(notes)
+    print_table(columns, list(zip(*cells, strict=True)), empty="no recordings")
+
+
+def episodes(
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", readable=False)
+    ],
+    filter_text: FilterText = None,
+    sort: Annotated[
+        str | None,
+        typer.Option(metavar="KEY", help="Order by return, steps, …; -KEY puts the largest first."),
+    ] = None,
+    limit: Limit = None,
+    as_json: Json = False,
+) -> None:
+    """List episodes of recordings, directories and storages.
+
+    Filters compare keys of episodes (steps, return, end, seed, env, ended, metadata.<name>, run.<name>, ...) with
+    = != > >= < <= in, and join with and, or, not. Times are "2026-11-23", "2026-11-23 03:31:07", "yesterday",
+    "last tuesday", "7d ago", ...: a text means all of the time that it names.
+    """
+    wanted = filter_of(filter_text)
+    headers: Sequence[EpisodeHeader]
+    if sort is None and len(paths) == 1 and paths[0].is_dir():  # which looks up so many only
+        with open_storage(paths[0]) as storage:
+            headers = storage.list_episodes(wanted, limit=limit)
+    else:
+        from tupli_mcap import open as open_dataset
+
+        found = open_dataset(paths[0] if len(paths) == 1 else paths)
+        found = found if wanted is None else found.filter(wanted)
+        if sort is not None:
+            found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
+        headers = found.headers[:limit]
+    print_episodes(headers, as_json=as_json)
+
+
+def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
+    """Print episodes as a table or as JSON."""
+    if as_json:
+        print_json([header.model_dump() for header in headers])
+        return
+    several = len({header.recording for header in headers}) > 1
+    roomy = (terminal_width() or _ROOMY) >= _ROOMY
+    several_envs = any(header.env for header in headers)
+    returns = numbers([header.episode_return for header in headers])
+    columns = (
+        *([Column("ID")] if several else [Column("EPISODE", "right")]),
+        *([Column("ENV", "right")] if several_envs else []),
+        Column("STEPS", "right"),
+        Column("RETURN", "right"),
+        Column("END"),
+        Column("SEED", "right"),
+        *([Column("ENDED")] if roomy else []),
+        Column("METADATA", shrink="end"),
+    )
+    rows = []
+    for header, total in zip(headers, returns, strict=True):
+        rows.append(
+            (
+                short_ids(header.id) if several else str(header.episode),
+                *([str(header.env)] if several_envs else []),
+                number(header.n_tuples),
+                total,
+                header.end,
+                "" if header.seed is None else str(header.seed),
+                *([when(header.created_at)] if roomy else []),
+                ", ".join(f"{key}={short_value(value)}" for key, value in header.metadata.items()),
+            )
+        )
+    print_table(columns, rows, empty="no episodes")
