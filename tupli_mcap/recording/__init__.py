@@ -1,6 +1,7 @@
 """One recording, one `.mcap` file: written, appended to, read, recovered, rewritten.
 
 recording, episode, frames    `Recording`, and what it gives
+opened                        what `Recording` is built on: an open file whose structure is checked
 open, contents                opening a file: everything that is known of it then
 index, limits                 the episode index, and whether it can be true
 channels, file_series         the channels that a layout needs; the files of a series
@@ -21,7 +22,8 @@ from tupli_mcap.journal.file import journal_path
 from tupli_mcap.recording.about.run import Run
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.episode import Episode, Episodes, Step
-from tupli_mcap.recording.recording import RecordedBenchmark, Recording
+from tupli_mcap.recording.opened import RecordedBenchmark
+from tupli_mcap.recording.recording import Recording
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.check.verify import Problem, VerifyReport, verify_recording

@@ -17,7 +17,8 @@ from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recording import OpenFile, Recording
+from tupli_mcap.recording.opened import OpenFile
+from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, STATEMENTS, Signed, is_covered_kind
 

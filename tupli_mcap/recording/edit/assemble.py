@@ -16,7 +16,7 @@ from tupli_mcap.messages.episodes import record
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.recording import OpenFile
+from tupli_mcap.recording.opened import OpenFile
 
 __all__ = ["Assembler"]
 

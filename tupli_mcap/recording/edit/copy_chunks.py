@@ -16,7 +16,7 @@ from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows
 from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
-from tupli_mcap.recording.recording import OpenFile
+from tupli_mcap.recording.opened import OpenFile
 
 __all__ = ["first_chunks"]
 

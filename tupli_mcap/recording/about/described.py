@@ -1,0 +1,112 @@
+"""What is said of a recording: the runs it is of, the metadata of its episodes, and what was said of them later."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from functools import cached_property
+from pathlib import PurePosixPath
+from typing import Any
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import FormatError, TupliError
+from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, MAX_ANNOTATIONS, Annotations
+from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run, file_name
+from tupli_mcap.recording.opened import OpenedRecording
+
+__all__ = ["DescribedRecording"]
+
+
+class DescribedRecording(OpenedRecording):
+    """An open recording with its runs, metadata and annotations."""
+
+    @property
+    def run(self) -> Run:
+        """The run it is of; of a recording made of several, the first one. `run_of` says which an episode is of."""
+        return self.runs[0]
+
+    @cached_property
+    def runs(self) -> list[Run]:
+        """The runs that it is of, more than one where it was made of other recordings.
+
+        Raises:
+            FormatError: what it says of them is damaged.
+        """
+        rows = self.index
+        ended = int(rows["end_time"].max()) if len(rows) else 0
+        said, name = self.recorded_runs.runs, PurePosixPath(file_name(self.name)).stem
+        environment = "" if all(run.environment for run in said) else self._environment_name
+        return [run.known_as(name, environment, self.created_ns, ended) for run in said]
+
+    @cached_property
+    def run_places(self) -> list[int]:
+        """For each episode, which of `runs` it is of."""
+        return self.recorded_runs.places(len(self.index))
+
+    def run_of(self, i: int) -> Run:
+        """The run of episode `i`."""
+        return self.runs[self.run_places[i]]
+
+    @cached_property
+    def recorded_runs(self) -> RecordedRuns:
+        """`runs` as `run.json` has them: empty where the recording does not say it."""
+        info = self.attachments.get(RUN_NAME)
+        if info is None:
+            return RecordedRuns([Run()])
+        where = f"{self.name}: {RUN_NAME}"
+        if info.size > MAX_RUN:
+            raise FormatError(f"{where}: expected at most {MAX_RUN} bytes, found {info.size}")
+        return RecordedRuns.from_json(self.read_attachment(RUN_NAME), where)
+
+    @property
+    def _environment_name(self) -> str:
+        with contextlib.suppress(TupliError):  # damaged, which opening it says
+            return self.benchmark.record.name
+        return ""
+
+    @cached_property
+    def annotations(self) -> Annotations:
+        """What was said about its episodes after they were recorded; FormatError if that is damaged."""
+        info = self.attachments.get(ANNOTATIONS_NAME)
+        if info is None:
+            return Annotations()
+        where = f"{self.name}: {ANNOTATIONS_NAME}"
+        if info.size > MAX_ANNOTATIONS:
+            raise FormatError(f"{where}: expected at most {MAX_ANNOTATIONS} bytes, found {info.size}")
+        return Annotations(self.read_attachment(ANNOTATIONS_NAME), where)
+
+    def listed_runs(self) -> list[dict[str, Any]]:
+        """The run of each episode as filters see it; that of the file alone, with a warning, where it is damaged."""
+        try:
+            runs, places = self.runs, self.run_places
+        except FormatError as err:
+            warnings.warn(f"{err}; the run is not known", UserWarning, stacklevel=2)
+            runs, places = (
+                [Run().known_as(PurePosixPath(file_name(self.name)).stem, "", self.created_ns, 0)],
+                [],
+            )
+        found = [run.as_dict() for run in runs]
+        return [found[place] for place in places] or found * len(self.index)
+
+    def episode_metadata(self, i: int) -> dict[str, Any]:
+        """The metadata of episode `i`, with what was said about it later."""
+        number = int(self.index["episode"][i])
+        return self.annotations.applied(number, self.recorded_metadata(i))
+
+    def recorded_metadata(self, i: int) -> dict[str, Any]:
+        """The metadata of episode `i` as they were recorded."""
+        value = jsonvalue.loads(self._contents.index.metadata_text(i))
+        if not isinstance(value, dict):
+            raise FormatError(
+                f"{self.name}: episode {i} expected metadata as a JSON object, found {value!r:.80}"
+            )
+        return value
+
+    def all_metadata(self) -> list[str]:
+        """The metadata of all episodes as JSON texts; "{}" where there is none."""
+        texts = [self._contents.index.metadata_text(i) for i in range(len(self.index))]
+        if self.annotations.said:
+            for i, number in enumerate(self.index["episode"].tolist()):
+                if self.annotations.of(number):
+                    texts[i] = jsonvalue.dumps(self.episode_metadata(i))
+        return texts

@@ -1,0 +1,318 @@
+"""Opening a recording: the file is read as far as its summary and index, and checked before anything is allocated."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, BinaryIO, NamedTuple
+
+import gymnasium as gym
+from mcap.records import Channel
+
+from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
+from tupli_mcap.errors import FormatError, RecordingError, memory_for
+from tupli_mcap.mcap.records import BODY, read_attachment
+from tupli_mcap.mcap.source import Source, open_source
+from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
+from tupli_mcap.messages.images.codecs import image_codecs
+from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, Topics
+from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.columns.read import ColumnReader
+from tupli_mcap.recording.contents import Contents, step_channels
+from tupli_mcap.recording.frames import Cameras
+from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
+from tupli_mcap.recording.open import read_contents
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME, voucher
+from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
+from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.trust import TrustedKey, is_trusted
+
+__all__ = ["CACHE_BYTES", "AttachmentInfo", "OpenFile", "OpenedRecording", "RecordedBenchmark"]
+
+CACHE_BYTES = 512 << 20
+
+
+class AttachmentInfo(NamedTuple):
+    """What a recording says of an attachment."""
+
+    name: str
+    media_type: str
+    size: int
+
+
+class OpenFile(NamedTuple):
+    """The file of an open recording, for those who copy, check or sign what is in it.
+
+    topics: the id of each topic's channel. steps: the ids of the step channels, by sub-environment.
+    """
+
+    source: Source
+    contents: Contents
+    store: ChunkStore
+    topics: Mapping[str, int]
+    steps: Sequence[int]
+    cameras: Cameras
+
+
+class RecordedBenchmark(NamedTuple):
+    """The environment a recording was made with, as data. signature: the attachment of a signed recording."""
+
+    id: str
+    record: EnvironmentRecord
+    signature: bytes | None = None
+
+    def make_env(self, *, trust: bool = False, render_mode: str | None = None) -> gym.Env[Any, Any]:
+        """Rebuilds the environment, with another `render_mode` if one is given and it has that.
+
+        Raises:
+            UntrustedError: code from the file would run, and neither is it trusted here, nor the key that signed it.
+        """
+        trust = trust or (self.needs_trust and self.voucher is not None)
+        return build(self.record, trust=trust, render_mode=render_mode)
+
+    @property
+    def needs_trust(self) -> bool:
+        """Whether rebuilding it runs code that this user has not trusted."""
+        return bool(reasons_for_distrust(self.record)) and not is_trusted(self.record.digest)
+
+    @property
+    def voucher(self) -> TrustedKey | None:
+        """The key, among those this user trusts, that signed the environment; None if none did."""
+        return None if self.signature is None else voucher(self.signature, self.record.digest, self.id)
+
+
+class OpenedRecording:
+    """An open file whose structure is sound, and what it says of itself. The arguments are those of `Recording`."""
+
+    def __init__(self, source: str | os.PathLike[str] | BinaryIO, *, cache_bytes: int = CACHE_BYTES) -> None:
+        self._source = open_source(source)
+        self._reopen = None if not isinstance(source, str | os.PathLike) else _absolute(source)
+        self._cache_bytes = cache_bytes
+        self.name = self._source.name
+        self.path: Path | None = self._source.path
+        try:
+            with memory_for(lambda: f"{self.name}: opening a file of {self._source.size} bytes"):
+                self._contents: Contents = read_contents(self._source)
+                self._store = ChunkStore(
+                    self._source, self._contents.table, self._contents.memory, cache_bytes
+                )
+                self._prepare()
+        except BaseException:
+            self._source.close()
+            raise
+
+    def _prepare(self) -> None:
+        contents = self._contents
+        self.complete = contents.complete
+        self.metadata: Mapping[str, str] = MappingProxyType(contents.metadata)
+        self.index = contents.index.episodes
+        topics = {channel.topic: channel for channel in contents.channels.values()}
+        steps = step_channels(contents.channels, self.name)
+        self._step_channels = [channel.id for channel in steps]
+        self._layout: StepLayout | None = None
+        self._columns: ColumnReader | None = None
+        self._topics = {topic: channel.id for topic, channel in topics.items()}
+        self._images: dict[str, dict[int, int]] = {}  # leaf -> step channel -> image channel
+        self._infos: dict[int, dict[int, dict[str, Any]]] | None = None
+        counts = {topic: self._store.count(self._topics.get(topic, 0)) for topic in EPISODE_TOPICS}
+        rows = [self._store.count(channel) for channel in self._step_channels]
+        check_episodes(self.index, rows, counts, self.name, whole=contents.complete)
+        self._cameras = Cameras(contents, self._store, self.is_vector, len(steps), self.name)
+        if steps:
+            self._layout = StepLayout.from_metadata(steps[0].metadata)
+            description = _spaces_of(steps[0])
+            for channel in steps:
+                self._check_schema(channel, STEP_SCHEMA, self._layout.step_schema)
+                if _spaces_of(channel) != description:
+                    raise FormatError(
+                        f"{self.name}: {channel.topic} describes other spaces than {steps[0].topic}"
+                    )
+            if FINAL_STATE in topics:
+                self._check_schema(topics[FINAL_STATE], FINAL_STATE_SCHEMA, self._layout.final_schema)
+            self._images = {
+                leaf.name: {
+                    channel.id: self._topics.get(Topics.of_step(channel.topic).image(leaf.name), 0)
+                    for channel in steps
+                }
+                for leaf in self._layout.images
+            }
+            self._check_others(topics)
+            self._store.codecs = image_codecs(self._layout, contents.channels)
+            if contents.complete:
+                self._check_sizes(self._layout, rows)
+            self._store.claims = {
+                channel: StepClaims(self.index, env, self._store.table_of(channel))
+                for env, channel in enumerate(self._step_channels)
+            }
+            self._columns = ColumnReader(self._layout, self._store, self._images)
+
+    def _check_others(self, topics: Mapping[str, Channel]) -> None:
+        """The messages of episodes are what their topics say."""
+        for topic, name, text in (
+            (EPISODE_START, START_NAME, START_SCHEMA), (EPISODE_END, END_NAME, END_SCHEMA),
+        ):  # fmt: skip
+            if topic in topics:
+                self._check_schema(topics[topic], name, text)
+
+    def _check_sizes(self, layout: StepLayout, steps: Sequence[int]) -> None:
+        """The chunks hold the rows that the index says, and each step has its images, before columns are allocated."""
+        if layout.constant:
+            size = layout.step_message.record_size
+        else:  # at least
+            size = BODY + 10 + sum(_stored_bytes(layout, leaf) for leaf in layout.step_leaves)
+        sizes = dict.fromkeys(self._step_channels, (size, layout.constant))
+        if layout.constant and FINAL_STATE in self._topics:
+            sizes[self._topics[FINAL_STATE]] = (layout.final_message.record_size, True)
+        for leaf in layout.images:
+            for count, channel in zip(steps, self._images[leaf.name].values(), strict=True):
+                if self._store.count(channel) != count:
+                    raise FormatError(
+                        f"{self.name}: expected {count} images of {leaf.path}, found {self._store.count(channel)}; "
+                        "recover it into a new file"
+                    )
+                if channel not in self._store.codecs:
+                    sizes[channel] = (layout.image_messages[leaf.name].dtype.itemsize, True)
+        check_rows(self._contents.table, sizes, self.name)
+
+    def _check_schema(self, channel: Channel, name: str, text: str) -> None:
+        schema = self._contents.schemas.get(channel.schema_id)
+        if schema is None or schema.name != name or schema.data != text.encode():
+            raise FormatError(f"{self.name}: the schema of {channel.topic} is not the one its spaces have")
+
+    # ---- facts
+
+    @property
+    def uuid(self) -> str:
+        """32 hex digits, made when the recording was."""
+        return self.metadata["uuid"]
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file, as it was opened."""
+        return self._source.size
+
+    @property
+    def benchmark_id(self) -> str:
+        """The id of the benchmark; empty if there is none."""
+        return self.metadata.get("benchmark_id", "")
+
+    @property
+    def created_ns(self) -> int:
+        """Wall clock (ns) when the recording was made."""
+        text = self.metadata.get("created_ns", "0")
+        return int(text) if text.isdecimal() and len(text) <= 19 else 0
+
+    @property
+    def layout(self) -> StepLayout:
+        """The layout of the steps; RecordingError if there is none yet."""
+        if self._layout is None:
+            raise RecordingError(
+                f"{self.name} has no step yet, so its spaces are not known; record a step first"
+            )
+        return self._layout
+
+    @property
+    def observation_space(self) -> gym.Space[Any]:
+        """The space of the states, of one sub-environment; RecordingError before the first step."""
+        return self.layout.observation_space
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The space of the actions, of one sub-environment; RecordingError before the first step."""
+        return self.layout.action_space
+
+    @property
+    def num_envs(self) -> int:
+        """Sub-environments; 1 for a single environment."""
+        return len(self._step_channels)
+
+    @property
+    def is_vector(self) -> bool:
+        """True if a vector environment was recorded, of one sub-environment or more."""
+        return Topics.of(0).step in self._topics
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of all episodes."""
+        return int(self.index["length"].sum())
+
+    @property
+    def attachments(self) -> Mapping[str, AttachmentInfo]:
+        """The attachments, the episode index left out."""
+        return {
+            name: AttachmentInfo(name, a.media_type, a.data_size)
+            for name, a in self._contents.attachments.items()
+        }
+
+    def read_attachment(self, name: str) -> bytes:
+        """An attachment's bytes, its CRC checked."""
+        if name not in self._contents.attachments:
+            known = ", ".join(self._contents.attachments) or "none"
+            raise RecordingError(f"{self.name} has no attachment {name!r}; it has {known}")
+        return read_attachment(self._source, self._contents.attachments[name])
+
+    @property
+    def labels(self) -> Labels:
+        """Names of dimensions and values, and the seconds of a step, as far as the recording says them.
+
+        Raises:
+            FormatError: they do not fit the recording.
+        """
+        info = self.attachments.get(LABELS_NAME)
+        if info is None or self._layout is None:
+            return Labels.none()
+        where = f"{self.name}: {LABELS_NAME}"
+        if info.size > MAX_LABELS:
+            raise FormatError(f"{where}: expected at most {MAX_LABELS} bytes, found {info.size}")
+        return Labels.from_json(self.read_attachment(LABELS_NAME), self._layout.leaves, where)
+
+    @property
+    def benchmark(self) -> RecordedBenchmark:
+        """The environment that was recorded, as data; `make_env()` rebuilds it."""
+        if "benchmark.json" not in self._contents.attachments:
+            advice = "load its benchmark from the storage it is in"
+            if not self.benchmark_id:
+                advice = "it was left out, could not be captured, or lived in other processes"
+            raise RecordingError(f"{self.name} carries no environment; {advice}")
+        pickle = None
+        if "env.cloudpickle" in self._contents.attachments:
+            pickle = self.read_attachment("env.cloudpickle")
+        where = f"{self.name}: benchmark.json"
+        record = EnvironmentRecord.from_json(self.read_attachment("benchmark.json"), pickle, where=where)
+        signature = self.read_attachment(SIGNATURE_NAME) if SIGNATURE_NAME in self.attachments else None
+        return RecordedBenchmark(self.benchmark_id, record, signature)
+
+    def _channel(self, topic: str) -> int:
+        if topic not in self._topics:
+            raise FormatError(
+                f"{self.name}: expected a channel {topic}, found {', '.join(self._topics) or 'none'}"
+            )
+        return self._topics[topic]
+
+    @property
+    def file(self) -> OpenFile:
+        """Its channels, chunks and messages. It is closed with the recording."""
+        return OpenFile(
+            self._source, self._contents, self._store, self._topics, self._step_channels, self._cameras
+        )
+
+    def close(self) -> None:
+        """Closes the file; what was read stays valid."""
+        self._source.close()
+
+
+def _stored_bytes(layout: StepLayout, leaf: Leaf) -> int:
+    """What a leaf takes in a message, at least."""
+    return 1 if leaf.kind == "variable" else leaf.size * layout.dtypes[leaf.name].itemsize
+
+
+def _spaces_of(channel: Channel) -> dict[str, str]:
+    return {key: value for key, value in channel.metadata.items() if key not in ("env", "crc")}
+
+
+def _absolute(source: str | os.PathLike[str]) -> str:
+    name = os.fspath(source)
+    return name if "://" in name else os.path.abspath(name)  # noqa: PTH100 - links stay
