@@ -19,7 +19,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from tupli_mcap import RecordEpisodes, Recording, RecordingError, verify_recording
 from tupli_mcap.mcap.lock import is_locked
-from tupli_mcap.recording.file_series import series
+from tupli_mcap.recording.write.rotation import series
 from tupli_mcap.schema import EpisodeMetadataCallback
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

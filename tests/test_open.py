@@ -17,7 +17,7 @@ from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, TupliErr
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeMetadataCallback
 
-METADATA = ["metadata.side", "metadata.count", "metadata.success"]
+OWN = ["metadata.side", "metadata.count", "metadata.success", "info.tag"]
 
 
 class Notes(EpisodeMetadataCallback):
@@ -36,7 +36,7 @@ class Notes(EpisodeMetadataCallback):
 def record(path: Path, seed: int, episodes: int) -> Path:
     env = gym.make("CartPole-v1")
     with tupli_mcap.RecordEpisodes(
-        env, path, metadata_callback=Notes(path.stem), record_info=True
+        env, path, metadata_callback=Notes(path.stem), step_callback=lambda step: {"tag": int(step.action)}
     ) as recorder:
         recorder.action_space.seed(seed)
         for i in range(episodes):
@@ -254,7 +254,7 @@ def test_no_episode_has_no_steps(dataset: Dataset, tmp_path: Path) -> None:
     assert len(none) == none.n_steps == len(none.read()) == 0
     assert (none.read().states.shape, none.read().states.dtype) == ((0, 4), np.float32)
     assert none.to_pandas("episodes").empty and none.to_pandas().empty
-    assert list(none.to_pandas()) == list(dataset.head(1).to_pandas().drop(columns=METADATA))
+    assert list(none.to_pandas()) == list(dataset.head(1).to_pandas().drop(columns=OWN))
     assert len(tupli_mcap.open(tmp_path).read()) == 0  # of no recording at all
 
 
@@ -334,6 +334,8 @@ def test_pandas(dataset: Dataset) -> None:
     assert episodes["id"].tolist() == ids(found)
     assert episodes["metadata.side"].tolist() == [episode.metadata["side"] for episode in found]
     assert set(steps["id"]) == set(ids(found))
+    infos = [info or {} for episode in found for info in episode.infos or []]
+    assert steps["info.tag"].tolist() == [info["tag"] for info in infos]
     with pytest.raises(TupliError, match="expected the level"):
         found.to_pandas("rows")  # type: ignore[arg-type]
 
@@ -384,6 +386,71 @@ def test_an_episode_gives_pytuplis_tuples(dataset: Dataset) -> None:
     wanted = tupli_mcap.TupliDataset(episode.recording.path.parent).episodes[2]  # type: ignore[union-attr]
     assert episode.tuples == wanted.tuples
     assert ids(dataset)[2] == wanted.id
+
+
+def test_a_recording_does_what_a_dataset_does(runs: Path) -> None:
+    dataset = tupli_mcap.open(runs / "a.mcap")
+    with Recording(runs / "a.mcap") as recording:
+        assert recording[3] == dataset[3] and recording[-1] == dataset[-1]
+        assert [episode.id for episode in recording] == ids(recording.dataset) == ids(dataset)
+        for narrow in (
+            lambda x: x.filter("return > 20"),
+            lambda x: x.sort("return", descending=True),
+            lambda x: x.head(3),
+            lambda x: x.sample(4, seed=2),
+            lambda x: x.split(0.5, seed=1)[0],
+            lambda x: x[2:9:3],
+            lambda x: x[x.returns > 20],
+            lambda x: x + x[:2],
+        ):
+            assert ids(narrow(recording)) == ids(narrow(dataset))
+        assert (recording.n_steps, recording.keys) == (dataset.n_steps, dataset.keys)
+        assert np.array_equal(recording.lengths, dataset.lengths)
+        assert np.array_equal(
+            recording.windows(5, stride=2)[3].states, dataset.windows(5, stride=2)[3].states
+        )
+        assert np.array_equal(recording.transitions(2, 0.9)[4].states, dataset.transitions(2, 0.9)[4].states)
+        assert recording.stats()["rewards"].count == dataset.n_steps
+        assert recording._repr_html_() == recording.dataset._repr_html_()
+    with (runs / "a.mcap").open("rb") as file, Recording(file) as recording:
+        assert recording[3] == dataset[3] and "12 episodes" in recording._repr_html_()
+        with pytest.raises(TupliError, match="open it by its path or URL"):
+            recording.head(3)
+
+
+def test_the_episodes_of_two_datasets(runs: Path, tmp_path: Path) -> None:
+    every = tupli_mcap.open(runs)
+    a, b = every.filter('metadata.side == "a"'), tupli_mcap.open(runs / "b.mcap")
+    joined = a + b
+    assert ids(joined) == ids(a) + ids(b)
+    assert ids(joined + a.head(3)) == ids(joined)
+    assert ids(joined.sort("return")) != ids(joined)
+    assert np.array_equal(joined.read().states, np.concatenate([a.read().states, b.read().states]))
+    assert np.array_equal(pickle.loads(pickle.dumps(joined)).read().rewards, joined.read().rewards)
+    assert len(tupli_mcap.open(joined.save(tmp_path / "joined.mcap"))) == len(joined)
+    parts = tupli_mcap.open(runs / "a.mcap")[5:] + tupli_mcap.open(runs / "a.mcap")[:5]
+    assert ids(parts) == ids(a[5:]) + ids(a[:5])
+    with pytest.raises(TypeError, match="unsupported operand"):
+        a + 3  # type: ignore[operator]
+
+
+def test_different_recordings_of_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for seed, folder in enumerate(("one", "two")):
+        (tmp_path / folder).mkdir()
+        monkeypatch.chdir(tmp_path / folder)
+        found.append(tupli_mcap.open(record(Path("r.mcap"), seed, 2)).head(2))
+        assert len(found[-1]) == 2
+    with pytest.raises(TupliError, match="different recordings called 'r.mcap'"):
+        found[0] + found[1]
+
+
+def test_what_a_notebook_shows_of_an_episode(dataset: Dataset) -> None:
+    shown = dataset[0]._repr_html_()
+    assert f"<td>{dataset[0].return_:g}</td>" in shown
+    episode = dataset[0]
+    episode.__dict__["metadata"] = {"side": "<script>"}
+    assert "<script>" not in episode._repr_html_() and "&lt;script&gt;" in episode._repr_html_()
 
 
 def test_a_step_callback_is_told_the_sub_environment(tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ from tupli_mcap import (
     TupliEnvWrapper,
     verify_recording,
 )
-from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.write import rotation, writer
+from tupli_mcap.recording.write.rotation import series
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 from tupli_mcap.wrappers.rollout import record_rollouts

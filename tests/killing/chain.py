@@ -20,7 +20,7 @@ from killing.child import Job, Told, record_and_die
 from killing.kinds import KINDS, open_recorder
 from killing.moments import MOMENTS
 from tupli_mcap import FileStorage, Recording, TupliEnvWrapper, TupliError, journal_path
-from tupli_mcap.recording.file_series import series
+from tupli_mcap.recording.write.rotation import series
 
 __all__ = ["Death", "lives", "moments_of"]
 

@@ -207,7 +207,7 @@ def _saying_what_is_safe(output: Path, limit: float | None, *, replaces: bool) -
 
 def _held(output: Path, limit: float | None) -> str:
     from tupli_mcap.recording import Recording
-    from tupli_mcap.recording.file_series import series
+    from tupli_mcap.recording.write.rotation import series
 
     if output.is_dir():
         return f"tupli-mcap ls {output} lists what was recorded"

@@ -17,7 +17,14 @@ from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.load import read_columns
-from tupli_mcap.dataset.sources import DatasetError, FilesSource, OpenRecordings, Source, StorageSource
+from tupli_mcap.dataset.sources import (
+    DatasetError,
+    FilesSource,
+    JoinedSource,
+    OpenRecordings,
+    Source,
+    StorageSource,
+)
 from tupli_mcap.dataset.statistics import STATISTICAL, FieldStatistics, statistics_of
 from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.recording import Episode, Recording
@@ -203,6 +210,22 @@ class Dataset(RandomAccess):
         made = Dataset(self._source, headers)
         made._recordings = self._recordings
         return made
+
+    def __add__(self, other: Dataset | Recording) -> Dataset:
+        """The episodes of both, these first. An episode that is in both counts once.
+
+        Raises:
+            DatasetError: two of their recordings have the same name, and are different.
+        """
+        if not isinstance(other, Dataset | Recording):
+            return NotImplemented
+        other = open(other)
+        ids = {header.id for header in self.headers}
+        more = [header for header in other.headers if header.id not in ids]
+        if self._source is other._source:
+            return self._of([*self.headers, *more])
+        joined = JoinedSource([(self._source, self.headers), (other._source, more)])
+        return Dataset(joined, [*self.headers, *more])
 
     # ---- narrowing
 
@@ -420,6 +443,8 @@ class Dataset(RandomAccess):
 
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
         """A row a step, or a row an episode; a column a dimension, with its name where the recording knows it.
+
+        Infos and metadata have a column for each key: `info.x`, `metadata.score`.
 
         Raises:
             MissingExtraError: pandas is not installed.

@@ -32,7 +32,15 @@ from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.sidecar import Notes
 
-__all__ = ["DatasetError", "FilesSource", "OpenRecordings", "Source", "StorageSource", "episode_headers"]
+__all__ = [
+    "DatasetError",
+    "FilesSource",
+    "JoinedSource",
+    "OpenRecordings",
+    "Source",
+    "StorageSource",
+    "episode_headers",
+]
 
 _MOST_OPEN = 64
 _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two blocks share it
@@ -195,6 +203,49 @@ class FilesSource:
 
     def __repr__(self) -> str:
         return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} files"
+
+
+class JoinedSource:
+    """The recordings of several sources, each with those of its episodes that are wanted.
+
+    Raises:
+        DatasetError: two sources have different recordings of one name.
+    """
+
+    def __init__(self, sources: Sequence[tuple[Source, Sequence[EpisodeHeader]]]) -> None:
+        self._sources = [source for source, _ in sources]
+        self._of: dict[str, tuple[Source, str]] = {}
+        for source, headers in sources:
+            for header in headers:
+                uuid = header.id.partition("-")[0]
+                first, known = self._of.setdefault(header.recording, (source, uuid))
+                if known != uuid:
+                    raise DatasetError(
+                        f"{first!r} and {source!r} have different recordings called {header.recording!r}; "
+                        "save one of the datasets to a file, and add that"
+                    )
+
+    def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
+        found = [header for source in self._sources for header in source.benchmarks(filter)]
+        return list({(header.id, header.metadata.name): header for header in found}.values())
+
+    def episodes(
+        self,
+        benchmark_filter: BaseFilter | None,
+        episode_filter: BaseFilter | None,
+        seen: dict[str, Recording] | None = None,
+    ) -> list[EpisodeHeader]:
+        found = [s.episodes(benchmark_filter, episode_filter, seen) for s in self._sources]
+        return list({header.id: header for headers in found for header in headers}.values())
+
+    def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
+        return "\n".join(source.explain(benchmark_filter, episode_filter) for source in self._sources)
+
+    def open(self, recording: str) -> Recording:
+        return self._of[recording][0].open(recording)
+
+    def __repr__(self) -> str:
+        return " + ".join(map(repr, self._sources))
 
 
 def _expand(item: str | os.PathLike[str]) -> Sequence[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -66,7 +66,7 @@ def _episode_columns(dataset: Dataset) -> dict[str, Any]:
         "ended": np.array([header.created_at.removesuffix("+00:00") for header in headers], "datetime64[ns]"),
         "benchmark_id": [header.benchmark_id for header in headers],
     }
-    return columns | _metadata_columns([header.metadata for header in headers])
+    return columns | _columns_of("metadata", [header.metadata for header in headers])
 
 
 def _whole_numbers(values: list[int | None]) -> Any:
@@ -75,14 +75,14 @@ def _whole_numbers(values: list[int | None]) -> Any:
     return import_pandas().array(values, dtype="Int64") if fits else values
 
 
-def _metadata_columns(items: list[dict[str, Any]]) -> dict[str, list[Any]]:
-    """A column for each key that one of the episodes has, None where another one has it not."""
+def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """A column for each key that one of the items has, None where another one has it not."""
     keys = dict.fromkeys(key for item in items for key in item)
-    return {f"metadata.{key}": [item.get(key) for item in items] for key in keys}
+    return {f"{root}.{key}": [item.get(key) for item in items] for key in keys}
 
 
 def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
-    found = dataset.read((*FIVE, "times"))
+    found = dataset.read((*FIVE, "times", "infos"))
     lengths = found.episode_lengths
     of_episode = np.repeat(np.arange(len(lengths)), lengths)
     starts = np.repeat(np.cumsum(lengths) - lengths, lengths)
@@ -98,6 +98,7 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
         columns |= _named(found.actions, recording.layout, recording.labels, "action")
         columns |= _named(found.rewards, recording.layout, recording.labels, "reward")
     columns |= {"terminal": found.terminals, "timeout": found.timeouts}
+    columns |= _columns_of("info", found.infos)
     repeated = {"id", "env", "seed", *(key for key in episodes if key.startswith("metadata."))}
     for key in episodes:
         if key in repeated:

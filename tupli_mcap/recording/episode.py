@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -277,6 +278,21 @@ class Episode(GymnasiumNames):
 
     def __repr__(self) -> str:
         return f"<Episode {self.number}: {len(self)} steps, return {self.return_:g}, {self.end}>"
+
+    def _repr_html_(self) -> str:
+        facts = {
+            "steps": f"{len(self):,}",
+            "return": f"{self.return_:g}",
+            "end": self.end,
+            "seed": self.seed,
+            "run": self.run.name,
+            "metadata": ", ".join(f"{key}: {value!r:.80}" for key, value in self.metadata.items()),
+            "recording": self._recording.name,
+        }
+        rows = "".join(
+            f"<tr><th>{key}</th><td>{html.escape(str(value))}</td></tr>" for key, value in facts.items()
+        )
+        return f"<p>Episode {self.number}</p><table>{rows}</table>"
 
 
 def reward_getter(space: Any, column: Any) -> Any:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import os
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -16,15 +17,19 @@ from tupli_mcap.recording.about.described import DescribedRecording
 from tupli_mcap.recording.columns.fields import FIVE, field_names
 from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
 from tupli_mcap.recording.columns.runs import Runs, runs_of
-from tupli_mcap.recording.episode import Episodes
+from tupli_mcap.recording.episode import Episode, Episodes
 from tupli_mcap.recording.frames import Frames
+from tupli_mcap.recording.verbs import DatasetVerbs
+
+if TYPE_CHECKING:
+    from tupli_mcap.dataset import Dataset
 
 __all__ = ["Recording"]
 
 _THREADS = min(4, os.cpu_count() or 1)
 
 
-class Recording(DescribedRecording):
+class Recording(DescribedRecording, DatasetVerbs):
     """An MCAP recording, open for reading.
 
     Opening reads the summary and the episode index only. A file without a summary (its writer was killed, or is still
@@ -44,6 +49,30 @@ class Recording(DescribedRecording):
     def episodes(self) -> Episodes:
         """The episodes, lazily: length, indexing, slicing, iteration."""
         return Episodes(self)
+
+    @property
+    def dataset(self) -> Dataset:
+        """Its episodes as a `Dataset`, which opens the file by its path.
+
+        Raises:
+            DatasetError: it was opened as a file object.
+        """
+        from tupli_mcap import dataset
+
+        return dataset.open(self)
+
+    @overload
+    def __getitem__(self, chosen: int) -> Episode: ...
+    @overload
+    def __getitem__(self, chosen: slice | Sequence[int] | np.ndarray[Any, Any]) -> Dataset: ...
+    def __getitem__(self, chosen: int | slice | Sequence[int] | np.ndarray[Any, Any]) -> Episode | Dataset:
+        """`recording[3]` is an episode; `recording[-5:]`, `recording[[4, 2]]` and `recording[mask]` are datasets."""
+        if isinstance(chosen, int | np.integer) and not isinstance(chosen, bool):
+            return self.episodes[int(chosen)]
+        return self.dataset[chosen]
+
+    def __iter__(self) -> Iterator[Episode]:
+        return iter(self.episodes)
 
     def annotate(self, episodes: Sequence[int] | None, values: Mapping[str, Any]) -> None:
         """Gives episodes (their numbers; None: all) values that count more than the metadata that were recorded.
@@ -357,6 +386,9 @@ class Recording(DescribedRecording):
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def _repr_html_(self) -> str:
+        return html.escape(repr(self)) if self._reopen is None else self.dataset._repr_html_()
 
     def __repr__(self) -> str:
         state = "" if self.complete else ", recovered"

@@ -28,9 +28,9 @@ from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier
 from tupli_mcap.recording.edit.made_of import MADE_OF_NAME, say_made_of
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
-from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
+from tupli_mcap.recording.write.rotation import series
 
 __all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]
 

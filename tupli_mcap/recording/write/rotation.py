@@ -19,13 +19,13 @@ from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.journal.rows import LAST_ROW
-from tupli_mcap.recording.file_series import series
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, RecordOptions, check_place
 from tupli_mcap.recording.write.writer import RecordingWriter, finish_recording
 
-__all__ = ["Rotation"]
+__all__ = ["Rotation", "series"]
 
+_NUMBERED = re.compile(r"(.+)_([0-9]{4,})\Z")
 _MANY_ROWS = LAST_ROW - (1 << 27)  # of a channel: room for an episode of 60 million steps is left
 
 
@@ -186,3 +186,18 @@ def _make_folder(path: Path) -> None:
         pass  # opening the file says what is in the way
     except OSError as err:
         raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
+
+
+def series(path: Path) -> tuple[Path, dict[int, Path]]:
+    """The first file of the series that a path belongs to, and those that follow it and exist, by number."""
+    match = _NUMBERED.match(path.stem)
+    base = path if match is None else path.with_stem(match[1])
+    if match is not None and not base.exists():
+        base = path
+    pattern = re.compile(re.escape(base.stem) + r"_([0-9]{4,})" + re.escape(base.suffix) + r"\Z")
+    found = {}
+    with contextlib.suppress(OSError):
+        for name in os.listdir(base.parent):  # noqa: PTH208 - names are all it takes
+            if number := pattern.match(name):
+                found[int(number[1])] = base.with_name(name)
+    return base, dict(sorted(found.items()))

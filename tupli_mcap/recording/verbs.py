@@ -1,0 +1,119 @@
+"""What a recording does as the dataset of its episodes does it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import pandas as pd
+    import pyarrow as pa
+
+    from tupli_mcap.arrays import Array
+    from tupli_mcap.dataset import Dataset
+    from tupli_mcap.dataset.dataset import Test
+    from tupli_mcap.dataset.items import Transitions, Windows
+    from tupli_mcap.dataset.statistics import FieldStatistics
+    from tupli_mcap.dataset.tables import Level
+    from tupli_mcap.recording.episode import Episode
+    from tupli_mcap.recording.recording import Recording
+
+__all__ = ["DatasetVerbs"]
+
+
+class DatasetVerbs:
+    """The verbs of `Dataset`: arguments and errors are the same, and are told there."""
+
+    @property
+    def dataset(self) -> Dataset:
+        """Its episodes as a `Dataset`, which opens the file by its path."""
+        raise NotImplementedError
+
+    @property
+    def n_steps(self) -> int:
+        """The number of steps of all episodes."""
+        return self.dataset.n_steps
+
+    @property
+    def lengths(self) -> Array:
+        """Steps of each episode: int64 (episodes,)."""
+        return self.dataset.lengths
+
+    @property
+    def returns(self) -> Array:
+        """The sum of each episode's rewards: float64 (episodes,)."""
+        return self.dataset.returns
+
+    @property
+    def keys(self) -> list[str]:
+        """What `filter`, `sort` and `split` may name."""
+        return self.dataset.keys
+
+    def filter(self, test: Test) -> Dataset:
+        """The episodes that a test is true of: `recording.filter("return > 100")`."""
+        return self.dataset.filter(test)
+
+    def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
+        """The episodes in the order of a key ("return", "metadata.score") or a function."""
+        return self.dataset.sort(key, descending=descending)
+
+    def head(self, n: int) -> Dataset:
+        """The first `n` episodes."""
+        return self.dataset.head(n)
+
+    def sample(self, n: int, *, seed: int | None = None) -> Dataset:
+        """`n` different episodes, drawn at random."""
+        return self.dataset.sample(n, seed=seed)
+
+    def split(self, fraction: float, *, seed: int = 0, by: str | None = None) -> tuple[Dataset, Dataset]:
+        """Two datasets: about `fraction` of the episodes, and the others."""
+        return self.dataset.split(fraction, seed=seed, by=by)
+
+    def windows(self, length: int, **chosen: Any) -> Windows:
+        """Sub-trajectories of `length` steps. `chosen`: stride, pad, history, fields."""
+        return self.dataset.windows(length, **chosen)
+
+    def transitions(self, n_step: int = 1, discount: float = 1.0, **chosen: Any) -> Transitions:
+        """The transition (s, a, r, s') that starts at each step. `chosen`: fields."""
+        return self.dataset.transitions(n_step, discount, **chosen)
+
+    def loader(self, length: int | None = None, **chosen: Any) -> Any:
+        """A PyTorch `DataLoader` of windows of `length` steps, or of transitions."""
+        return self.dataset.loader(length, **chosen)
+
+    def stats(
+        self, fields: Sequence[str] = ("states", "actions", "rewards")
+    ) -> Mapping[str, FieldStatistics]:
+        """Count, mean, std, min, max and quantiles of each leaf."""
+        return self.dataset.stats(fields)
+
+    def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
+        """A row a step, or a row an episode."""
+        return self.dataset.to_pandas(level)
+
+    def to_arrow(self, level: Level = "steps") -> pa.Table:
+        """The same as an Arrow table."""
+        return self.dataset.to_arrow(level)
+
+    def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+        """Writes the episodes to a new recording."""
+        return self.dataset.save(target, overwrite=overwrite)
+
+    def map(
+        self,
+        function: Callable[[Episode], Any],
+        target: str | os.PathLike[str],
+        *,
+        fields: Sequence[str] = ("rewards",),
+        overwrite: bool = False,
+    ) -> Path:
+        """Writes the episodes to a new recording, with new rewards or actions."""
+        return self.dataset.map(function, target, fields=fields, overwrite=overwrite)
+
+    def __add__(self, other: Recording | Dataset) -> Dataset:
+        """The episodes of both, these first."""
+        return self.dataset + other
