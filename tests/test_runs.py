@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -152,6 +153,19 @@ class TestRun:
             for _ in range(40):
                 recorded.step(np.zeros(2, np.int64))
         assert Recording(tmp_path / "v.mcap").episodes[0].run.metadata == {"n": 2}
+
+    def test_the_files_of_a_storage_are_called_by_run_and_time(self, tmp_path: Path) -> None:
+        for name in ("../../ppo seed 3", None):
+            env = TupliEnvWrapper(gym.make("CartPole-v1"), FileStorage(tmp_path / "lab"), name=name)
+            env.store("cart")
+            env.reset(seed=1)
+            env.step(0)
+            env.close()
+        names = [path.name for path in sorted((tmp_path / "lab" / "recordings").rglob("*.mcap"))]
+        assert [re.sub(r"[0-9a-f]{12}\.mcap$|^\d{8}T\d{6}", "", name) for name in names] == [
+            "-.._.._ppo_seed_3-",
+            "-cart-",
+        ]
 
     def test_in_filters_of_files_and_of_a_storage(self, tmp_path: Path) -> None:
         storage = FileStorage(tmp_path / "lab")

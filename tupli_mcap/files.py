@@ -24,6 +24,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 __all__ = [
+    "as_file_name",
     "create",
     "hold",
     "is_temporary",
@@ -258,3 +259,8 @@ def _remove(path: Path) -> None:
             path.unlink()
     except OSError:
         shutil.rmtree(path, ignore_errors=True)
+
+
+def as_file_name(name: str) -> str:
+    """A name of letters, digits, `_`, `-`, `+` and dots that a file may have, of at most 80 bytes."""
+    return re.sub(r"[^\w.+-]+", "_", name).encode()[:80].decode(errors="ignore")

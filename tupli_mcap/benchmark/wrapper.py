@@ -252,7 +252,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             with contextlib.suppress(RecordingError):
                 return RecordEpisodes(self._tap, self._path, **vars(going_on))
         benchmark = self.storage.load_benchmark(benchmark_id)
-        self._path = self.storage.new_recording_path(benchmark_id)
+        self._path = self.storage.new_recording_path(benchmark_id, options.name or benchmark.metadata.name)
         options = replace(options, attachments=recording_attachments(benchmark.serialized))
         return RecordEpisodes(self._tap, self._path, **vars(options))
 

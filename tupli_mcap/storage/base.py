@@ -153,8 +153,8 @@ class TupliStorage(ABC):
     # --- recordings ---
 
     @abstractmethod
-    def new_recording_path(self, benchmark_id: str) -> Path:
-        """Where a new recording of a stored benchmark may be written; nothing is there yet."""
+    def new_recording_path(self, benchmark_id: str, name: str = "") -> Path:
+        """Where a new recording of a stored benchmark may be written; nothing is there yet. `name` is part of it."""
 
     def beginning_recording(self) -> AbstractContextManager[object]:
         """Held from looking up a benchmark until the file to record to is open, so that it is not deleted in

@@ -250,9 +250,9 @@ class FileStorage(TupliStorage):
 
     # --- recordings ---
 
-    def new_recording_path(self, benchmark_id: str) -> Path:
+    def new_recording_path(self, benchmark_id: str, name: str = "") -> Path:
         self._benchmarks.header(benchmark_id)
-        return self._recordings.new_path(benchmark_id)
+        return self._recordings.new_path(benchmark_id, name)
 
     def ingest(self, path: Path) -> None:
         self._recordings.ingest(path)

@@ -154,13 +154,14 @@ class RecordingFiles:
 
     # --- files ---
 
-    def new_path(self, benchmark_id: str) -> Path:
-        """A path below the benchmark's directory that nobody else is given."""
+    def new_path(self, benchmark_id: str, name: str) -> Path:
+        """A path below the benchmark's directory that nobody else is given: time (UTC), name and random digits."""
         directory = self._root / "recordings" / benchmark_id
         with os_errors("cannot make the directory", directory):
             directory.mkdir(parents=True, exist_ok=True)
         now = datetime.datetime.now(datetime.UTC)
-        return directory / f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(6)}.mcap"
+        named = f"{files.as_file_name(name)}-" if name else ""
+        return directory / f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
 
     def path(self, recording: str) -> Path:
         """The file of a catalogued recording.

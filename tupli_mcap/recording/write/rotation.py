@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError, os_reason
+from tupli_mcap.files import as_file_name
 from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, RecordOptions, check_place
@@ -60,7 +61,7 @@ class Rotation:
         name: str = "run",
     ) -> None:
         check_place(path)
-        self._name = re.sub(r"[^\w.+-]+", "_", name)
+        self._name = as_file_name(name)
         self._folder = Path(path) if _is_folder(path) else None
         self._options, self._format_version = options, format_version
         self._limited, self._max_bytes, self._max_seconds = (
