@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -312,6 +313,23 @@ class TestAnnotations:
         with pytest.raises(RecordingError, match="no annotation"):
             undo_annotation(path)
         assert path.read_bytes() == before
+
+    def test_of_several_people_at_once_are_all_kept_or_refused(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap")
+
+        def annotate(i: int) -> bool:
+            try:
+                annotate_episodes(path, {f"key{i}": i})
+            except RecordingError:  # another one is writing
+                return False
+            return True
+
+        with ThreadPoolExecutor(4) as people:
+            kept = list(people.map(annotate, range(40)))
+        assert any(kept)
+        with Recording(path) as recording:
+            found = {int(key[3:]) for key in recording.episodes[0].metadata if key.startswith("key")}
+        assert found == {i for i, is_kept in enumerate(kept) if is_kept}
 
     def test_wait_for_the_end_of_the_recording(self, tmp_path: Path) -> None:
         with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:

@@ -6,8 +6,10 @@ import getpass
 import operator
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from tupli_mcap.errors import RecordingError
@@ -18,7 +20,7 @@ from tupli_mcap.recording.about.annotations import (
     Annotations,
 )
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
-from tupli_mcap.recording.edit.attach import add_attachments
+from tupli_mcap.recording.edit.attach import attach, held
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
@@ -46,25 +48,25 @@ def annotate_episodes(
             or cannot be written.
         FormatError: it is damaged.
     """
-    with Recording(path) as recording:
+    with _changing(path, dry_run) as (recording, say):
         known = recording.index["episode"].tolist()
         try:
             chosen = known if episodes is None else sorted({operator.index(number) for number in episodes})
         except TypeError as err:
             raise RecordingError(f"expected numbers of episodes, found {episodes!r:.80}") from err
         missing = sorted(set(chosen) - set(known))
+        if missing:
+            raise RecordingError(f"{path} has no episode {missing[0]}; its episodes are {_some(known)}")
+        if not all(isinstance(key, str) for key in values):
+            raise RecordingError(f"expected keys that are texts, found {list(values)!r:.80}")
+        if not chosen or not values:
+            raise RecordingError(
+                f"expected episodes and values to give them, found {chosen!r:.60}, {values!r:.60}"
+            )
         said = Annotations()
-        said.said = [*recording.annotations.said]
-    if missing:
-        raise RecordingError(f"{path} has no episode {missing[0]}; its episodes are {_some(known)}")
-    if not all(isinstance(key, str) for key in values):
-        raise RecordingError(f"expected keys that are texts, found {list(values)!r:.80}")
-    if not chosen or not values:
-        raise RecordingError(
-            f"expected episodes and values to give them, found {chosen!r:.60}, {values!r:.60}"
-        )
-    said.said.append(Annotation(chosen, dict(values), _user(), iso_utc(time.time_ns())))
-    _say(path, {ANNOTATIONS_NAME: (ANNOTATIONS_MEDIA_TYPE, said.to_json())}, dry_run=dry_run)
+        added = Annotation(chosen, dict(values), _user(), iso_utc(time.time_ns()))
+        said.said = [*recording.annotations.said, added]
+        say(ANNOTATIONS_NAME, ANNOTATIONS_MEDIA_TYPE, said.to_json())
     return chosen
 
 
@@ -74,13 +76,13 @@ def undo_annotation(path: str | os.PathLike[str], *, dry_run: bool = False) -> A
     Raises:
         RecordingError: nothing was said; otherwise as `annotate_episodes`.
     """
-    with Recording(path) as recording:
+    with _changing(path, dry_run) as (recording, say):
         said = Annotations()
         said.said = [*recording.annotations.said]
-    if not said.said:
-        raise RecordingError(f"{path} has no annotation to take back")
-    last = said.said.pop()
-    _say(path, {ANNOTATIONS_NAME: (ANNOTATIONS_MEDIA_TYPE, said.to_json())}, dry_run=dry_run)
+        if not said.said:
+            raise RecordingError(f"{path} has no annotation to take back")
+        last = said.said.pop()
+        say(ANNOTATIONS_NAME, ANNOTATIONS_MEDIA_TYPE, said.to_json())
     return last
 
 
@@ -100,29 +102,38 @@ def edit_run(
     Raises:
         RecordingError: as `annotate_episodes`; or the recording was made of several runs.
     """
-    with Recording(path) as recording:
+    with _changing(path, dry_run) as (recording, say):
         if len(recording.runs) > 1:
             raise RecordingError(
                 f"{path} is made of {len(recording.runs)} runs; edit the recordings that it was made of, and merge them"
             )
         (said,) = recording.recorded_runs.runs
-    added = {**said.metadata, **(metadata or {})}
-    run = Run.given(
-        said.name if name is None else name,
-        {key: value for key, value in added.items() if value is not None},
-        said.tags if tags is None else tags,
-        said.split if split is None else split,
-    )
-    run = replace(said, name=run.name, metadata=run.metadata, tags=run.tags, split=run.split)
-    _say(path, {RUN_NAME: (RUN_MEDIA_TYPE, RecordedRuns([run]).to_json())}, dry_run=dry_run)
+        added = {**said.metadata, **(metadata or {})}
+        run = Run.given(
+            said.name if name is None else name,
+            {key: value for key, value in added.items() if value is not None},
+            said.tags if tags is None else tags,
+            said.split if split is None else split,
+        )
+        run = replace(said, name=run.name, metadata=run.metadata, tags=run.tags, split=run.split)
+        say(RUN_NAME, RUN_MEDIA_TYPE, RecordedRuns([run]).to_json())
     return run
 
 
-def _say(
-    path: str | os.PathLike[str], attachments: Mapping[str, tuple[str, bytes]], *, dry_run: bool
-) -> None:
-    if not dry_run:
-        add_attachments(path, attachments, without=[SIGNATURE_NAME])
+@contextmanager
+def _changing(
+    path: str | os.PathLike[str], dry_run: bool
+) -> Iterator[tuple[Recording, Callable[[str, str, bytes], None]]]:
+    """A recording that nobody else writes to meanwhile, and a function that replaces an attachment of it.
+
+    The function takes name, media type and bytes. In a dry run it does nothing, and the recording is not kept.
+    """
+
+    def say(name: str, media_type: str, data: bytes) -> None:
+        attach(Path(recording.name), {name: (media_type, data)}, without=[SIGNATURE_NAME])
+
+    with nullcontext(path) if dry_run else held(path) as place, Recording(place) as recording:
+        yield recording, (lambda *_: None) if dry_run else say
 
 
 def _user() -> str:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from tupli_mcap.errors import RecordingError
@@ -18,7 +19,7 @@ from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.write.resume import restore_container
 
-__all__ = ["add_attachments"]
+__all__ = ["add_attachments", "attach", "held"]
 
 _COPY = 1 << 22
 
@@ -36,21 +37,36 @@ def add_attachments(
         RecordingError: the recording is not finished, is being written, or cannot be written.
         FormatError: it is damaged.
     """
-    path = Path(os.path.realpath(path))  # not a symbolic link is replaced, but what it names
-    lock = FileLock(path, "a")
+    with held(path) as place:
+        attach(place, attachments, without=without)
+
+
+@contextlib.contextmanager
+def held(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """The file at a path, where links have been followed; nobody else writes to it in the block.
+
+    What is said of a recording depends on what was said before: read it in the block, then `attach` it.
+
+    Raises:
+        RecordingError: somebody else writes to it for longer than a moment.
+    """
+    place = Path(os.path.realpath(path))  # not a symbolic link is replaced, but what it names
+    lock = FileLock(place, "a")
     try:
-        source = PathSource(path)
-        try:
-            contents = read_contents(source)
-            if not contents.complete:
-                raise RecordingError(
-                    f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover` finishes it"
-                )
-            _replace(path, source, contents, attachments, without)
-        finally:
-            source.close()
+        yield place
     finally:
         lock.release()
+
+
+def attach(path: Path, attachments: Mapping[str, tuple[str, bytes]], *, without: Sequence[str] = ()) -> None:
+    """`add_attachments` to a file that is `held`."""
+    with contextlib.closing(PathSource(path)) as source:
+        contents = read_contents(source)
+        if not contents.complete:
+            raise RecordingError(
+                f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover` finishes it"
+            )
+        _replace(path, source, contents, attachments, without)
 
 
 def _replace(

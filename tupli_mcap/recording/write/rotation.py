@@ -1,6 +1,7 @@
 """A rollout in one file or several: what they are called, and when it is time for the next one.
 
-A directory gets a new file, `CartPole-v1_2026-11-23_16-55-03.mcap`; what the path lacks of directories is made.
+A directory gets a new file, `CartPole-v1_2026-11-23_16-55-03.mcap`; what the path lacks of directories is made. A path
+without a suffix, such as `runs`, is a directory.
 `run.mcap` is followed by `run_0001.mcap`, `run_0002.mcap`, …, an order that sorting by name keeps. Each is a recording
 of its own, with its benchmark and attachments.
 """
@@ -173,8 +174,11 @@ class Rotation:
 
 
 def _is_folder(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is a directory, or is to become one: nothing is there, and it has no suffix."""
     try:
-        return os.fspath(path).endswith(os.sep) or Path(path).is_dir()
+        if os.fspath(path).endswith(os.sep) or Path(path).is_dir():
+            return True
+        return not Path(path).suffix and not os.path.lexists(path)
     except OSError as err:
         raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
 
