@@ -780,13 +780,22 @@ def test_a_sketch_is_of_the_whole_data(cartpole: Path) -> None:
     returns, lengths = found.courses
     parts = np.array_split(rows["length"], 10)
     np.testing.assert_allclose(sorted(lengths.values), sorted(part.mean() for part in parts), rtol=0.2)
-    assert (lengths.least, lengths.most) == (rows["length"].min(), rows["length"].max())
+    assert (lengths.least, lengths.most) == (min(lengths.values), max(lengths.values))
+    assert lengths.each == -(-len(rows) // 10)
     assert returns.values == lengths.values  # a reward of 1 a step
     by_name = {series.name: series for series in found.distributions}
     assert list(by_name)[:2] == ["reward", "Cart Position"] and list(by_name)[-1] == "action"
     for i, name in enumerate(("Cart Position", "Cart Velocity")):
         np.testing.assert_array_equal(by_name[name].values, np.histogram(states[:, i], 10)[0])
     assert (found.sampled, found.hidden, found.error) == (400, 0, "")
+
+
+def test_bars_of_whole_numbers_hold_as_many_of_them(tmp_path: Path) -> None:
+    space = spaces.Box(0, 100, (1,), np.int64)
+    path = scripted(tmp_path / "r.mcap", lambda n: np.array([n % 50]), space, 500, length=500)
+    with Recording(path) as recording:
+        (state,) = [found for found in sketch(recording, 40).distributions if found.name == "state[0]"]
+    assert state.values == (20.0,) * 25
 
 
 def test_info_says_what_is_not_finite(tmp_path: Path) -> None:
