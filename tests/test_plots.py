@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ from tupli_mcap.errors import install_line
 from tupli_mcap.plots import Measured, Report, report
 from tupli_mcap.plots.draw_trace import by_scale
 from tupli_mcap.plots.draw_values import LEVELS, most_varying, quantiles
+from tupli_mcap.plots.groups import groups_of
 from tupli_mcap.plots.measure import measure
 from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, mean_interval, running_mean
 from tupli_mcap.recording.series import sketch
@@ -730,6 +732,14 @@ def test_which_runs_are_of_one_group(
     scored(tmp_path / "a.mcap", [2, 3], **first)
     scored(tmp_path / "b.mcap", [2, 3], **second)
     assert [group.name for group in report(tmp_path).groups] == groups
+
+
+def test_a_run_with_a_long_name_is_grouped_at_once(tmp_path: Path) -> None:
+    one = measured(scored(tmp_path / "r.mcap", [2, 3], metadata={"seed": 1}))
+    one.run = replace(
+        one.run, name="-" * 1_000_000
+    )  # as only a file can have it: recorders refuse such names
+    assert [len(group.runs) for group in groups_of([one])] == [1]
 
 
 def test_the_files_of_a_run_are_one_line_and_what_was_made_of_them_is_another(tmp_path: Path) -> None:

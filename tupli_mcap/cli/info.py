@@ -263,7 +263,7 @@ def _print_series(recording: Recording) -> None:
         return
     say("")
     each = max(series.each for series in summary.courses)
-    order = f"FIRST TO LAST, MEANS OF {each}" if each > 1 else "FIRST TO LAST"
+    order = f"FIRST TO LAST, MEANS OF UP TO {each}" if each > 1 else "FIRST TO LAST"
     _print_sparklines("EPISODES", order, summary.courses, zero_based=False)
     if summary.distributions:
         say("")

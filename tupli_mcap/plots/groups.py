@@ -18,6 +18,7 @@ __all__ = ["Group", "PlottedRun", "X", "groups_of", "shown_numbers"]
 
 X: TypeAlias = Literal["steps", "episodes", "time"]
 _MOST_NUMBERS = 4  # of infos, and of metadata, that get a panel
+_LONGEST = 200  # characters of a run's name that are looked at
 _SEED = re.compile(r"[-_. ]*seed[-_=. ]*\d+", re.IGNORECASE)
 _STARTED = re.compile(r"[-_. ]+\d{10}$")  # the time (s) at the end of CleanRL's names
 
@@ -111,11 +112,11 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
 def _seedless(one: Measured) -> tuple[str, ...] | None:
     """What runs of a group have in common: their name without the seed, with its directory where a run is named as its
     file; environment and split. None if it names no seed."""
-    seed, path = one.run.metadata.get("seed"), Path(one.facts.name)
-    name = _SEED.sub("", one.run.name)
-    if name == one.run.name and seed is None:
+    seed, path, given = one.run.metadata.get("seed"), Path(one.facts.name), one.run.name[:_LONGEST]
+    name = _SEED.sub("", given)
+    if name == given and seed is None:
         return None
-    if name == one.run.name and isinstance(seed, int):
+    if name == given and isinstance(seed, int):
         name = re.sub(rf"[-_. ]+s?{seed}(?!\d)", "", _STARTED.sub("", name), count=1)
     own = one.run.name != path.stem
     folder = "" if own else _SEED.sub("", str(path.parent))

@@ -153,7 +153,7 @@ class Page:
         def draw(axes: Any) -> None:
             axes.set_axis_off()
             axes.set(xlim=(0, 1), ylim=(0, _HEADING - TOP))
-            axes.text(0, _HEADING - 0.2, cut(text, 120), fontsize=10.5, fontweight="bold")
+            axes.text(0, _HEADING - 0.2, cut(text, 100), fontsize=10.5, fontweight="bold")
             axes.axhline(_HEADING - TOP, color="#BBBBBB", linewidth=0.8, clip_on=False)
 
         self._rows.append((_HEADING, [Cell(draw, _HEADING - TOP, left=0, right=0)], 1))
