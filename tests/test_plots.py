@@ -734,6 +734,16 @@ def test_which_runs_are_of_one_group(
     assert [group.name for group in report(tmp_path).groups] == groups
 
 
+def test_groups_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        for split in ("train", "eval"):
+            scored(tmp_path / split / f"{split}{seed}.mcap", [2, 3], name=f"ppo-seed{seed}", split=split)
+        for folder in ("x", "y"):
+            scored(tmp_path / folder / f"sac-seed{seed}.mcap", [2, 3])
+    names = [group.name for group in report(tmp_path).groups]
+    assert names == ["ppo (eval)", "ppo (train)", "sac (x)", "sac (y)"]
+
+
 def test_a_run_with_a_long_name_is_grouped_at_once(tmp_path: Path) -> None:
     one = measured(scored(tmp_path / "r.mcap", [2, 3], metadata={"seed": 1}))
     one.run = replace(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -97,16 +96,22 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
             key = _seedless(one) or (("", one.run.name, one.run.id) if one.run.id else key)
         uuids.add(one.facts.uuid)
         found.setdefault(key, {}).setdefault(one.run.id or place, []).append(one)
-    groups = [Group("", [PlottedRun(run) for run in runs.values()]) for runs in found.values()]
-    for key, group in zip(found, groups, strict=True):
-        alone = len(group.recordings) == 1
-        group.name = group.recordings[0].name if alone else key[1] or Path(key[0]).name or "runs"
-    taken = Counter(group.name for group in groups)
-    for group in groups:
-        run = group.recordings[0].run
-        if taken[group.name] > 1:
-            group.name = f"{group.name} ({run.split or run.environment})"
-    return groups
+    alike: dict[str, list[tuple[Any, ...]]] = {}
+    for key, runs in found.items():
+        if sum(map(len, runs.values())) > 1:
+            alike.setdefault(key[1] or Path(key[0]).name or "runs", []).append(key)
+    names = {key: _told_apart(name, key, keys) for name, keys in alike.items() for key in keys}
+    return [
+        Group(names.get(key) or next(iter(runs.values()))[0].name, [PlottedRun(run) for run in runs.values()])
+        for key, runs in found.items()
+    ]
+
+
+def _told_apart(name: str, key: tuple[Any, ...], keys: Sequence[tuple[Any, ...]]) -> str:
+    """The name of a group, with what tells its key from those of other groups with this name."""
+    differing = [parts for parts in zip(key, *keys, strict=False) if len(set(parts)) > 1]
+    told = ", ".join(Path(str(own)).name for own, *_ in differing if own)
+    return f"{name} ({told})" if told else name
 
 
 def _seedless(one: Measured) -> tuple[str, ...] | None:
