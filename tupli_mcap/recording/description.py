@@ -210,27 +210,27 @@ def _leaf_lines(leaf: Leaf, labels: Labels) -> list[str]:
     if leaf.kind == "variable":
         return [name + describe_space(leaf.space)]
     low, high = element_bounds(leaf)
-    bounds = [
-        f"{_short(start)} … {_short(end)}" if start != end else _short(start)
-        for start, end in zip(low, high, strict=True)
-    ]
     if isinstance(leaf.space, gym.spaces.Discrete):
-        named = [f"{low[0] + i} {text}" for i, text in enumerate(labels.values.get(leaf.path, ()))]
-        return [f"{name}one of {leaf.space.n:,}: {', '.join(named) or bounds[0]}"]
+        named = [f"{int(low[0]) + i} {text}" for i, text in enumerate(labels.values.get(leaf.path, ()))]
+        return [f"{name}one of {leaf.space.n:,}: {', '.join(named) or _range(low[0], high[0])}"]
     sizes = " x ".join(map(str, leaf.shape)) or "1"
     what = f"{name}{sizes} number{'' if sizes == '1' else 's'}"
-    kind = "" if isinstance(leaf.space, gym.spaces.MultiDiscrete | gym.spaces.MultiBinary) else leaf.dtype
-    kind = f" ({kind})" if kind else ""
-    alike = len(set(bounds)) <= 1
-    if alike and (leaf.path not in labels.dimensions or leaf.size > _MOST_BOUNDS):
-        return [
-            what + "".join(f", each {text}" if leaf.size > 1 else f", {text}" for text in bounds[:1]) + kind
-        ]
-    if leaf.size > _MOST_BOUNDS:
-        return [f"{what}, of {_short(low.min())} … {_short(high.max())}{kind}"]
+    whole = isinstance(leaf.space, gym.spaces.MultiDiscrete | gym.spaces.MultiBinary)
+    kind = "" if whole else f" ({leaf.dtype})"
+    if not leaf.size:
+        return [what + kind]
+    alike = bool((low == low[0]).all() and (high == high[0]).all())
+    if leaf.size > _MOST_BOUNDS or (alike and leaf.path not in labels.dimensions):
+        between = "," if leaf.size == 1 else ", each" if alike else ", of"
+        return [f"{what}{between} {_range(low.min(), high.max())}{kind}"]
     names = element_names(leaf, labels)
     widest = max(map(len, names))
+    bounds = map(_range, low, high)
     return [what + kind, *(f"{text:<{widest}}  {ends}" for text, ends in zip(names, bounds, strict=True))]
+
+
+def _range(low: Any, high: Any) -> str:
+    return _short(low) if low == high else f"{_short(low)} … {_short(high)}"
 
 
 def _short(value: Any) -> str:
