@@ -40,7 +40,10 @@ from tupli_mcap.cli import app
 from tupli_mcap.cli.output import bytes_of, number, numbers
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.recording.description import space_lines
 from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, RLTuple
+from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.leaves import NameRegistry, flatten_space
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
@@ -478,8 +481,9 @@ class TestLook:
         assert facts["state"] == "complete"
         assert facts["environment"] == "CartPole-v1"
         assert facts["benchmark"] == "none"
-        assert facts["action"] == "Discrete(2)"
-        assert facts["observation"].endswith("(4,), float32)")
+        assert facts["action"] == "one of 2: 0 Push cart to the left, 1 Push cart to the right"
+        assert facts["observation"] == "4 numbers (float32)"
+        assert re.search(r"^ +Cart Position +-4\.8 … 4\.8\n +Cart Velocity +-inf … inf$", out, re.MULTILINE)
         assert re.search(r"compressed \d+\.\d : 1", facts["size"])
         assert "/step           tupli_mcap/msg/Step" in out
         assert "benchmark.json" in out
@@ -573,17 +577,48 @@ class TestLook:
         assert run("info", "empty.mcap", "--json").json["returns"] is None
         assert ok("episodes", "empty.mcap") == "no episodes\n"
 
-    def test_info_of_nested_spaces_fits_one_line_each(self, here: Path) -> None:
+    def test_info_of_nested_spaces_has_a_line_for_each_part(self, here: Path) -> None:
         ok("record", "Blackjack-v1", "-o", "a.mcap", "--steps", 20)
-        assert "observation  Tuple(Discrete(32), Discrete(11), Discrete(2))\n" in ok("info", "a.mcap")
+        lines = ok("info", "a.mcap").splitlines()
+        at = lines.index("observation  state[0]: one of 32: 0 … 31")
+        assert [line.strip() for line in lines[at + 1 : at + 3]] == [
+            "state[1]: one of 11: 0 … 10",
+            "state[2]: one of 2: 0 … 1",
+        ]
+        said = run("info", "a.mcap", "--json").json["observation_space"]
+        assert said == "Tuple(Discrete(32), Discrete(11), Discrete(2))"
+
+    @pytest.mark.parametrize(
+        ("space", "said"),
+        [
+            (gym.spaces.Box(-1, 1, (3, 2), np.float32), ["3 x 2 numbers, each -1 … 1 (float32)"]),
+            (gym.spaces.Box(0, 255, (8, 8, 3), np.uint8), ["8 x 8 x 3 numbers, each 0 … 255 (uint8)"]),
+            (gym.spaces.Box(0.5, np.inf, (), np.float64), ["1 number, 0.5 … inf (float64)"]),
+            (
+                gym.spaces.Box(-np.arange(99, dtype=np.float32), np.float32(7), dtype=np.float32),
+                ["99 numbers, of -98 … 7 (float32)"],
+            ),
+            (gym.spaces.Box(0, 1, (0,), np.float32), ["0 numbers (float32)"]),
+            (
+                gym.spaces.MultiDiscrete([3, 30], start=[1, 0]),
+                ["2 numbers", "state[0]  1 … 3", "state[1]  0 … 29"],
+            ),
+            (gym.spaces.MultiBinary(4), ["4 numbers, each 0 … 1"]),
+            (gym.spaces.Discrete(1, start=7), ["one of 1: 7"]),
+        ],
+    )
+    def test_spaces_are_written_to_be_read(self, space: gym.Space[Any], said: list[str]) -> None:
+        leaves = flatten_space(space, "state", NameRegistry())
+        assert space_lines(leaves, Labels.none()) == said
 
     def test_info_of_texts_counts_their_characters(self, here: Path) -> None:
         space = gym.spaces.Dict({"say": gym.spaces.Text(20), "bit": gym.spaces.Text(1, charset="01")})
         states = [{"say": "up", "bit": "1"}]
         episode = EpisodeData(states, [0], [1.0], [True], [False])
         write_recording("r.mcap", [episode], observation_space=space, action_space=gym.spaces.Discrete(2))
-        said = "Dict('bit': Text(1..1, 2 characters), 'say': Text(1..20, 62 characters))"
-        assert f"observation  {said}\n" in ok("info", "r.mcap")
+        out = ok("info", "r.mcap")
+        assert "observation  bit: Text(1..1, 2 characters)\n" in out
+        assert "             say: Text(1..20, 62 characters)\n" in out
 
     def test_episodes_of_a_file(self, cartpole: Path, here: Path) -> None:
         header, *rows = ok("episodes", cartpole).splitlines()

@@ -706,7 +706,7 @@ def test_what_cannot_be_examined(tmp_path: Path) -> None:
     missing = examine(tmp_path / "missing.mcap")
     assert found(missing, "unreadable").message.startswith(f"{tmp_path / 'missing.mcap'} does not exist")
     assert "holds no recording" in found(examine(tmp_path), "unreadable").message
-    with pytest.raises(RecordingError, match="expected a path, Recording, TupliDataset or storage, found 3"):
+    with pytest.raises(RecordingError, match="expected a path, Recording, Dataset or storage, found 3"):
         examine(3)  # type: ignore[arg-type]
     with pytest.raises(RecordingError, match="there is no check 'nam'; there are unfinished, nan, "):
         examine(tmp_path, checks=["nam"])

@@ -7,7 +7,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from gymnasium import spaces
 from PIL import Image
 from typer.testing import CliRunner
 
+import tupli_mcap
 from tupli_mcap import (
     EpisodeData,
     F,
@@ -38,8 +40,9 @@ from tupli_mcap.errors import install_line
 from tupli_mcap.plots import Measured, Report, report
 from tupli_mcap.plots.draw_trace import by_scale
 from tupli_mcap.plots.draw_values import LEVELS, most_varying, quantiles
+from tupli_mcap.plots.groups import groups_of
 from tupli_mcap.plots.measure import measure
-from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, running_mean
+from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, mean_interval, running_mean
 from tupli_mcap.recording.series import sketch
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
@@ -475,7 +478,7 @@ def test_few_episodes_are_counted_in_whole_numbers(tmp_path: Path, episodes: int
     found = [EpisodeData([UNIT.low], [0], [float(i)], [True], [False]) for i in range(episodes)]
     write_recording(tmp_path / "r.mcap", found, observation_space=UNIT, action_space=spaces.Discrete(2))
     counted = [axes for axes in report(tmp_path / "r.mcap").figure.axes if axes.get_ylabel() == "episodes"]
-    assert len(counted) == 2  # of returns, of lengths
+    assert len(counted) == 1  # of returns; the head says the lengths, which are all the same
     for axes in counted:
         assert len(axes.get_yticks()) >= 2
         assert all(float(tick).is_integer() for tick in axes.get_yticks())
@@ -557,7 +560,7 @@ def test_what_lines_of_compared_recordings_are_is_said(tmp_path: Path) -> None:
     paths = {name: tmp_path / f"{name}.mcap" for name in ("short", "middle", "long")}
 
     def told(*names: str) -> set[str]:
-        made = report([paths[name] for name in names])
+        made = report([paths[name] for name in names], x="episodes")
         return {text for text in texts(made) if text.startswith("episode;")}
 
     assert told("short", "middle") == {"episode; lines are means of 2 to 5 episodes"}
@@ -586,6 +589,204 @@ def test_a_storage_without_what_it_has_deleted(tmp_path: Path) -> None:
     storage.close()
 
 
+# --- numbers of episodes, and runs ---
+
+
+def scored(path: Path, lengths: Sequence[int], *, seed: int = 0, **options: Any) -> Path:
+    """Episodes of such lengths, a reward of 1 a step; infos say a distance and, at the end of odd ones, success."""
+    ended = iter(lengths)
+    length = 0
+
+    class Env(Scripted):
+        def reset(self, **given: Any) -> Any:
+            nonlocal length
+            self._length = length = next(ended)
+            return super().reset(**given)
+
+    env = Env(
+        lambda n: np.float32([n]),
+        spaces.Box(-99, 99, (1,), np.float32),
+        info=lambda n: {
+            "is_success": n % 2 == 1,
+            "distance": n + seed,
+            "word": "far",
+            "left": n % 2 == 0,
+            "k": 3,
+        },
+    )
+    with RecordEpisodes(env, path, record_info=True, **options) as recorder:
+        for _ in lengths:
+            recorder.reset(seed=seed)
+            while not any(recorder.step(0)[2:4]):
+                pass
+    return path
+
+
+def panel(made: Report, title: str) -> Any:
+    (axes,) = [axes for axes in made.figure.axes if axes.get_title(loc="left") == title]
+    return axes
+
+
+@pytest.mark.parametrize(
+    ("x", "label", "expected"),
+    [("episodes", "episode", [1, 2, 3]), (None, "episode", [1, 2, 3]), ("steps", "steps", [9, 10, 16])],
+)
+def test_what_is_on_the_x_axis(tmp_path: Path, x: Any, label: str, expected: list[int]) -> None:
+    path = scored(tmp_path / "r.mcap", [7, 2, 1, 6])
+    axes = panel(report(path, x=x, episode_filter=F("episode") > 0), "return")
+    assert axes.get_xlabel() == label
+    at, returns = axes.collections[0].get_offsets().T
+    assert (at.tolist(), returns.tolist()) == (expected, [2, 1, 6])  # steps of the first one count
+
+
+def test_time_on_the_x_axis(tmp_path: Path) -> None:
+    path = scored(tmp_path / "r.mcap", [7, 2, 1, 6])
+    axes = panel(report(path, x="time"), "return")
+    with Recording(path) as recording:
+        ended = (recording.index["end_time"] - recording.index["start_time"][0]) / 1e9
+    np.testing.assert_allclose(axes.collections[0].get_offsets()[:, 0], ended)
+    assert axes.get_xlabel() == "time (s)"
+    with pytest.raises(RecordingError, match="expected steps, episodes, time as x, found 'days'"):
+        report(path, x="days")  # type: ignore[arg-type]
+
+
+def test_success_and_numbers_of_infos_and_metadata(tmp_path: Path) -> None:
+    path = scored(tmp_path / "r.mcap", [1, 2, 3, 4])
+    with Recording(path) as recording:
+        for position, score in ((0, 9.5), (2, 4)):
+            recording.episodes[position].annotate(score=score, kind="x", constant=1)
+    made = report(path)
+    (one,) = made.measured
+    np.testing.assert_array_equal(one.numbers["success"], [1, 0, 1, 0])
+    np.testing.assert_array_equal(one.numbers["metadata: score"], [9.5, np.nan, 4, np.nan])
+    np.testing.assert_array_equal(one.numbers["info: distance"], [1, 1.5, 2, 2.5])
+    assert dict(made.facts)["success"] == "50%"
+    np.testing.assert_array_equal(panel(made, "success rate").lines[0].get_ydata(), [1, 0, 1, 0])
+    assert panel(made, "info: distance, mean of each episode") and panel(
+        made, "info: left, mean of each episode"
+    )
+    assert panel(made, "metadata: score") and panel(made, "info: distance")  # of episodes; step by step
+    assert not {"metadata: constant", "info: k, mean of each episode"} & set(texts(made))  # all the same
+    assert made.notes == []
+
+
+def test_of_many_infos_some_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = scored(tmp_path / "r.mcap", [20] * 20)
+    monkeypatch.setattr("tupli_mcap.plots.measure.INFO_STEPS", 100)
+    made = report(path)
+    found = made.measured[0].numbers["info: distance"]
+    assert "Infos are those of 80 of 400 steps." in made.notes
+    assert np.isfinite(found).all() and len(set(found.tolist())) > 1
+    assert "info: distance" not in texts(made)  # of one episode, as not all of its infos are read
+
+
+def test_huge_numbers_of_infos_are_left_out(tmp_path: Path) -> None:
+    huge = [10**400, -1e300, float("nan"), 5]
+    env = Scripted(lambda n: UNIT.low, UNIT, info=lambda n: {"k": huge[n % 4]}, length=4)
+    path = record(tmp_path / "r.mcap", env, 8, record_info=True)
+    np.testing.assert_array_equal(measured(path).numbers["info: k"], [5, 5])
+
+
+def test_runs_that_differ_by_their_seeds_are_one_line(tmp_path: Path) -> None:
+    for algo in ("ppo", "sac"):
+        for seed in range(3):
+            lengths = [2 + seed, 4 + seed, 6] * 10
+            scored(
+                tmp_path / f"{algo}{seed}.mcap",
+                lengths,
+                seed=seed,
+                name=f"{algo}-seed{seed}",
+                metadata={"lr": 1},
+            )
+    made = report(tmp_path)
+    assert [(group.name, len(group.runs)) for group in made.groups] == [("ppo", 3), ("sac", 3)]
+    assert [label for label, _ in made.facts] == ["ppo", "sac"]
+    assert made.facts[0][1].startswith("3 runs, 90 episodes, 420 steps, return 4.667 ± ")
+    assert any(note.startswith("Shades are 95% intervals of the mean over runs") for note in made.notes)
+    assert made.groups[0].states[0].values.shape == (1, 420)
+    axes = panel(made, "return")
+    assert axes.get_xlabel() == "steps; lines are means of 3 episodes"
+    mean = axes.lines[3]  # after those of three runs
+    assert mean.get_xdata()[-1] == 120  # the steps of the shortest
+    assert mean.get_ydata()[-1] == pytest.approx(np.mean([4, 14 / 3, 16 / 3]))
+    check_formats(made, tmp_path, page=False)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "groups"),
+    [
+        ({"name": "ppo", "metadata": {"seed": 1}}, {"name": "ppo", "metadata": {"seed": 2}}, ["ppo"]),
+        (
+            {"name": "Cart-v1__ppo__1__1700000000", "metadata": {"seed": 1}},
+            {"name": "Cart-v1__ppo__2__1700000999", "metadata": {"seed": 2}},
+            ["Cart-v1__ppo"],
+        ),
+        ({"name": "ppo-seed1"}, {"name": "ppo-seed2", "split": "eval"}, ["a", "b"]),
+        ({"name": "ppo"}, {"name": "ppo"}, ["a", "b"]),
+        ({}, {}, ["a", "b"]),
+    ],
+)
+def test_which_runs_are_of_one_group(
+    tmp_path: Path, first: dict[str, Any], second: dict[str, Any], groups: list[str]
+) -> None:
+    scored(tmp_path / "a.mcap", [2, 3], **first)
+    scored(tmp_path / "b.mcap", [2, 3], **second)
+    assert [group.name for group in report(tmp_path).groups] == groups
+
+
+def test_groups_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        for split in ("train", "eval"):
+            scored(tmp_path / split / f"{split}{seed}.mcap", [2, 3], name=f"ppo-seed{seed}", split=split)
+        for folder in ("x", "y"):
+            scored(tmp_path / folder / f"sac-seed{seed}.mcap", [2, 3])
+    names = [group.name for group in report(tmp_path).groups]
+    assert names == ["ppo (eval)", "ppo (train)", "sac (x)", "sac (y)"]
+
+
+def test_a_run_with_a_long_name_is_grouped_at_once(tmp_path: Path) -> None:
+    one = measured(scored(tmp_path / "r.mcap", [2, 3], metadata={"seed": 1}))
+    one.run = replace(
+        one.run, name="-" * 1_000_000
+    )  # as only a file can have it: recorders refuse such names
+    assert [len(group.runs) for group in groups_of([one])] == [1]
+
+
+def test_the_files_of_a_run_are_one_line_and_what_was_made_of_them_is_another(tmp_path: Path) -> None:
+    scored(tmp_path / "a-seed1.mcap", [2, 3, 4])
+    tupli_mcap.open(tmp_path / "a-seed1.mcap").filter("steps > 2").save(tmp_path / "good.mcap")
+    made = report([tmp_path / "a-seed1.mcap", tmp_path / "good.mcap"])
+    assert [(group.name, len(group.rows)) for group in made.groups] == [("a-seed1", 3), ("good", 2)]
+    twice = report([tmp_path / "a-seed1.mcap"] * 2)
+    assert [len(group.rows) for group in twice.groups] == [3, 3]
+
+
+def test_the_interval_of_a_mean() -> None:
+    values = np.random.default_rng(3).normal(7, 2, (400, 2))
+    mean, low, high = mean_interval(values)
+    np.testing.assert_array_equal(mean, values.mean(axis=0))
+    width = 1.96 * values.std(axis=0) / np.sqrt(400)  # the central limit theorem
+    np.testing.assert_allclose([low, high], [mean - width, mean + width], atol=0.03)
+    assert [line.tolist() for line in mean_interval(np.array([[3.0]]))] == [[3], [3], [3]]
+
+
+def test_episodes_of_one_step_take_lines_not_panels(tmp_path: Path) -> None:
+    made = report(scored(tmp_path / "r.mcap", [1] * 50))
+    assert {"state[0] 0", "action 0", "reward 1"} <= set(texts(made))
+    assert "running return" not in texts(made) and "length (steps)" not in texts(made)
+
+
+def test_a_dataset_is_plotted(tmp_path: Path) -> None:
+    for name, seed in (("a", 1), ("b", 2)):
+        scored(tmp_path / f"{name}.mcap", [2, 5, 3, 6], seed=seed)
+    chosen = tupli_mcap.open(tmp_path).filter("steps > 2").sort("return")
+    made = chosen.plot(x="episodes", episode_filter=F("steps") < 6)
+    assert [(one.name, one.rows["length"].tolist()) for one in made.measured] == [
+        ("a", [5, 3]),
+        ("b", [5, 3]),
+    ]
+
+
 # --- files ---
 
 
@@ -594,6 +795,7 @@ def test_the_same_recording_gives_the_same_bytes(tiny: Path) -> None:
     assert first.svg() == second.svg() == first.svg()
     assert first.svg().startswith(b"<?xml")
     assert first.html() == second.html()
+    assert first.pdf() == second.pdf() and first.pdf().startswith(b"%PDF-")
 
 
 HOSTILE = "</svg><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$\\frac{--><!--\u202e"
@@ -649,9 +851,9 @@ def test_a_file_is_written_whole_or_not_at_all(tiny: Path, tmp_path: Path) -> No
     assert goal.read_bytes() == b"old"
     assert made.save(goal, overwrite=True) == goal
     with pytest.raises(
-        RecordingError, match=r"expected a file that ends in .png, .svg, .html, found 'report.pdf'"
+        RecordingError, match=r"expected a file that ends in .png, .svg, .pdf, .html, found 'report.gif'"
     ):
-        made.save(tmp_path / "report.pdf")
+        made.save(tmp_path / "report.gif")
     with pytest.raises(RecordingError, match="there is no directory .*; make it first"):
         made.save(tmp_path / "nowhere" / "report.png")
     with pytest.raises(RecordingError, match="is a directory; choose another name"):
@@ -692,10 +894,20 @@ def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert (code, err) == (0, "")
     assert out.startswith("tiny.png: ") and ", 55 steps, " in out
     code, out, _ = run(
-        "plot", tiny, "-o", "two.html", "--episode", "3,worst", "--filter", "n_tuples > 9", "--json"
+        "plot",
+        tiny,
+        "-o",
+        "two.pdf",
+        "--episode",
+        "3,worst",
+        "--filter",
+        "n_tuples > 9",
+        "--x",
+        "time",
+        "--json",
     )
     told = json.loads(out)
-    assert code == 0 and told["path"] == "two.html" and told["notes"] == []
+    assert code == 0 and told["path"] == "two.pdf" and told["notes"] == []
     with Recording(tiny) as recording:
         assert told["episodes"] == int((recording.index["length"] > 9).sum())
     assert run("plot", tiny)[::2] == (
@@ -712,7 +924,7 @@ def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (
             ["cartpole.mcap", "-o", "x.jpeg"],
             1,
-            "expected a file that ends in .png, .svg, .html, found 'x.jpeg'",
+            "expected a file that ends in .png, .svg, .pdf, .html, found 'x.jpeg'",
         ),
         (["cartpole.mcap", "-o", "no/x.png"], 1, "there is no directory 'no'; make it first"),
         (["cartpole.mcap", "--episode", "999"], 1, "cartpole.mcap has no episode 999; choose from 0 to"),
@@ -724,6 +936,7 @@ def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             'there is no episode that F("n_tuples") > 99999 is true of',
         ),
         (["cartpole.mcap", "--filter", "n_tuples >"], 2, "error: "),
+        (["cartpole.mcap", "--x", "days"], 2, "'days' is not one of 'steps', 'episodes', 'time'"),
         (["cartpole.mcap", "--filter", "color = 3"], 2, "color"),
         ([], 2, "Missing argument"),
     ],
@@ -780,13 +993,22 @@ def test_a_sketch_is_of_the_whole_data(cartpole: Path) -> None:
     returns, lengths = found.courses
     parts = np.array_split(rows["length"], 10)
     np.testing.assert_allclose(sorted(lengths.values), sorted(part.mean() for part in parts), rtol=0.2)
-    assert (lengths.least, lengths.most) == (rows["length"].min(), rows["length"].max())
+    assert (lengths.least, lengths.most) == (min(lengths.values), max(lengths.values))
+    assert lengths.each == -(-len(rows) // 10)
     assert returns.values == lengths.values  # a reward of 1 a step
     by_name = {series.name: series for series in found.distributions}
     assert list(by_name)[:2] == ["reward", "Cart Position"] and list(by_name)[-1] == "action"
     for i, name in enumerate(("Cart Position", "Cart Velocity")):
         np.testing.assert_array_equal(by_name[name].values, np.histogram(states[:, i], 10)[0])
     assert (found.sampled, found.hidden, found.error) == (400, 0, "")
+
+
+def test_bars_of_whole_numbers_hold_as_many_of_them(tmp_path: Path) -> None:
+    space = spaces.Box(0, 100, (1,), np.int64)
+    path = scripted(tmp_path / "r.mcap", lambda n: np.array([n % 50]), space, 500, length=500)
+    with Recording(path) as recording:
+        (state,) = [found for found in sketch(recording, 40).distributions if found.name == "state[0]"]
+    assert state.values == (20.0,) * 25
 
 
 def test_info_says_what_is_not_finite(tmp_path: Path) -> None:

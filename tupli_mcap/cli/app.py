@@ -257,7 +257,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
         "episodes lab/ --limit 20 --json",
     ),
     "view": ("view run.mcap", "view run.mcap --episodes best,worst --compare", "view lab/ --web"),
-    "plot": ("plot run.mcap -o report.html", "plot a.mcap b.mcap -o compared.png"),
+    "plot": ("plot run.mcap -o report.html", "plot runs/ --x steps -o compared.pdf"),
     "render": ("render run.mcap -o best.mp4", "render run.mcap -o first.gif --episodes first --rerun"),
     "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning"),
     "verify": ("verify run.mcap", "verify run.mcap --rerun --episodes 0,4,10-19"),

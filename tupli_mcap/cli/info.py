@@ -161,8 +161,8 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         ("environment", f"{environment}, {d.num_envs} sub-environments" if d.num_envs > 1 else environment),
         ("benchmark", d.benchmark_id or "none"),
         *([("signed by", f"{d.signed_by} (not checked)")] if d.signed_by else []),
-        ("observation", d.observation_space or "not known before the first step"),
-        ("action", d.action_space or "not known before the first step"),
+        *_space_facts("observation", d.observation),
+        *_space_facts("action", d.action),
         ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),
         ("steps", f"{d.steps:,}{_spread_text(d.lengths, d.episodes, ' an episode')}"),
         *([("return", _spread_text(d.returns, d.episodes).removeprefix(", "))] if d.returns else []),
@@ -171,6 +171,11 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         *([("metadata", ", ".join(d.metadata_keys))] if d.metadata_keys else []),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
+
+
+def _space_facts(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:
+    first, *others = lines or ["not known before the first step"]
+    return [(name, first), *(("", line) for line in others)]
 
 
 def _made_of_text(made_of: dict[str, Any]) -> str:
@@ -257,7 +262,9 @@ def _print_series(recording: Recording) -> None:
     if not summary.courses:
         return
     say("")
-    _print_sparklines("EPISODES", "FIRST TO LAST", summary.courses, zero_based=False)
+    each = max(series.each for series in summary.courses)
+    order = f"FIRST TO LAST, MEANS OF UP TO {each}" if each > 1 else "FIRST TO LAST"
+    _print_sparklines("EPISODES", order, summary.courses, zero_based=False)
     if summary.distributions:
         say("")
         _print_sparklines("STEPS", "LEAST TO MOST", summary.distributions, zero_based=True)

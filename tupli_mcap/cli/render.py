@@ -31,6 +31,12 @@ class _Format(StrEnum):
     jpeg = "jpeg"
 
 
+class _X(StrEnum):
+    steps = "steps"
+    episodes = "episodes"
+    time = "time"
+
+
 _Source = Annotated[
     str,
     typer.Argument(
@@ -183,7 +189,10 @@ def plot(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="A .png, .svg or .html; by default FILE's name with .png."
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="A .png, .svg, .pdf or .html; by default FILE's name with .png.",
         ),
     ] = None,
     episode: Annotated[
@@ -195,13 +204,21 @@ def plot(
             help="Whose steps to show: a number, best, worst, first, last.",
         ),
     ] = "best",
+    x: Annotated[
+        _X | None,
+        typer.Option(
+            "--x", help="What returns are drawn over; by default episodes of one recording, steps of several."
+        ),
+    ] = None,
     filter_text: FilterText = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the output if it is there.")] = False,
     as_json: Json = False,
 ) -> None:
     """Draw a report of recordings as a picture or a page.
 
-    Returns, lengths, states, actions, rewards, and one episode step by step. Several recordings are compared.
+    Returns, lengths, success, numbers of infos and metadata, states, actions, rewards, and one episode step by step.
+    Several recordings are compared; runs whose names or settings differ by their seeds only are one: their mean, with
+    its 95% interval (percentile bootstrap) as far as all of them go, and a thin line for each.
     The extension of the output says what it is; an .html needs no network. Needs the extra plot (matplotlib).
     Nothing in a file is executed.
     """
@@ -212,7 +229,9 @@ def plot(
         check_goal(goal, overwrite=force)
     except RecordingError as err:
         raise type(err)(str(err).replace("overwrite it", "replace it with --force")) from err
-    made = report(paths, episode=episode, episode_filter=filter_of(filter_text))
+    made = report(
+        paths, episode=episode, episode_filter=filter_of(filter_text), x=None if x is None else x.value
+    )
     made.save(goal, overwrite=force)
     size = goal.stat().st_size
     episodes, steps = (

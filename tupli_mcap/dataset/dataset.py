@@ -191,6 +191,10 @@ class Dataset(RandomAccess):
         for header in self.headers:
             yield self._episode(header)
 
+    def _episodes(self, filter: BaseFilter | None) -> tuple[Source, Sequence[EpisodeHeader]]:
+        """What opens its recordings, and its episodes that the filter is true of."""
+        return self._source, (self if filter is None else self.filter(filter)).headers
+
     def _episode(self, header: EpisodeHeader) -> Episode:
         recording = self._recordings.get(header.recording)
         position = int(np.searchsorted(recording.index["episode"], header.episode))
@@ -496,6 +500,18 @@ class Dataset(RandomAccess):
         return curate.relabel(self, function, Path(target), fields, overwrite=overwrite)
 
     # ---- looking
+
+    def plot(self, **options: Any) -> Any:
+        """A `tupli_mcap.plots.Report` of these episodes: returns, lengths, success, states, actions and one episode.
+
+        `options` are those of `tupli_mcap.plots.report`. A notebook shows it; `.save(path)` writes it.
+
+        Raises:
+            MissingExtraError: matplotlib (the extra `plot`) is not installed.
+        """
+        from tupli_mcap import plots
+
+        return plots.report(self, **options)
 
     def __repr__(self) -> str:
         if self._listed is None:

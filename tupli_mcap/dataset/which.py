@@ -6,7 +6,6 @@ Storages take long to import, and a file that was never in one can do without: t
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,7 +13,7 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, Union
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias, Union, runtime_checkable
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from tupli_mcap.errors import FilterError, RecordingError, TupliError
 from tupli_mcap.recording import Episode, Recording
 
 if TYPE_CHECKING:
+    from tupli_mcap.dataset.sources import Source as EpisodeSource
     from tupli_mcap.dataset.tupli import TupliDataset
     from tupli_mcap.schema import BaseFilter, EpisodeHeader
     from tupli_mcap.storage import TupliStorage
@@ -46,7 +46,15 @@ _CACHE_BYTES = 64 << 20  # each chunk is read once or twice
 _MOST_OPEN = 200
 Positions = np.ndarray[Any, np.dtype[np.int64]]
 Source = Recording | str | os.PathLike[str]
-Examinable: TypeAlias = Union[Source, "TupliDataset", "TupliStorage"]
+Examinable: TypeAlias = Union[Source, "Listed", "TupliDataset", "TupliStorage"]
+
+
+@runtime_checkable
+class Listed(Protocol):
+    """A `Dataset`, seen from below."""
+
+    def _episodes(self, filter: BaseFilter | None) -> tuple[EpisodeSource, Sequence[EpisodeHeader]]:
+        """What opens its recordings, and its episodes that the filter is true of."""
 
 
 # ---- of one recording
@@ -175,7 +183,7 @@ class Subject:
 def subjects_of(
     source: Examinable | Iterable[Examinable], episode_filter: BaseFilter | None
 ) -> Iterator[Subject]:
-    """The recordings of a path, a directory, a recording, a dataset, a storage, or several of those.
+    """The recordings of a path, a directory, a recording, a dataset (each once), a storage, or several of those.
 
     Raises:
         RecordingError: it is none of those.
@@ -190,14 +198,17 @@ def subjects_of(
         choose = _all if episode_filter is None else partial(candidates, filter=episode_filter)
         yield Subject(source.name, lambda: nullcontext(source), choose)
     elif isinstance(source, TupliDataset):
-        yield from _of_dataset(source if episode_filter is None else _narrowed(source, episode_filter))
+        dataset = source if episode_filter is None else _narrowed(source, episode_filter)
+        yield from _of_headers(dataset._query.source, dataset.preview())
+    elif isinstance(source, Listed):
+        yield from _of_headers(*source._episodes(episode_filter))
     elif isinstance(source, TupliStorage):
-        yield from _of_dataset(TupliDataset(source).with_episode_filter(episode_filter))
+        yield from subjects_of(TupliDataset(source), episode_filter)
     elif isinstance(source, Iterable):
         for item in source:
             yield from subjects_of(item, episode_filter)
     else:
-        raise RecordingError(f"expected a path, Recording, TupliDataset or storage, found {source!r:.80}")
+        raise RecordingError(f"expected a path, Recording, Dataset or storage, found {source!r:.80}")
 
 
 def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Subject]:
@@ -216,10 +227,12 @@ def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Su
         yield Subject(name, _unopened, _all, error)
 
 
-def _of_dataset(dataset: TupliDataset) -> Iterator[Subject]:
-    source = dataset._query.source
-    for name, group in itertools.groupby(dataset.preview(), key=lambda header: header.recording):
-        yield Subject(name, partial(source.open, name), partial(_positions, headers=list(group)))
+def _of_headers(source: EpisodeSource, headers: Iterable[EpisodeHeader]) -> Iterator[Subject]:
+    by_recording: dict[str, list[EpisodeHeader]] = {}
+    for header in headers:
+        by_recording.setdefault(header.recording, []).append(header)
+    for name, group in by_recording.items():
+        yield Subject(name, partial(source.open, name), partial(_positions, headers=group))
 
 
 def _narrowed(dataset: TupliDataset, episode_filter: BaseFilter) -> TupliDataset:

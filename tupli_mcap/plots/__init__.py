@@ -1,7 +1,8 @@
 """Recordings as one page of pictures, without a viewer; needs the extra `plot`.
 
-- `report` makes the page, a `Report`, and saves it as PNG, SVG or HTML.
-- `measure` reads what it shows: values of all steps, and chosen episodes step by step. `statistics` sums them up.
+- `report` makes the page, a `Report`, and saves it as PNG, SVG, PDF or HTML.
+- `measure` reads what it shows: numbers of episodes, values of all steps, and chosen episodes step by step.
+  `groups` puts runs together that differ by their seeds only. `statistics` sums them up.
 - `draw_episodes`, `draw_values` and `draw_trace` draw its panels; `texts` writes its head, its notes and the HTML.
 - `style` holds colours, fonts and the layout of all of them.
 """

@@ -1,34 +1,71 @@
-"""Panels over episodes: returns and lengths in their order, and how they are distributed."""
+"""Panels over episodes: returns, lengths, success and other numbers in their order, and how they are distributed."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots import style
-from tupli_mcap.plots.measure import Measured
-from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, running_mean
+from tupli_mcap.plots.groups import Group, PlottedRun, X, shown_numbers
+from tupli_mcap.plots.measure import INFO, SUCCESS
+from tupli_mcap.plots.statistics import bands, bin_edges, mean_interval, running_mean
 from tupli_mcap.plots.style import Cell, Page, cut
 
 __all__ = ["add_episodes"]
 
 _MOST_DOTS, _VECTOR_DOTS = 3000, 500  # of more there are bands; they are one picture inside an SVG
 _MOST_WINDOW, _GROUPS = 100, 250  # episodes of a mean, groups of a band
-_BINS, _HEIGHT = 32, 1.65
+_POINTS, _MOST_LINES = 200, 12  # of a mean over runs; runs of a group that have lines of their own
+_BINS, _HEIGHT, _LOW = 32, 1.65, 1.3
+_UNITS = (("h", 3600.0), ("min", 60.0), ("s", 1.0))
 
 
-def add_episodes(page: Page, measured: Sequence[Measured]) -> None:
-    """Returns and lengths of recordings that have episodes."""
+class _Axis(NamedTuple):
+    """The x axis of all panels: what it counts, and how many of that are one on it."""
+
+    x: X
+    label: str
+    scale: float = 1.0
+
+    @classmethod
+    def of(cls, x: X, groups: Sequence[Group]) -> _Axis:
+        if x != "time":
+            return cls(x, {"episodes": "episode", "steps": "steps"}[x])
+        longest = max(float(run.places(x).max()) for group in groups for run in group.runs if len(run.rows))
+        unit, scale = next((pair for pair in _UNITS if longest >= 2 * pair[1]), _UNITS[-1])
+        return cls(x, f"time ({unit})", scale)
+
+    def course(self, run: PlottedRun, name: str) -> tuple[Array, Array, Array]:
+        """Of the episodes of a run in the order of this axis: where each lies, its number, how it ended."""
+        at = run.places(self.x) / self.scale
+        order = np.argsort(at, kind="stable")
+        return at[order], run.numbers(name)[order], run.rows["end"][order]
+
+
+def add_episodes(page: Page, groups: Sequence[Group], x: X) -> None:
+    """Panels of groups that have episodes.
+
+    Lengths that are all the same have no panel: the head says them.
+    """
     page.heading("Episodes")
-    for column, name in (("return", "return"), ("length", "length (steps)")):
-        order, distribution = (partial(f, measured, column, name) for f in (_draw_order, _draw_distribution))
-        page.add([Cell(order, _HEIGHT, 3), Cell(distribution, _HEIGHT, 1.25)], 4.25)
+    axis = _Axis.of(x, groups)
+    alike = len({length for group in groups for length in np.unique(group.rows["length"]).tolist()}) == 1
+    for name, title in (("return", "return"), ("length", "length (steps)")):
+        if name == "return" or not alike:
+            order = partial(_draw_order, groups, name, title, axis)
+            distribution = partial(_draw_distribution, groups, name, title)
+            page.add([Cell(order, _HEIGHT, 3), Cell(distribution, _HEIGHT, 1.25)], 4.25)
+    names, _ = shown_numbers(groups)
+    titles = ["success rate" if name == SUCCESS else name for name in names]
+    titles = [f"{name}, mean of each episode" if name.startswith(INFO) else name for name in titles]
+    draws = [partial(_draw_order, groups, *pair, axis) for pair in zip(names, titles, strict=True)]
+    page.add([Cell(draw, _LOW, 2) for draw in draws])
 
 
 def _window(count: int) -> int:
@@ -36,64 +73,93 @@ def _window(count: int) -> int:
     return max(1, min(_MOST_WINDOW, count // 10))
 
 
-def _draw_order(measured: Sequence[Measured], column: str, name: str, axes: Any) -> None:
-    axes.set_title(name)
-    if len(measured) == 1:
-        _draw_one(measured[0].rows, drawable_numbers(measured[0].rows[column]), axes)
-        axes.set_xlabel("episode")
+def _draw_order(groups: Sequence[Group], name: str, title: str, axis: _Axis, axes: Any) -> None:
+    axes.set_title(cut(title, 60))
+    runs = [run for group in groups for run in group.runs if len(run.rows)]
+    label = axis.label
+    if len(runs) == 1:
+        _draw_one(*axis.course(runs[0], name), name, axes)
     else:
-        for one, colour in zip(measured, style.colours(len(measured)), strict=True):
-            numbers, values = one.rows["episode"], drawable_numbers(one.rows[column])
-            marker = "o" if len(values) == 1 else None
-            mean = running_mean(values, _window(len(values)))
-            axes.plot(numbers, mean, color=colour, label=cut(one.name, 24), marker=marker)
-            if len(values) <= _MOST_DOTS and len(measured) <= 4:
-                dense = len(values) > _VECTOR_DOTS
-                axes.scatter(numbers, values, s=5, color=colour, alpha=0.3, linewidths=0, rasterized=dense)
-        spans = sorted(_window(len(one.rows)) for one in measured)
+        spans = sorted(_window(len(run.rows)) for run in runs)
         span = f"{spans[0]} to {spans[-1]}" if spans[0] < spans[-1] else str(spans[0])
-        axes.set_xlabel(f"episode; lines are means of {span} episodes" if spans[-1] > 1 else "episode")
+        label += f"; lines are means of {span} episodes" if spans[-1] > 1 else ""
+        for group, colour in zip(groups, style.colours(len(groups)), strict=True):
+            courses = [axis.course(run, name) for run in group.runs if len(run.rows)]
+            dots = name != SUCCESS and len(runs) <= 4
+            _draw_group(group.name, courses, colour, axes, dots=dots)
     low, high = axes.get_xlim()
-    if high - low < 1:  # of one episode: the axis shows its number, too
-        axes.set_xlim(low - 1, high + 1)
-    else:
-        axes.set_xlim(low, high)
-    axes.locator_params(axis="x", integer=True)
-    style.legend_above(axes)
+    if high - low < 1 and axis.x != "time":  # of one episode: the axis shows its number, too
+        low, high = low - 1, high + 1
+    axes.set_xlim(low, high)
+    axes.set_xlabel(label)
+    axes.locator_params(axis="x", integer=axis.x != "time")
+    if axis.x == "steps":
+        axes.xaxis.set_major_formatter(lambda value, _: style.number_text(float(value)))
+    if name == SUCCESS:
+        axes.set_ylim(-0.04, 1.04)
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0%}")
+    if name in ("return", "length"):  # the others are narrow, and look the same
+        style.legend_above(axes)
 
 
-def _draw_one(rows: Array, values: Array, axes: Any) -> None:
-    """A dot for each episode and a running mean; of many episodes, bands."""
-    if len(rows) > _MOST_DOTS:
-        at, mean, low, tenth, ninetieth, high = bands(values, _GROUPS)
-        at = rows["episode"][at.astype(np.int64)]
-        axes.fill_between(at, low, high, color=style.BLUE, alpha=0.13, label="smallest to largest")
-        axes.fill_between(at, tenth, ninetieth, color=style.BLUE, alpha=0.32, label="middle 80%")
-        axes.plot(at, mean, color=style.BLUE, label=f"mean of {len(rows) // _GROUPS:,} episodes")
+def _draw_group(
+    name: str, courses: Sequence[tuple[Array, Array, Array]], colour: str, axes: Any, *, dots: bool
+) -> None:
+    """A running mean of a run; of several, their mean and interval as far as all of them go, and thin lines."""
+    lines = []
+    for at, values, _ in courses:
+        mean = running_mean(values, _window(len(values)))
+        lines.append((at[np.isfinite(mean)], mean[np.isfinite(mean)]))
+        if len(courses) == 1:
+            axes.plot(at, mean, color=colour, label=cut(name, 24), marker="o" if len(at) == 1 else None)
+        elif len(courses) <= _MOST_LINES:
+            axes.plot(at, mean, color=colour, linewidth=0.6, alpha=0.35)
+        if dots and len(courses) == 1 and len(values) <= _MOST_DOTS:
+            dense = len(values) > _VECTOR_DOTS
+            axes.scatter(at, values, s=5, color=colour, alpha=0.3, linewidths=0, rasterized=dense)
+    lines = [line for line in lines if len(line[0])]
+    if len(courses) == 1 or not lines:
+        return
+    first, last = max(at[0] for at, _ in lines), min(at[-1] for at, _ in lines)
+    points = np.linspace(first, max(first, last), _POINTS)
+    mean, low, high = mean_interval(np.array([np.interp(points, at, values) for at, values in lines]))
+    axes.fill_between(points, low, high, color=colour, alpha=0.2)
+    axes.plot(points, mean, color=colour, linewidth=1.6, label=cut(f"{name} ({len(lines)} runs)", 30))
+
+
+def _draw_one(at: Array, values: Array, ends: Array, name: str, axes: Any) -> None:
+    """A dot for each episode and a running mean; of many episodes, bands; of successes, the mean only."""
+    if name != SUCCESS and len(at) > _MOST_DOTS:
+        where, mean, low, tenth, ninetieth, high = bands(values, _GROUPS)
+        where = at[where.astype(np.int64)]
+        axes.fill_between(where, low, high, color=style.BLUE, alpha=0.13, label="smallest to largest")
+        axes.fill_between(where, tenth, ninetieth, color=style.BLUE, alpha=0.32, label="middle 80%")
+        axes.plot(where, mean, color=style.BLUE, label=f"mean of {len(at) // _GROUPS:,} episodes")
         return
     for i, end in enumerate(END_NAMES):
-        chosen = rows["end"] == i
-        if chosen.any():
+        chosen = ends == i
+        if chosen.any() and name != SUCCESS:
             colour, marker = style.ENDS[end]
             axes.scatter(
-                rows["episode"][chosen], values[chosen], s=float(np.clip(3000 / len(rows), 5, 26)), c=colour,
-                marker=marker, linewidths=0, label=end, alpha=0.75, rasterized=len(rows) > _VECTOR_DOTS,
+                at[chosen], values[chosen], s=float(np.clip(3000 / len(at), 5, 26)), c=colour,
+                marker=marker, linewidths=0, label=end, alpha=0.75, rasterized=len(at) > _VECTOR_DOTS,
             )  # fmt: skip
-    window = _window(len(rows))
-    if window > 1:
-        mean = running_mean(values, window)
-        axes.plot(rows["episode"], mean, color=style.INK, linewidth=1.4, label=f"mean of {window} episodes")
+    window = _window(len(at))
+    if window > 1 or name == SUCCESS:
+        label = f"mean of {window} episodes" if window > 1 else None
+        shape = "o" if window == 1 else ""
+        axes.plot(at, running_mean(values, window), color=style.INK, linewidth=1.4, label=label, marker=shape)
 
 
-def _draw_distribution(measured: Sequence[Measured], column: str, name: str, axes: Any) -> None:
-    columns = [drawable_numbers(one.rows[column]) for one in measured]
+def _draw_distribution(groups: Sequence[Group], column: str, name: str, axes: Any) -> None:
+    columns = [group.numbers(column) for group in groups]
     pooled = np.concatenate(columns)
     edges, beyond = bin_edges(pooled, _BINS)
-    if len(measured) == 1:
+    if len(groups) == 1:
         axes.set_ylabel("episodes", color=style.GREY)
         axes.locator_params(axis="y", integer=True)
         finite = np.isfinite(pooled)
-        ends, values = measured[0].rows["end"][finite], pooled[finite]
+        ends, values = groups[0].rows["end"][finite], pooled[finite]
         frequent = [i for i, _ in Counter(ends.tolist()).most_common()]  # the most frequent end at the bottom
         if frequent:
             axes.hist(

@@ -19,6 +19,7 @@ __all__ = ["add_trace", "by_scale"]
 
 _MOST_LINES, _LINES = 12, 6  # of all panels, of one panel
 _SAME_SCALE = 8  # lines of one panel differ by this factor at most
+_MOST_INFOS = 4
 _CHOICES = 2  # panels of one leaf
 _NAMED = 8  # values of a choice that are named at the axis
 _HEIGHT, _TABLE_HEIGHT, _LEGEND = 0.75, 1.25, 1.85
@@ -42,17 +43,41 @@ def add_trace(page: Page, measured: Measured, trace: Trace, *, several: bool) ->
             Cell(partial(_draw_picture, *picture), height, right=0.06, left=0.06) for picture in pictures
         ]
         page.add(cells, 7, tight=True)
+    if trace.length == 1:  # a panel for one point says no more
+        page.text(_step_lines(measured, trace))
+        return
     add = partial(_add_panel, page, trace)
     _add_values(add, trace, measured.states, False)
     _add_values(add, trace, measured.actions, True)
     for leaf in measured.rewards:
         if len(leaf.elements) <= _LINES:
             add(partial(_draw_lines, trace, leaf, range(len(leaf.elements)), True))
+    for key, values in list(trace.infos.items())[:_MOST_INFOS]:
+        add(partial(_plot, trace, key, values, True, color=style.BLUE))
     seconds = measured.step_seconds
     unit = "" if seconds is None else f" (each {number_text(seconds)} s)"
     thinned = f"; smallest and largest of every {trace.thinned} steps" if trace.thinned > 1 else ""
     draw = partial(_plot, trace, "running return", trace.totals, False, color=style.INK)
     add(draw, label=f"step{unit}{thinned}")
+
+
+def _step_lines(measured: Measured, trace: Trace) -> list[str]:
+    """The values of an episode of one step, a text for each leaf."""
+    lines = []
+    for leaf in measured.leaves:
+        said = []
+        for i, name in enumerate(leaf.names[:_MOST_LINES]):
+            value = float(trace.values[leaf.leaf.name][0, i])
+            named = (
+                leaf.value_names[int(value - leaf.starts[i]) :][:1]
+                if leaf.counts and leaf.value_names
+                else ()
+            )
+            said.append(f"{name} {number_text(value)}{''.join(f' ({text})' for text in named)}")
+        more = len(leaf.names) - _MOST_LINES
+        lines.append(", ".join(said) + (f" and {more:,} more" if more > 0 else ""))
+    lines += [f"{key} {number_text(float(values[0]))}" for key, values in trace.infos.items()][:_MOST_INFOS]
+    return list(filter(None, lines))
 
 
 def _add_panel(
@@ -63,8 +88,6 @@ def _add_panel(
     def draw_over_steps(axes: Any) -> None:
         draw(axes)
         axes.locator_params(axis="x", integer=True)
-        if trace.length <= 1:
-            axes.set_xticks([0])
         axes.set(xlabel=label, xlim=(-0.5, max(trace.length, 1) - 0.5))
         axes.tick_params(labelbottom=bool(label))
 

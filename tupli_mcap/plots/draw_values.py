@@ -18,7 +18,7 @@ from tupli_mcap.spaces.element_names import short_path
 
 __all__ = ["LEVELS", "add_coverage", "add_values", "most_varying", "quantiles"]
 
-Leaves = Sequence[LeafValues]  # the same leaf of each recording
+Leaves = Sequence[LeafValues]  # the same leaf of each group of recordings
 Dimension = tuple[Leaves, int]  # one of its elements
 
 LEVELS = (0, 1, 5, 10, 25, 50, 75, 90, 95, 99, 100)  # percents of the quantiles in a heat map
@@ -156,7 +156,7 @@ def _draw_counts(leaves: Leaves, i: int, axes: Any) -> None:
         axes.plot(start + never, 0 * never, "x", color=style.VERMILION, markersize=4, clip_on=False)
         axes.set_xlabel(f"{len(never):,} of {count:,} never occur (×)", **SMALL | {"color": style.VERMILION})
     else:
-        axes.set_xlabel(f"{count:,} values, all occur", **SMALL)
+        axes.set_xlabel(f"{count:,} values, all occur" if count > 1 else "the only value", **SMALL)
     axes.set(title=cut(first.names[i], 25 if len(first.counts) > 1 else 80), ylim=(0, None))
     if count <= _TICKS:
         axes.set_xticks(start + np.arange(count))

@@ -1,25 +1,37 @@
-"""What a report shows of a recording: the values in its steps, and chosen episodes step by step."""
+"""What a report shows of a recording: numbers of its episodes, the values in its steps, and episodes step by step."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
+from tupli_mcap.plots.statistics import LARGEST, LeafValues, drawable_numbers
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.about.run import Run
+from tupli_mcap.recording.about.success import KEYS, success_of
 from tupli_mcap.recording.blocks import blocks, step_bytes
 from tupli_mcap.recording.description import RecordingDescription, describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Measured", "Trace", "measure", "trace"]
+__all__ = ["INFO", "METADATA", "SUCCESS", "Measured", "Trace", "measure", "trace"]
 
 READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most; their values stay in memory
 MAX_POINTS = 4000  # of a trace
+INFO_STEPS, INFO_BYTES = 20_000, 16 << 20  # of the infos that are read at most: each is JSON
+_INFO_PLACES, _MOST_KEYS = 40, 64
+SUCCESS, INFO, METADATA = (
+    "success",
+    "info: ",
+    "metadata: ",
+)  # a key of `Measured.numbers`, and how others begin
 _FRAMES, _AVERAGED = 6, 48  # that are shown, that make up the mean picture
 
 
@@ -27,15 +39,22 @@ _FRAMES, _AVERAGED = 6, 48  # that are shown, that make up the mean picture
 class Measured:
     """One recording.
 
-    rows: the index rows of its chosen episodes. read_episodes, read_steps: how many of those the values are from.
+    index: the rows of all its episodes. positions: of the chosen ones. rows: of those. run: whose they are.
+    numbers: of each chosen episode, NaN where there is none: `success` (0 or 1), `metadata: key`, and `info: key`, the
+    mean over those of its steps that are read. info_steps: how many steps have an info, read_infos: are read.
+    read_episodes, read_steps: how many of the chosen ones the values are from.
     states, actions, rewards: their leaves. seeds: of the chosen episodes, each once, ascending.
     """
 
     name: str
     facts: RecordingDescription
-    rows: Array
-    all_episodes: int
+    run: Run
+    index: Array
+    positions: Array
     layout: StepLayout | None
+    numbers: dict[str, Array] = field(default_factory=dict)
+    info_steps: int = 0
+    read_infos: int = 0
     step_seconds: float | None = None
     read_episodes: int = 0
     read_steps: int = 0
@@ -43,6 +62,10 @@ class Measured:
     actions: list[LeafValues] = field(default_factory=list)
     rewards: list[LeafValues] = field(default_factory=list)
     seeds: list[int] = field(default_factory=list)
+
+    @property
+    def rows(self) -> Array:
+        return self.index[self.positions]
 
     @property
     def steps(self) -> int:
@@ -60,6 +83,8 @@ class Measured:
             notes.append(
                 f"Values are those of {self.read_episodes:,} randomly chosen episodes ({self.read_steps:,} steps)."
             )
+        if self.read_infos < self.info_steps:
+            notes.append(f"Infos are those of {self.read_infos:,} of {self.info_steps:,} steps.")
         for leaf in self.leaves:
             notes += leaf.notes()
         odd = int(np.isnan(self.rows["return"]).sum())
@@ -78,9 +103,13 @@ def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES
     """
     layout = recording.layout if recording.num_envs else None
     rows = recording.index[positions]
-    measured = Measured(recording.name, describe(recording), rows, len(recording.index), layout)
+    measured = Measured(
+        recording.name, describe(recording), recording.run, recording.index, positions, layout,
+        _metadata_numbers(recording, positions),
+    )  # fmt: skip
     if layout is None:
         return measured
+    _add_infos(recording, measured)
     labels = recording.labels
     measured.seeds, measured.step_seconds = _seeds(recording, positions), labels.step_seconds
     most = read_bytes // step_bytes(layout, images=False)
@@ -114,6 +143,59 @@ def _read(recording: Recording, positions: Array, most: int) -> tuple[dict[str, 
     }, steps
 
 
+def _metadata_numbers(recording: Recording, positions: Array) -> dict[str, Array]:
+    """What the metadata of some episodes say in numbers, and whether the episodes succeeded."""
+    texts = recording.all_metadata()
+    numbers: dict[str, Array] = {}
+    for at, position in enumerate(positions.tolist()):
+        if texts[position] == "{}":
+            continue
+        said = jsonvalue.loads(texts[position])
+        found = {SUCCESS: success_of(said), **{METADATA + key: value for key, value in _numeric(said)}}
+        for key, value in found.items():
+            if value is not None and (key in numbers or len(numbers) < _MOST_KEYS):
+                numbers.setdefault(key, np.full(len(positions), np.nan))[at] = float(value)
+    return numbers
+
+
+def _numeric(said: Any) -> Iterator[tuple[str, float]]:
+    """The entries of an info or of metadata that are numbers, but for those that say success."""
+    for key, value in said.items() if isinstance(said, Mapping) else ():
+        if isinstance(key, str) and key not in KEYS and isinstance(value, int | float | np.number | np.bool_):
+            number = (
+                float(value) if -LARGEST <= value <= LARGEST else np.nan
+            )  # an integer may be too large for a float
+            if np.isfinite(number):
+                yield key, number
+
+
+def _add_infos(recording: Recording, measured: Measured) -> None:
+    """Means over the steps of each episode; of many steps, over those at a few places of the recording.
+
+    A step whose info does not have the key does not count.
+    """
+    channel = next((one for one in measured.facts.channels if one.topic == "/info"), None)
+    if channel is None or not channel.messages:
+        return
+    most = max(1, min(INFO_STEPS, INFO_BYTES * channel.messages // max(1, channel.size)))
+    places = 1 if channel.messages <= most else min(_INFO_PLACES, most)
+    each = min(most, channel.messages) // places
+    file = recording.file
+    number = file.topics["/info"]
+    decoder = InfoCodec.from_metadata(file.contents.channels[number].metadata)
+    at = {episode: i for i, episode in enumerate(measured.rows["episode"].tolist())}
+    sums: dict[str, Array] = {}
+    for first in np.linspace(0, channel.messages - each, places).astype(np.int64).tolist():
+        for body in file.store.bodies(number, first, each):
+            episode, _, info = decoder.decode(body)
+            for key, value in _numeric(info) if episode in at else ():
+                if INFO + key in sums or len(sums) < _MOST_KEYS:
+                    sums.setdefault(INFO + key, np.zeros((2, len(at))))[:, at[episode]] += value, 1
+    measured.info_steps, measured.read_infos = channel.messages, each * places
+    with np.errstate(invalid="ignore"):
+        measured.numbers |= {key: total / count for key, (total, count) in sums.items()}
+
+
 def _seeds(recording: Recording, positions: Array) -> list[int]:
     """Each seed once: those of the index, and those beyond 64 bits, which only the starts of episodes hold."""
     rows = recording.index[positions]
@@ -133,6 +215,7 @@ class Trace(NamedTuple):
     """One episode, step by step; of a long one, the smallest and the largest of every `thinned` (> 1) steps.
 
     values: leaf name -> (points, elements), float64, at the steps `at` (points); NaN for what cannot be drawn.
+    infos: key -> (points), as well; only where all infos of the recording are read.
     totals: the running return. pictures: of each picture leaf, some frames (H x W or H x W x 1|3|4) and their titles.
     """
 
@@ -145,6 +228,7 @@ class Trace(NamedTuple):
     thinned: int
     at: Array
     values: dict[str, Array]
+    infos: dict[str, Array]
     totals: Array
     pictures: list[list[tuple[str, Array]]]
 
@@ -167,10 +251,16 @@ def trace(recording: Recording, position: int, measured: Measured) -> Trace:
         for leaf in measured.leaves
         if len(leaf.elements)
     }
+    infos: dict[str, Array] = {}
+    if measured.info_steps and measured.read_infos == measured.info_steps:
+        for step, info in enumerate(recording.infos(position) or ()):
+            for key, value in _numeric(info):
+                infos.setdefault(INFO + key, np.full(length, np.nan))[step] = value
     return Trace(
         int(row["episode"]), int(row["env"]), length, float(row["return"]), END_NAMES[row["end"]],
         recording.episode_start(position).seed_number, width, _thinned(np.arange(steps)[:, None], width)[:, 0],
-        values, _thinned(totals[:, None], width)[:, 0],
+        values, {key: _thinned(column[:steps, None], width)[:, 0] for key, column in infos.items()},
+        _thinned(totals[:, None], width)[:, 0],
         [_pictures(recording, position, length, leaf.leaf) for leaf in measured.leaves if leaf.kind == "picture"],
     )  # fmt: skip
 

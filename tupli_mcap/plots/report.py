@@ -7,7 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from tupli_mcap.plots import texts
 from tupli_mcap.plots.draw_episodes import add_episodes
 from tupli_mcap.plots.draw_trace import add_trace
 from tupli_mcap.plots.draw_values import add_coverage, add_values
+from tupli_mcap.plots.groups import X, groups_of, shown_numbers
 from tupli_mcap.plots.measure import READ_BYTES, Measured, Trace, measure, trace
 from tupli_mcap.plots.style import Page, styled
 from tupli_mcap.schema import BaseFilter
@@ -24,7 +25,7 @@ from tupli_mcap.storage.atomic import write_bytes
 
 __all__ = ["FORMATS", "Report", "check_goal", "report"]
 
-FORMATS = (".png", ".svg", ".html")
+FORMATS = (".png", ".svg", ".pdf", ".html")
 _MOST_TRACES = 4
 
 Traces = Sequence[tuple[Measured, Trace]]
@@ -35,25 +36,35 @@ def report(
     *,
     episode: str | int = "best",
     episode_filter: BaseFilter | None = None,
+    x: X | None = None,
 ) -> Report:
-    """Returns, lengths, states, actions, rewards and one episode of a recording, or of several compared.
+    """Numbers of the episodes of a recording, its states, actions and rewards, and one episode; or several compared.
 
-    At most 128 MiB of steps are read: of longer recordings, randomly chosen episodes; the report says so. Nothing
-    in a file is executed.
+    The numbers are returns, lengths, success, and some of infos (their means) and of metadata.
+    Runs that differ by their seeds only are drawn as one: their mean, and its 95% interval (a percentile bootstrap over
+    the runs, see `plots.statistics.mean_interval`), as far as all of them go. They are those whose names are the same
+    without `seed3`, or without the `seed` of their settings.
+
+    At most 128 MiB of steps and 20,000 infos of a recording are read: of longer ones, randomly chosen episodes; the
+    report says so. Nothing in a file is executed.
 
     Args:
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
-            `TupliDataset`, a storage, or several of those. Episodes that a storage has deleted are left out.
+            `Dataset`, a `TupliDataset`, a storage, or several of those. Deleted episodes are left out.
         episode: whose steps are shown: a number, "best", "worst", "first" or "last"; with one recording also
             several, such as "3,7".
         episode_filter: show only episodes that it is true of.
+        x: what returns, lengths and the like are drawn over: "steps" of the run, "episodes" (their numbers) or "time"
+            since its start, each when an episode ended. By default episodes of one recording, and steps of several.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        RecordingError: there is no recording or no such episode.
+        RecordingError: there is no recording or no such episode, or `x` is none of these.
         FilterError: the filter names an unknown field, or `episode` is none of these words.
         FormatError: a recording is damaged.
     """
+    if x is not None and x not in get_args(X):
+        raise RecordingError(f"expected {', '.join(get_args(X))} as x, found {x!r:.80}")
     with styled():  # before anything is read: matplotlib may be missing
         subjects = list(subjects_of(source, episode_filter))
         if not subjects:
@@ -68,34 +79,41 @@ def report(
             raise RecordingError(f"there is no episode that {episode_filter} is true of; use another filter")
         _shorten_names(measured)
         traces = _traces(subjects, measured, str(episode))
-        return Report(measured, traces, _make_comparable(measured))
+        return Report(measured, traces, _make_comparable(measured), x)
 
 
 class Report:
     """A page of pictures.
 
     figure: matplotlib's, to be changed or saved in other ways. measured: the numbers behind it, a recording each.
+    groups: what has a colour of its own: a recording, or runs that differ by their seeds only.
     traces: the episodes that are shown step by step, each with its recording.
     notes: what is not shown, and what is a sample.
     """
 
-    def __init__(self, measured: Sequence[Measured], traces: Traces, notes: Sequence[str] = ()) -> None:
+    def __init__(
+        self, measured: Sequence[Measured], traces: Traces, notes: Sequence[str] = (), x: X | None = None
+    ) -> None:
         self.measured = list(measured)
+        self.groups = groups_of(measured)
         self.title = texts.title_of(measured)
-        self.facts = texts.facts_of(measured)
-        self.notes = [*notes, *texts.notes_of(measured)]
+        self.facts = texts.facts_of(self.groups)
         self.traces = list(traces)
+        self._x: X = x or ("episodes" if len(measured) == 1 else "steps")
+        self.notes = [*notes, *(shown_numbers(self.groups)[1]), *texts.notes_of(measured)]
         with styled():
-            self.figure: Any = _figure(measured, traces, self.notes)
+            self.figure: Any = self._draw(whole=True)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
-        """Write a .png, .svg or .html file, whole or not at all; the same report gives the same bytes.
+        """Write a .png, .svg, .pdf or .html file, whole or not at all; the same report gives the same bytes.
 
         Raises:
             RecordingError: another extension, the file is there already, or it cannot be written.
         """
         goal = check_goal(path, overwrite=overwrite)
-        data = {".png": self.png, ".svg": self.svg, ".html": self.html}[goal.suffix.lower()]()
+        data = {".png": self.png, ".svg": self.svg, ".pdf": self.pdf, ".html": self.html}[
+            goal.suffix.lower()
+        ]()
         try:
             write_bytes(goal, data, replace=overwrite)
         except OSError as err:
@@ -110,14 +128,41 @@ class Report:
         """The bytes of an SVG; its texts are outlines, so that it looks the same everywhere."""
         return _saved(self.figure, "svg")
 
+    def pdf(self) -> bytes:
+        """The bytes of a PDF of one page, as long as it has to be; its texts are texts."""
+        return _saved(self.figure, "pdf")
+
     def html(self) -> bytes:
         """A page that needs nothing else: no network, no script."""
         return texts.html_page(self.title, self._fragment()).encode()
 
     def _fragment(self) -> str:
         with styled():
-            svg = _saved(_figure(self.measured, self.traces, None), "svg").decode()
+            svg = _saved(self._draw(whole=False), "svg").decode()
         return texts.html_fragment(self.title, self.facts, self.notes, svg, self.measured)
+
+    def _draw(self, *, whole: bool) -> Any:
+        """The page; else without its head and its notes."""
+        page = Page()
+        if whole:
+            texts.add_facts(page, self.title, self.facts, several=len(self.measured) > 1)
+        filled = [group for group in self.groups if len(group.rows)]
+        if filled:
+            add_episodes(page, filled, self._x)
+        valued = [group for group in filled if any(one.read_steps for one in group.recordings)]
+        if valued:
+            states, actions, rewards = (
+                list(zip(*leaves, strict=True))  # the same leaf of every group together
+                for leaves in zip(*((one.states, one.actions, one.rewards) for one in valued), strict=True)
+            )
+            add_values(page, "States", states)
+            add_coverage(page, states, [group.name for group in valued])
+            add_values(page, "Actions and rewards", actions, rewards)
+        for one, shown in self.traces:
+            add_trace(page, one, shown, several=len(self.measured) > 1)
+        if whole:
+            texts.add_notes(page, self.notes)
+        return page.draw()
 
     def _repr_png_(self) -> bytes:
         return self.png()
@@ -146,33 +191,10 @@ def check_goal(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
     return goal
 
 
-def _figure(measured: Sequence[Measured], traces: Traces, notes: Sequence[str] | None) -> Any:
-    """The whole page; without notes (None), it leaves out the head, too."""
-    page = Page()
-    if notes is not None:
-        texts.add_facts(page, measured)
-    filled = [one for one in measured if len(one.rows)]
-    if filled:
-        add_episodes(page, filled)
-    valued = [one for one in filled if one.read_steps]
-    if valued:
-        states, actions, rewards = (
-            list(zip(*leaves, strict=True))  # the same leaf of every recording together
-            for leaves in zip(*((one.states, one.actions, one.rewards) for one in valued), strict=True)
-        )
-        add_values(page, "States", states)
-        add_coverage(page, states, [one.name for one in valued])
-        add_values(page, "Actions and rewards", actions, rewards)
-    for one, shown in traces:
-        add_trace(page, one, shown, several=len(measured) > 1)
-    if notes is not None:
-        texts.add_notes(page, notes)
-    return page.draw()
-
-
 def _saved(figure: Any, format: str) -> bytes:
     """A picture's bytes, without its date and who made it: the same report gives the same bytes."""
     unnamed = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
+    unnamed["pdf"] = {"CreationDate": None, "Creator": None, "Producer": None}
     with styled():
         out = io.BytesIO()
         figure.savefig(out, format=format, metadata=unnamed[format])

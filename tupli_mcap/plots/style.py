@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -22,7 +23,8 @@ ENDS = {"terminal": (VERMILION, "o"), "timeout": (BLUE, "s"), "interrupted": (GR
 SMALL: dict[str, Any] = {"color": GREY, "fontsize": 7.5}  # of texts beside small panels
 COLUMNS = 4  # of small cells
 LEFT, RIGHT, TOP, BOTTOM = 0.62, 0.18, 0.26, 0.42  # inches around the axes of a cell
-_WIDTH, _EDGE, _HEADING = 10.0, 0.25, 0.36  # inches
+_WIDTH, _EDGE, _HEADING, _LINE = 10.0, 0.25, 0.36, 0.175  # inches
+_TEXT_COLUMNS = 150
 _RC: dict[str, Any] = {
     "figure.dpi": 110, "font.size": 8.5, "lines.linewidth": 1.3, "patch.linewidth": 0,
     "axes.titlesize": 9, "axes.titlelocation": "left", "axes.titlepad": 4, "axes.labelsize": 8.5,
@@ -32,6 +34,7 @@ _RC: dict[str, Any] = {
     "axes.formatter.useoffset": False, "xtick.labelsize": 8, "ytick.labelsize": 8,
     "xtick.color": "#555555", "ytick.color": "#555555", "legend.fontsize": 8, "legend.frameon": False,
     "text.color": INK, "text.parse_math": False,  # names come from files: a "$" is a "$"
+    "pdf.fonttype": 42,  # as texts that programs can change
     "svg.hashsalt": "tupli-mcap",  # the same recording gives the same bytes
 }  # fmt: skip
 
@@ -150,7 +153,7 @@ class Page:
         def draw(axes: Any) -> None:
             axes.set_axis_off()
             axes.set(xlim=(0, 1), ylim=(0, _HEADING - TOP))
-            axes.text(0, _HEADING - 0.2, cut(text, 120), fontsize=10.5, fontweight="bold")
+            axes.text(0, _HEADING - 0.2, cut(text, 100), fontsize=10.5, fontweight="bold")
             axes.axhline(_HEADING - TOP, color="#BBBBBB", linewidth=0.8, clip_on=False)
 
         self._rows.append((_HEADING, [Cell(draw, _HEADING - TOP, left=0, right=0)], 1))
@@ -171,6 +174,18 @@ class Page:
         for row in rows:
             height = max(cell.height for cell in row) + TOP + (0.16 if tight else BOTTOM)
             self._rows.append((height, row, columns))
+
+    def text(self, paragraphs: Sequence[str]) -> None:
+        """Texts in as many lines as they take; of each, 600 characters at most."""
+        lines = [line for text in paragraphs for line in textwrap.wrap(cut(text, 600), _TEXT_COLUMNS)]
+
+        def draw(axes: Any) -> None:
+            axes.set_axis_off()
+            axes.set_ylim(len(lines), 0)
+            for i, line in enumerate(lines):
+                axes.text(0, i - 0.5, line, color="#444444", va="center", fontsize=8)
+
+        self.add([Cell(draw, _LINE * len(lines), left=0, right=0)], 1, tight=True)
 
     def draw(self) -> Any:
         """Matplotlib's figure."""

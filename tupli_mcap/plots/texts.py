@@ -14,7 +14,8 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots import style
-from tupli_mcap.plots.measure import Measured
+from tupli_mcap.plots.groups import Group
+from tupli_mcap.plots.measure import SUCCESS, Measured
 from tupli_mcap.plots.style import Cell, Page, cut
 from tupli_mcap.recording.description import nan_text, spread_of
 
@@ -23,7 +24,7 @@ __all__ = ["add_facts", "add_notes", "facts_of", "html_fragment", "html_page", "
 _MOST_SEEDS, _LONGEST_SEEDS = 6, 56  # that are listed; characters
 _MOST_LISTED = 12  # recordings
 _HEAD, _LINE = 0.25, 0.175  # inches
-_NOTE_COLUMNS = 150
+_VALUE = 56  # characters of a fact in two columns
 _STYLE = """
 .tupli-report{font:14px/1.45 system-ui,"DejaVu Sans",sans-serif;color:#222;background:#fff;max-width:1150px;
 margin:0 auto;padding:12px}
@@ -46,18 +47,14 @@ def title_of(measured: Sequence[Measured]) -> str:
     return ": ".join(filter(None, parts)) or measured[0].name
 
 
-def facts_of(measured: Sequence[Measured]) -> list[tuple[str, str]]:
-    """Labels and values: of one recording all there is to say, of several a line for each."""
-    if len(measured) > 1:
-        facts = []
-        for one in measured:
-            spread = _spread_text(one.rows["return"])
-            text = f"{_counted(len(one.rows), 'episode')}, {_counted(one.steps, 'step')}"
-            facts.append((one.name, f"{text}, return {spread}" if spread else text))
-        return facts
-    (one,) = measured
+def facts_of(groups: Sequence[Group]) -> list[tuple[str, str]]:
+    """Labels and values: of one recording all there is to say, of several a line for each group."""
+    recordings = [one for group in groups for one in group.recordings]
+    if len(recordings) > 1:
+        return [(group.name, _group_text(group)) for group in groups]
+    (one,) = recordings
     about, rows = one.facts, one.rows
-    chosen = "" if len(rows) == one.all_episodes else f" of {one.all_episodes:,}"
+    chosen = "" if len(rows) == len(one.index) else f" of {len(one.index):,}"
     counts = np.bincount(rows["end"], minlength=len(END_NAMES))
     ends = ", ".join(f"{count:,} {name}" for count, name in zip(counts, END_NAMES, strict=True) if count)
     found = {
@@ -70,12 +67,36 @@ def facts_of(measured: Sequence[Measured]) -> list[tuple[str, str]]:
         "steps": f"{one.steps:,}",
         "return": _spread_text(rows["return"]),
         "length": _spread_text(rows["length"]),
+        "success": _success_text(groups[0]),
         "seeds": _seeds_text(one.seeds),
         "benchmark": about.benchmark_id[:12] or "none",
-        "observation": about.observation_space or "not known before the first step",
-        "action": about.action_space or "not known before the first step",
+        "observation": _space_text(about.observation),
+        "action": _space_text(about.action),
     }
     return [(label, value) for label, value in found.items() if value]
+
+
+def _group_text(group: Group) -> str:
+    spread, success = _spread_text(group.rows["return"]), _success_text(group)
+    parts = [_counted(len(group.runs), "run")] if len(group.runs) > 1 else []
+    parts += [_counted(len(group.rows), "episode"), _counted(int(group.rows["length"].sum()), "step")]
+    parts += [f"return {spread}"] if spread else []
+    return ", ".join([*parts, *([f"success {success}"] if success else [])])
+
+
+def _success_text(group: Group) -> str:
+    said = group.numbers(SUCCESS)
+    known = said[np.isfinite(said)]
+    return (
+        f"{known.mean():.0%}" + (f" of {len(known):,}" if len(known) < len(said) else "")
+        if len(known)
+        else ""
+    )
+
+
+def _space_text(lines: Sequence[str]) -> str:
+    """As many of `space_lines` as have room."""
+    return textwrap.shorten(", ".join(lines), _VALUE, placeholder=" …") or "not known before the first step"
 
 
 def notes_of(measured: Sequence[Measured]) -> list[str]:
@@ -126,43 +147,34 @@ def _bytes_text(size: int) -> str:
     return f"{size / scale:.1f} {unit}" if size >= 1000 else f"{size} B"
 
 
-def add_facts(page: Page, measured: Sequence[Measured]) -> None:
-    """The title and the facts: of one recording in two columns, of several a line for each."""
-    facts, several = facts_of(measured), len(measured) > 1
+def add_facts(page: Page, title: str, facts: Sequence[tuple[str, str]], *, several: bool) -> None:
+    """The title and the facts: of one recording in two columns, of several a line in the colour of each group."""
+    shades = style.colours(len(facts)) if several else []
     if several and len(facts) > _MOST_LISTED:
         facts = [*facts[:_MOST_LISTED], ("…", f"and {len(facts) - _MOST_LISTED} more")]
     lines = len(facts) if several else -(-len(facts) // 2)
     height = _HEAD + _LINE * lines
-    shades = style.colours(len(measured)) if several else []
 
     def draw(axes: Any) -> None:
         axes.set_axis_off()
         axes.set(xlim=(0, 9.5), ylim=(height, 0))
-        axes.text(0, 0.0, cut(title_of(measured), 80), fontsize=13, fontweight="bold", va="center")
+        axes.text(0, 0.0, cut(title, 80), fontsize=13, fontweight="bold", va="center")
         for i, (label, value) in enumerate(facts):
             x, y = 4.9 * (i // lines), 0.32 + _LINE * (i % lines)
             if i < len(shades):
                 axes.plot([x + 0.02, x + 0.2], [y, y], color=shades[i], linewidth=2.5)
                 x += 0.28
             axes.text(x, y, cut(label, 34), color=style.INK if several else style.GREY, va="center")
-            axes.text(x + (2.4 if several else 0.85), y, cut(value, 100 if several else 56), va="center")
+            axes.text(x + (2.4 if several else 0.85), y, cut(value, 100 if several else _VALUE), va="center")
 
     page.add([Cell(draw, height, left=0, right=0)], 1, tight=True)
 
 
 def add_notes(page: Page, notes: Sequence[str]) -> None:
     """The notes, in lines; nothing without any."""
-    lines = [line for note in notes for line in textwrap.wrap(cut(note, 600), _NOTE_COLUMNS)]
-
-    def draw(axes: Any) -> None:
-        axes.set_axis_off()
-        axes.set_ylim(len(lines), 0)
-        for i, line in enumerate(lines):
-            axes.text(0, i - 0.5, line, color="#444444", va="center", fontsize=8)
-
-    if lines:
+    if notes:
         page.heading("Notes")
-        page.add([Cell(draw, _LINE * len(lines), left=0, right=0)], 1, tight=True)
+        page.text(notes)
 
 
 def html_page(title: str, body: str) -> str:

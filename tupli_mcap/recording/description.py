@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,10 +15,14 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
+from tupli_mcap.recording.columns.statistics import element_bounds
 from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.edit.made_of import made_of
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
+from tupli_mcap.spaces.element_names import element_names, short_path
+from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = [
     "ChannelFacts",
@@ -27,10 +32,13 @@ __all__ = [
     "describe",
     "describe_space",
     "nan_text",
+    "space_lines",
     "spread_of",
     "state_of",
     "success_rate",
 ]
+
+_MOST_BOUNDS = 16  # dimensions of a leaf whose bounds get a line each
 
 
 class Spread(NamedTuple):
@@ -67,6 +75,7 @@ class RecordingDescription:
     ends: episodes by how they ended. environment: the name its benchmark says, None if it carries none.
     run: what is known of the run. made_of: of which recordings it was made; None if it was recorded.
     metadata_keys: those that episodes have. success: see `success_rate`.
+    observation, action: their spaces in lines for people, see `space_lines`; empty where there is no step.
     signed_by: the fingerprint of the key that its signature names, unchecked; None if it is not signed.
     """
 
@@ -93,16 +102,18 @@ class RecordingDescription:
     returns: Spread | None
     observation_space: str | None
     action_space: str | None
+    observation: list[str]
+    action: list[str]
     compression: float | None
     channels: list[ChannelFacts]
     attachments: list[dict[str, Any]]
 
 
 def describe(recording: Recording) -> RecordingDescription:
-    """The facts; only the summary, the episode index and `benchmark.json` are read.
+    """The facts; only the summary, the episode index and attachments such as `benchmark.json` are read.
 
     Raises:
-        FormatError: the environment that the recording carries is damaged.
+        FormatError: the environment that the recording carries is damaged, or its labels are.
     """
     rows = recording.index
     contents = recording.file.contents
@@ -110,6 +121,7 @@ def describe(recording: Recording) -> RecordingDescription:
     chunks = table[table["offset"] < IN_MEMORY]
     stored = int(chunks["length"].sum())
     carried = "benchmark.json" in recording.attachments
+    layout = recording.layout if recording.num_envs else None
     return RecordingDescription(
         name=recording.name,
         uuid=recording.uuid,
@@ -134,6 +146,8 @@ def describe(recording: Recording) -> RecordingDescription:
         returns=spread_of(rows["return"]),
         observation_space=describe_space(recording.observation_space) if recording.num_envs else None,
         action_space=describe_space(recording.action_space) if recording.num_envs else None,
+        observation=space_lines(layout.state, recording.labels) if layout else [],
+        action=space_lines(layout.action, recording.labels) if layout else [],
         compression=int(chunks["uncompressed"].sum()) / stored if stored else None,
         channels=_channels(contents),
         attachments=[info._asdict() for info in recording.attachments.values()],
@@ -181,6 +195,46 @@ def describe_space(space: gym.Space[Any]) -> str:
     if isinstance(space, gym.spaces.Text):
         return f"Text({space.min_length}..{space.max_length}, {len(space.character_set)} characters)"
     return " ".join(str(space).split())
+
+
+def space_lines(leaves: Sequence[Leaf], labels: Labels) -> list[str]:
+    """A space in lines: what each leaf is, and below it each dimension with its bounds, where they differ.
+
+    Such as `2 numbers (float32)`, `Cart Position  -4.8 … 4.8`, `Pole Angle     -0.4189 … 0.4189`.
+    """
+    return [line for leaf in leaves for line in _leaf_lines(leaf, labels)]
+
+
+def _leaf_lines(leaf: Leaf, labels: Labels) -> list[str]:
+    name = f"{short_path(leaf)}: " if leaf.keys else ""
+    if leaf.kind == "variable":
+        return [name + describe_space(leaf.space)]
+    low, high = element_bounds(leaf)
+    if isinstance(leaf.space, gym.spaces.Discrete):
+        named = [f"{int(low[0]) + i} {text}" for i, text in enumerate(labels.values.get(leaf.path, ()))]
+        return [f"{name}one of {leaf.space.n:,}: {', '.join(named) or _range(low[0], high[0])}"]
+    sizes = " x ".join(map(str, leaf.shape)) or "1"
+    what = f"{name}{sizes} number{'' if sizes == '1' else 's'}"
+    whole = isinstance(leaf.space, gym.spaces.MultiDiscrete | gym.spaces.MultiBinary)
+    kind = "" if whole else f" ({leaf.dtype})"
+    if not leaf.size:
+        return [what + kind]
+    alike = bool((low == low[0]).all() and (high == high[0]).all())
+    if leaf.size > _MOST_BOUNDS or (alike and leaf.path not in labels.dimensions):
+        between = "," if leaf.size == 1 else ", each" if alike else ", of"
+        return [f"{what}{between} {_range(low.min(), high.max())}{kind}"]
+    names = element_names(leaf, labels)
+    widest = max(map(len, names))
+    bounds = map(_range, low, high)
+    return [what + kind, *(f"{text:<{widest}}  {ends}" for text, ends in zip(names, bounds, strict=True))]
+
+
+def _range(low: Any, high: Any) -> str:
+    return _short(low) if low == high else f"{_short(low)} … {_short(high)}"
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, np.floating) else str(int(value))
 
 
 def _bound(values: np.ndarray[Any, Any]) -> str:

@@ -359,7 +359,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         return viewer.show(self, episodes, **options)
 
     def plot(self, **options: Any) -> Any:
-        """A `tupli_mcap.plots.Report`: returns, lengths, states, actions and one episode, as one picture.
+        """A `tupli_mcap.plots.Report`: returns, lengths, success, states, actions and one episode.
 
         `options` are those of `tupli_mcap.plots.report`. A notebook shows it; `.save(path)` writes it.
 

@@ -29,9 +29,11 @@ _MOST_REWARDS, _MOST_STATES, _MOST_ACTIONS = 2, 12, 6
 
 
 class Series(NamedTuple):
-    """Some numbers in their order (NaN: there is none), and the range of the values they stand for.
+    """Some numbers in their order (NaN: there is none), and what the first and the last stand for.
 
-    odd: how many values are left out, since they are not finite.
+    least, most: of a course, the smallest and the largest of the numbers; of a distribution, the range of the values
+    that were counted. odd: how many values are left out, since they are not finite. each: how many episodes one number
+    is the mean of, at most.
     """
 
     name: str
@@ -39,6 +41,7 @@ class Series(NamedTuple):
     least: float
     most: float
     odd: int
+    each: int = 1
 
 
 class Sketch(NamedTuple):
@@ -84,8 +87,7 @@ def sketch(recording: Recording, points: int) -> Sketch:
 
 
 def _course(name: str, values: Array, points: int) -> Series | None:
-    finite = values[np.isfinite(values)]
-    if not len(finite):
+    if not np.isfinite(values).any():
         return None
     edges = np.linspace(0, len(values), min(points, len(values)) + 1).round().astype(np.int64)
     known = np.isfinite(values)
@@ -93,7 +95,9 @@ def _course(name: str, values: Array, points: int) -> Series | None:
     counts = np.add.reduceat(known.astype(np.float64), edges[:-1])
     with np.errstate(invalid="ignore", over="ignore"):
         means = np.add.reduceat(np.where(known, values, 0.0), edges[:-1]) / np.where(counts, counts, np.nan)
-    return Series(name, tuple(means.tolist()), float(finite.min()), float(finite.max()), odd)
+    finite, each = means[np.isfinite(means)], int(np.diff(edges).max())
+    least, most = (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
+    return Series(name, tuple(means.tolist()), least, most, odd, each)
 
 
 def _pieces(recording: Recording) -> Iterator[Columns]:
@@ -148,12 +152,16 @@ def _distribution(leaf: Leaf, name: str, values: Array, points: int) -> Series:
     least, most = float(values.min()), float(values.max())
     if isinstance(leaf.space, spaces.Discrete):  # values that never occur are seen, too
         least, most = float(leaf.space.start), float(leaf.space.start + leaf.space.n - 1)
-    bins = points
-    if np.array_equal(values, np.round(values)):
-        bins = int(min(points, most - least + 1))
+    bins, end = points, most
+    if (
+        np.array_equal(values, np.round(values)) and most - least < 2**52
+    ):  # each bin has as many whole numbers
+        width = np.ceil((most - least + 1) / points)
+        bins = int(np.ceil((most - least + 1) / width))
+        end = least + width * bins
     if not most > least or not np.isfinite(most - least):
         return Series(name, (float(len(values)),), least, most, odd)
     with np.errstate(over="ignore"):
-        at = np.minimum((values - least) / (most - least) * bins, bins - 1).astype(np.int64)
+        at = np.minimum((values - least) / (end - least) * bins, bins - 1).astype(np.int64)
     counts = np.bincount(np.maximum(at, 0), minlength=bins)
     return Series(name, tuple(counts.astype(np.float64).tolist()), least, most, odd)

@@ -1,0 +1,149 @@
+"""Recordings as runs, runs in groups that differ by their seeds only, and where their episodes lie on the x axis."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.plots.measure import INFO, METADATA, SUCCESS, Measured
+from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
+
+__all__ = ["Group", "PlottedRun", "X", "groups_of", "shown_numbers"]
+
+X: TypeAlias = Literal["steps", "episodes", "time"]
+_MOST_NUMBERS = 4  # of infos, and of metadata, that get a panel
+_LONGEST = 200  # characters of a run's name that are looked at
+_SEED = re.compile(r"[-_. ]*seed[-_=. ]*\d+", re.IGNORECASE)
+_STARTED = re.compile(r"[-_. ]+\d{10}$")  # the time (s) at the end of CleanRL's names
+
+
+class PlottedRun(NamedTuple):
+    """The recordings of a run: several where it went on in several files, or recorded in several processes."""
+
+    recordings: list[Measured]
+
+    @property
+    def rows(self) -> Array:
+        """The index rows of the chosen episodes."""
+        return np.concatenate([one.rows for one in self.recordings])
+
+    def numbers(self, name: str) -> Array:
+        """A number of each of `rows` that can be drawn, NaN where there is none."""
+        if name in ("return", "length"):
+            return drawable_numbers(self.rows[name])
+        missing = [np.full(len(one.positions), np.nan) for one in self.recordings]
+        return np.concatenate(
+            [one.numbers.get(name, nan) for one, nan in zip(self.recordings, missing, strict=True)]
+        )
+
+    def places(self, x: X) -> Array:
+        """Where each of `rows` lies: its number; the steps of the run, or the seconds since its start, when it ended.
+
+        Steps of episodes that were not chosen count.
+        """
+        index = np.concatenate([one.index for one in self.recordings])
+        by_end = np.argsort(index["end_time"], kind="stable")
+        places: Array = np.empty(len(index))
+        if x == "time":
+            places = (index["end_time"] - index["start_time"].min(initial=2**62)) / 1e9
+        elif x == "steps":
+            places[by_end] = np.cumsum(index["length"][by_end])
+        elif len(self.recordings) == 1:
+            places = index["episode"]
+        else:
+            places[by_end] = np.arange(len(index))
+        starts = np.cumsum([0, *(len(one.index) for one in self.recordings)])
+        chosen = [one.positions + start for one, start in zip(self.recordings, starts, strict=False)]
+        found: Array = places[np.concatenate(chosen)]
+        return found
+
+
+class Group:
+    """What is drawn in one colour: a run, or several that differ by their seeds only; all values together."""
+
+    def __init__(self, name: str, runs: Sequence[PlottedRun]) -> None:
+        self.name, self.runs = name, runs
+        self.recordings = [one for run in runs for one in run.recordings]
+        self.rows: Array = np.concatenate([run.rows for run in runs])
+        parts = [one for one in self.recordings if one.read_steps]
+        self.states, self.actions, self.rewards = (
+            [LeafValues.pooled(leaves) for leaves in zip(*each, strict=True)]
+            for each in zip(*((one.states, one.actions, one.rewards) for one in parts), strict=True)
+        ) if parts else ([], [], [])  # fmt: skip
+
+    def numbers(self, name: str) -> Array:
+        """A number of each of `rows` that can be drawn, NaN where there is none."""
+        return np.concatenate([run.numbers(name) for run in self.runs])
+
+
+def groups_of(measured: Sequence[Measured]) -> list[Group]:
+    """Groups in the order of their first recordings.
+
+    Recordings are of one group if their runs have the same name without `seed3`, or without the `seed` of their
+    settings, and the same environment and split. A run that names no seed is by itself, with all files that it went on
+    in; so is a recording that was made of others.
+    """
+    found: dict[Any, dict[Any, list[Measured]]] = {}
+    uuids = set()
+    for place, one in enumerate(measured):
+        key: tuple[Any, ...] = ("", "", place)
+        if not one.facts.made_of and one.facts.uuid not in uuids:
+            key = _seedless(one) or (("", one.run.name, one.run.id) if one.run.id else key)
+        uuids.add(one.facts.uuid)
+        found.setdefault(key, {}).setdefault(one.run.id or place, []).append(one)
+    alike: dict[str, list[tuple[Any, ...]]] = {}
+    for key, runs in found.items():
+        if sum(map(len, runs.values())) > 1:
+            alike.setdefault(key[1] or Path(key[0]).name or "runs", []).append(key)
+    names = {key: _told_apart(name, key, keys) for name, keys in alike.items() for key in keys}
+    return [
+        Group(names.get(key) or next(iter(runs.values()))[0].name, [PlottedRun(run) for run in runs.values()])
+        for key, runs in found.items()
+    ]
+
+
+def _told_apart(name: str, key: tuple[Any, ...], keys: Sequence[tuple[Any, ...]]) -> str:
+    """The name of a group, with what tells its key from those of other groups with this name."""
+    differing = [parts for parts in zip(key, *keys, strict=False) if len(set(parts)) > 1]
+    told = ", ".join(Path(str(own)).name for own, *_ in differing if own)
+    return f"{name} ({told})" if told else name
+
+
+def _seedless(one: Measured) -> tuple[str, ...] | None:
+    """What runs of a group have in common: their name without the seed, with its directory where a run is named as its
+    file; environment and split. None if it names no seed."""
+    seed, path, given = one.run.metadata.get("seed"), Path(one.facts.name), one.run.name[:_LONGEST]
+    name = _SEED.sub("", given)
+    if name == given and seed is None:
+        return None
+    if name == given and isinstance(seed, int):
+        name = re.sub(rf"[-_. ]+s?{seed}(?!\d)", "", _STARTED.sub("", name), count=1)
+    own = one.run.name != path.stem
+    folder = "" if own else _SEED.sub("", str(path.parent))
+    return folder, name.strip("-_. "), one.run.environment, one.run.split
+
+
+def shown_numbers(groups: Sequence[Group]) -> tuple[list[str], list[str]]:
+    """Which numbers of episodes get a panel: success, then some of infos and metadata that vary; and notes."""
+    known = dict.fromkeys(key for group in groups for one in group.recordings for key in one.numbers)
+    shown, notes = [SUCCESS] if SUCCESS in known else [], []
+    for start in (INFO, METADATA):
+        names = []
+        for key in (key for key in known if key.startswith(start)):
+            values = np.concatenate([group.numbers(key) for group in groups])
+            values = values[np.isfinite(values)]
+            if len(values) and values.min() < values.max():
+                names.append(key)
+        shown += names[:_MOST_NUMBERS]
+        if len(names) > _MOST_NUMBERS:
+            notes.append(f"Of the {len(names)} numbers in {start.strip(': ')}, {_MOST_NUMBERS} are shown.")
+    if any(len(group.runs) > 1 for group in groups):
+        notes.append(
+            "Shades are 95% intervals of the mean over runs, as far as all of a group go (bootstrap)."
+        )
+    return shown, notes
