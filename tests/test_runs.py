@@ -513,6 +513,23 @@ class TestCommands:
         assert returns == sorted(returns, reverse=True)
         assert found[0]["run"]["name"] in ("run-0", "run-1")
 
+    def test_episodes_shows_the_columns_that_are_asked_for(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap", name="a run", metadata={"lr": 0.001})
+        keys = "episode,steps,run.metadata.lr"
+        found = json.loads(command("episodes", str(path), "--columns", keys, "--json"))
+        lengths = tupli_mcap.open(path).lengths.tolist()
+        assert found == [
+            {"episode": i, "steps": steps, "run.metadata.lr": 0.001} for i, steps in enumerate(lengths)
+        ]
+        lines = command("episodes", str(path), "--columns", keys).splitlines()
+        assert lines[0].split() == ["EPISODE", "STEPS", "RUN.METADATA.LR"]
+        assert [line.split() for line in lines[1:]] == [
+            [str(i), str(steps), "0.001"] for i, steps in enumerate(lengths)
+        ]
+        for wrong, message in (("metadata.none", "no episode has metadata.none"), ("retrun", "'return'")):
+            result = CliRunner().invoke(app, ["episodes", str(path), "--columns", wrong])
+            assert result.exit_code and message in f"{result.output}{result.exception}"
+
 
 class TestOfStrangers:
     """What a file says that somebody made to do harm."""

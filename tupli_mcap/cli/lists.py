@@ -162,6 +162,9 @@ def episodes(
         str | None,
         typer.Option(metavar="KEY", help="Order by return, steps, …; -KEY puts the largest first."),
     ] = None,
+    columns: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help="Which keys, such as steps,return,metadata.score.")
+    ] = None,
     limit: Limit = None,
     as_json: Json = False,
 ) -> None:
@@ -184,7 +187,34 @@ def episodes(
         if sort is not None:
             found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
         headers = found.headers[:limit]
-    print_episodes(headers, as_json=as_json)
+    if columns is None:
+        print_episodes(headers, as_json=as_json)
+    else:
+        _print_keys(headers, [key.strip() for key in columns.split(",")], as_json=as_json)
+
+
+def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_json: bool) -> None:
+    """A column for each key that a filter may name."""
+    from tupli_mcap.schema import EpisodeHeader
+    from tupli_mcap.schema.facts import path_in
+    from tupli_mcap.schema.predicate import MISSING, look_up
+
+    paths = [path_in(key, EpisodeHeader) for key in keys]
+    found = [[look_up(header, path) for path in paths] for header in headers]
+    for key, column in zip(keys, zip(*found, strict=True), strict=False):
+        if all(value is MISSING for value in column):
+            raise typer.BadParameter(f"no episode has {key}")
+    rows = [[None if value is MISSING else value for value in row] for row in found]
+    if as_json:
+        print_json([dict(zip(keys, row, strict=True)) for row in rows])
+        return
+    numeric = [any(isinstance(value, int | float) for value in column) for column in zip(*rows, strict=True)]
+    aligned = zip(keys, numeric or [False] * len(keys), strict=True)
+    print_table(
+        [Column(key.upper(), "right" if is_numeric else "left", shrink="end") for key, is_numeric in aligned],
+        [["" if value is None else short_value(value) for value in row] for row in rows],
+        empty="no episodes",
+    )
 
 
 def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:

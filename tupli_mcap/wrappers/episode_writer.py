@@ -20,6 +20,7 @@ from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
@@ -524,9 +525,9 @@ def _close(work: Work, discarded: dict[Path, list[int]], compression: str) -> No
     work.close()
     while discarded:
         path, numbers = discarded.popitem()
-        with Recording(path) as recording:
+        with held(path), Recording(path) as recording:
             kept = [number for number in recording.index["episode"].tolist() if number not in numbers]
             if kept:
                 rewrite_recording(recording, path, episodes=kept, compression=compression)
-        if not kept:
-            path.unlink()
+            else:
+                path.unlink()
