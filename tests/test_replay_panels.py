@@ -271,6 +271,20 @@ def test_a_single_step_is_a_point_since_it_makes_no_line(tmp_path: Path) -> None
     assert "SeriesPoints:markers" not in replayed(tmp_path / "two", Sampled(space), steps=2).columns("/state")
 
 
+def test_lines_break_between_episodes(tmp_path: Path) -> None:
+    env = Sampled(Box(0, 1, (2,)), info=lambda step: {"speed": step} if step > 3 else {})
+    found = replayed(tmp_path, env, record_info=True)
+    second, first_speed = 11, 14  # rows, the second episode's
+    for entity, row in {
+        "/state": second,
+        "/reward": second,
+        "/return": second,
+        "/info/speed": first_speed,
+    }.items():
+        (at,) = found.breaks(entity)
+        assert found.rows(entity, "step")[at] == row
+
+
 def test_actions_are_lanes_or_steps(tmp_path: Path) -> None:
     action = spaces.Dict({"gear": spaces.Discrete(3, start=-1), "wheel": Box(-1, 1, (2,))})
     found = replayed(

@@ -112,7 +112,7 @@ def _send_block(place: Place, scene: Scene, block: Block) -> None:
 
 def times_of(block: Block) -> Times:
     """Where a block's rows lie on the timelines."""
-    return Times(block.number, block.times, block.recording.labels.step_seconds)
+    return Times(block.number, block.times, block.recording.labels.step_seconds, block.seams)
 
 
 def name_of(recording: Recording) -> str:
