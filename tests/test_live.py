@@ -478,7 +478,10 @@ def test_stacks_of_frames_come_to_rerun(shape: tuple[int, ...], axis: int, tmp_p
         states = recording.read().states
     assert len(rows) > 1  # how many depends on how busy the machine is
     for row, (buffer,) in zip(rows, buffers, strict=True):
-        picture = np.concatenate(list(np.moveaxis(states[row], axis, 0)), axis=1)  # frames side by side
+        d, c, b, a = np.moveaxis(states[row], axis, 0)
+        picture = np.concatenate(
+            [np.concatenate(pair, axis=1) for pair in ((a, b), (c, d))]
+        )  # the newest first
         assert np.array_equal(np.array(buffer, np.uint8).reshape(picture.shape), picture)
 
 

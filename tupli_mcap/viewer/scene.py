@@ -157,8 +157,11 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
 
 
 def _are_frames(leaf: Leaf, column: str, material: _Material) -> bool:
-    """Whether an array that is not declared as a stack of frames looks like one."""
-    if not can_stack(leaf) or leaf.shape[0] > _MOST_FRAMES or min(leaf.shape[1:3]) < _LEAST_FRAME:
+    """Whether an array that is not declared as such looks like a grey image, or like a stack of frames."""
+    grey = leaf.dtype == np.uint8 and len(leaf.shape) == 2
+    if not grey and (not can_stack(leaf) or leaf.shape[0] > _MOST_FRAMES):
+        return False
+    if min(leaf.shape if grey else leaf.shape[1:3]) < _LEAST_FRAME:
         return False
     return all(leaf.get(getattr(part, column)).dtype == np.uint8 for part in material.sample)
 
