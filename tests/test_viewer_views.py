@@ -92,7 +92,7 @@ def test_compared_episodes(viewer: HeadlessViewer, cart_pole: Path) -> None:
 
 def test_compared_texts_say_whose_they_are(viewer: HeadlessViewer, tmp_path: Path) -> None:
     state = shown(viewer, viewed.courier(tmp_path / "courier.mcap", episodes=2), "--compare")
-    wanted = {f"episode_{number}: state · task": TEXT for number in range(2)}
+    wanted = {f"episode {number}: state · task": TEXT for number in range(2)}
     assert views(state).items() >= wanted.items()
 
 

@@ -39,6 +39,7 @@ _LINES_SMALL: Final = 6
 _MOST_LANES: Final = 12  # values of a Discrete leaf that get a colour each
 _MOST_LANE_ROWS: Final = 20_000  # the state timeline draws every change, however narrow
 _MOST_INFOS: Final = 12
+_MOST_LINKED: Final = 1000  # rows
 _TITLED: Final = 4  # dimensions that a title names
 _MOST_FRAMES: Final = 16  # of a stack that is not declared as one
 _LEAST_FRAME: Final = 16  # pixels of each of its sides
@@ -63,12 +64,18 @@ class Scene:
         return [*self.states, *self.actions, *self.rewards, *self.beside]
 
     @property
+    def linked(self) -> bool:
+        """Whether plots move together in time. They begin with a window around the cursor, too small for many rows."""
+        return self.rows <= _MOST_LINKED
+
+    @property
     def looks(self) -> str:
         """The panels and what they show, as text: scenes with the same text can share a blueprint."""
         facts = ("title", "entity", "numbers", "texts")
-        return repr(
-            [(type(panel).__name__, *(getattr(panel, fact, None) for fact in facts)) for panel in self.panels]
-        )
+        panels = [
+            (type(panel).__name__, *(getattr(panel, fact, None) for fact in facts)) for panel in self.panels
+        ]
+        return repr((panels, self.linked))
 
 
 class _Material(NamedTuple):

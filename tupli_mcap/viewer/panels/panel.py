@@ -108,7 +108,7 @@ def send_lines(place: Place, entity: str, times: Times, values: Array) -> None:
 
 def named(title: str, root: str) -> str:
     """A view's title, after the name of the episode if there are several."""
-    return f"{root.rpartition('/')[2]}: {title}" if root else title
+    return f"{root.strip('/').replace('_', ' ')}: {title}" if root else title
 
 
 def plot(title: str, entities: Sequence[str], axis: Any, *, legend: bool = True) -> Any:
