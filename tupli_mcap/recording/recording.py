@@ -417,7 +417,10 @@ class Recording:
 
     def all_metadata(self) -> list[str]:
         """The metadata of all episodes as JSON texts; "{}" where there is none."""
-        texts = [self._contents.index.metadata_text(i) for i in range(len(self.index))]
+        index = self._contents.index
+        texts = ["{}"] * len(index.episodes)
+        for i in np.flatnonzero(index.episodes["metadata_length"]).tolist():
+            texts[i] = index.metadata_text(i)
         if self.annotations.said:
             for i, number in enumerate(self.index["episode"].tolist()):
                 if self.annotations.of(number):
