@@ -46,10 +46,25 @@ class Rrd:
         return {name for batch in self._batches[recording][entity] for name in batch.schema.names}
 
     def rows(self, entity: str, component: str, recording: int = 0) -> list[Any]:
-        """Of a component or a timeline, in the order they were sent."""
+        """Of a component or a timeline, in the order they were sent, without those that break lines."""
+        rows = self._sent(entity, component, recording)
+        breaks = set(self.breaks(entity, recording))
+        return [row for i, row in enumerate(rows) if i not in breaks or component.startswith("Series")]
+
+    def _sent(self, entity: str, component: str, recording: int) -> list[Any]:
         batches = [b for b in self._batches[recording][entity] if component in b.schema.names]
         batches.sort(key=lambda batch: batch.column("rerun.controls.RowId")[0].as_py())
         return [row for batch in batches for row in batch.column(component).to_pylist()]
+
+    def breaks(self, entity: str, recording: int = 0) -> list[int]:
+        """The rows of numbers that break lines: of NaN, at the time of the next row."""
+        values = self._sent(entity, "Scalars:scalars", recording)
+        steps = self._sent(entity, "step", recording)
+        return [
+            i
+            for i in range(min(len(values), len(steps)) - 1)
+            if steps[i] == steps[i + 1] and np.isnan(values[i]).all()
+        ]
 
     def scalars(self, entity: str, recording: int = 0) -> np.ndarray:
         return np.array(self.rows(entity, "Scalars:scalars", recording))

@@ -162,7 +162,8 @@ def test_frames_of_a_stack_stand_upright_beside_each_other(
         seen = np.concatenate([states_of(episode) for episode in recording.episodes])
     frames = np.moveaxis(seen, -1, 1) if last else seen
     frames = frames.reshape(*frames.shape[:4], -1)
-    across, down = min(count, 4), -(-count // 4)
+    across = {2: 2, 4: 2, 5: 3, 6: 3}[count]
+    down = -(-count // across)
     (form,) = found.rows("/state", "Image:format")
     assert (form[0]["width"], form[0]["height"]) == (16 * across, 20 * down)
     pictures = np.array(found.rows("/state", "Image:buffer"), np.uint8)
@@ -170,7 +171,18 @@ def test_frames_of_a_stack_stand_upright_beside_each_other(
     for i in range(across * down):
         y, x = 20 * (i // across), 16 * (i % across)
         tile = pictures[:, y : y + 20, x : x + 16]
-        assert np.array_equal(tile, frames[:, i] if i < count else np.zeros_like(tile))
+        newest_first = frames[:, ::-1]
+        assert np.array_equal(tile, newest_first[:, i] if i < count else np.zeros_like(tile))
+
+
+@pytest.mark.parametrize(("shape", "side"), [((84, 84), 84), ((84, 84, 4), 168)])
+def test_atari_is_grey_where_nothing_says_what_the_values_are(
+    tmp_path: Path, shape: tuple[int, ...], side: int
+) -> None:
+    found = replayed(tmp_path, Sampled(Box(0, 255, shape, np.uint8)))
+    (form,) = found.rows("/state", "Image:format")
+    assert (form[0]["width"], form[0]["height"]) == (side, side)
+    assert len(found.rows("/state", "Image:buffer")[0][0]) == side * side  # a byte a pixel
 
 
 def test_a_stack_of_other_values_is_no_picture(tmp_path: Path) -> None:
@@ -269,6 +281,20 @@ def test_a_single_step_is_a_point_since_it_makes_no_line(tmp_path: Path) -> None
         )
     (tmp_path / "two").mkdir()
     assert "SeriesPoints:markers" not in replayed(tmp_path / "two", Sampled(space), steps=2).columns("/state")
+
+
+def test_lines_break_between_episodes(tmp_path: Path) -> None:
+    env = Sampled(Box(0, 1, (2,)), info=lambda step: {"speed": step} if step > 3 else {})
+    found = replayed(tmp_path, env, record_info=True)
+    second, first_speed = 11, 14  # rows, the second episode's
+    for entity, row in {
+        "/state": second,
+        "/reward": second,
+        "/return": second,
+        "/info/speed": first_speed,
+    }.items():
+        (at,) = found.breaks(entity)
+        assert found.rows(entity, "step")[at] == row
 
 
 def test_actions_are_lanes_or_steps(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ PUSHES = ("Push cart to the left", "Push cart to the right")
 
 
 def test_every_step_is_sent(cartpole: Path, tmp_path: Path) -> None:
-    goal = viewer.save(cartpole, tmp_path / "out.rrd")
+    goal = viewer.save(cartpole, tmp_path / "out.rrd", "all")
     found = Rrd(goal)
     assert len(found.recordings) == 1 and len(found.blueprints) == 1
     with Recording(cartpole) as recording:
@@ -62,6 +63,85 @@ def test_every_step_is_sent(cartpole: Path, tmp_path: Path) -> None:
     ends = [row for how in ("terminal", "timeout", "interrupted") for row in _rows_at(found, f"/end/{how}")]
     assert sorted(ends) == [row - 1 for row in finals]
     assert np.array_equal(found.scalars("/overview/length")[:, 0], lengths)
+
+
+def test_of_many_episodes_the_last_the_best_and_the_worst_are_shown(tmp_path: Path) -> None:
+    path = tmp_path / "many.mcap"
+    rewards = [4.0, 2, 9, 3, -1, 5, 5, 5, 5, 5, 5, 6]
+    with RecordEpisodes(Goes(*rewards), path) as env:
+        for _ in rewards:
+            env.reset()
+            env.step(0)
+    notes: list[str] = []
+    found = Rrd(viewer.save(path, tmp_path / "out.rrd", note=notes.append))
+    assert found.scalars("/reward")[:, 0].tolist() == [6, 9, -1]
+    card = found.rows("/card", "TextDocument:text")[0][0]
+    assert notes[0].startswith("3 of 12 episodes: 11 (last), 2 (best), 4 (worst)")
+    assert card.startswith("3 of 12 episodes") and "- from step 2: **Episode 2**: 1 step, return 9" in card
+    (marks,) = found.rows("/overview/shown", "BarChart:values")[0]
+    assert list(marks["buffer"]) == [6, 9, -1]
+    every = Rrd(viewer.save(path, tmp_path / "all.rrd", "all", note=notes.append))
+    assert every.scalars("/reward")[:, 0].tolist() == rewards
+    assert len(notes) == 1 and "/overview/shown" not in every.entities()
+    assert every.recordings[0].application_id != found.recordings[0].application_id
+
+
+def test_few_episodes_are_all_shown(tmp_path: Path) -> None:
+    path = tmp_path / "few.mcap"
+    with RecordEpisodes(Goes(), path) as env:
+        for _ in range(10):
+            env.reset()
+            env.step(0)
+    notes: list[str] = []
+    found = Rrd(viewer.save(path, tmp_path / "few.rrd", note=notes.append))
+    assert len(found.scalars("/reward")) == 10 and not notes
+
+
+def test_the_choice_is_of_each_recording_and_of_many_of_all(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{name}.mcap" for name in "abcd"]
+    for i, path in enumerate(paths):
+        with RecordEpisodes(Goes(*[float(i)] * 6), path, name=f"run {path.stem}") as env:
+            for _ in range(6):
+                env.reset()
+                env.step(0)
+    notes: list[str] = []
+    two = Rrd(viewer.save(paths[:2], tmp_path / "two.rrd", note=notes.append))
+    assert notes[0].startswith(
+        "4 of 12 episodes: 5 (last), 0 (best, worst) of run a; 5 (last), 0 (best, worst) of run b"
+    )
+    assert two.scalars("/reward")[:, 0].tolist() == [0, 0, 1, 1]
+    four = Rrd(viewer.save(paths, tmp_path / "four.rrd", note=notes.append))
+    assert notes[1].startswith("3 of 24 episodes: 5 (last), 0 (best), 0 (worst)")
+    assert four.scalars("/reward")[:, 0].tolist() == [3, 3, 0]
+
+
+def test_success_and_the_name_of_the_run_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(Goes(succeeded=[True, False]), path, name="ppo-seed3") as env:
+        for _ in range(2):
+            env.reset()
+            env.step(0)
+    found = Rrd(viewer.save(path, tmp_path / "r.rrd"))
+    card = found.rows("/card", "TextDocument:text")[0][0]
+    assert "### ppo-seed3" in card and "| success | 50% of the episodes that say it |" in card
+    assert "**Episode 0**: 1 step, return 0, terminal, success" in card
+    assert "**Episode 1**: 1 step, return 0, terminal, no success" in card
+
+
+class Goes(gym.Env[Any, Any]):
+    """Episodes of a step, whose infos may say whether it succeeded."""
+
+    observation_space, action_space = gym.spaces.Box(0, 1, (1,)), gym.spaces.Discrete(2)
+
+    def __init__(self, *rewards: float, succeeded: Sequence[bool] = ()) -> None:
+        self._rewards, self._succeeded = list(rewards), list(succeeded)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        info = {"is_success": self._succeeded.pop(0)} if self._succeeded else {}
+        return np.zeros(1, np.float32), self._rewards.pop(0) if self._rewards else 0.0, True, False, info
 
 
 def _rows_at(found: Rrd, entity: str) -> list[int]:
@@ -98,7 +178,7 @@ def test_compare_puts_each_episode_below_its_own_root(cartpole: Path, tmp_path: 
     with Recording(cartpole) as recording:
         for number in (0, 4):
             episode = recording.episodes[number]
-            root = f"/compared/episode_{number}"
+            root = f"/episode_{number}"
             assert found.rows(f"{root}/state/dims_1", "step") == list(range(len(episode) + 1))
             assert np.array_equal(found.scalars(f"{root}/state/dims_1")[:, 0], states_of(episode)[:, 1])
             assert found.rows(f"{root}/reward", "step") == list(range(len(episode)))

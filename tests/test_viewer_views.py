@@ -51,6 +51,13 @@ def test_cart_pole(viewer: HeadlessViewer, cart_pole: Path) -> None:
     assert ranges(state)["time"][0] > 1_700_000_000_000_000_000
 
 
+def test_many_episodes(viewer: HeadlessViewer, tmp_path: Path) -> None:
+    state = shown(viewer, viewed.cart_pole(tmp_path / "many.mcap", episodes=12))
+    assert views(state) == {"state": PLOT, "action": LANES, **REWARDS, **ABOUT}
+    assert viewer.filled("returns", "state") == {"returns": True, "state": True}  # no view is behind a tab
+    assert ranges(state)["step"][1] < 3 * 301
+
+
 def test_one_of_several_episodes_apart(viewer: HeadlessViewer, cart_pole: Path) -> None:
     state = shown(viewer, cart_pole, "--split")
     assert views(state) == {"state": PLOT, "action": LANES, **REWARDS, **ABOUT}
@@ -92,7 +99,7 @@ def test_compared_episodes(viewer: HeadlessViewer, cart_pole: Path) -> None:
 
 def test_compared_texts_say_whose_they_are(viewer: HeadlessViewer, tmp_path: Path) -> None:
     state = shown(viewer, viewed.courier(tmp_path / "courier.mcap", episodes=2), "--compare")
-    wanted = {f"episode_{number}: state · task": TEXT for number in range(2)}
+    wanted = {f"episode {number}: state · task": TEXT for number in range(2)}
     assert views(state).items() >= wanted.items()
 
 
@@ -121,6 +128,8 @@ def test_dict(viewer: HeadlessViewer, tmp_path: Path) -> None:
     rest = {"state · carrying": LANES, "action · gripper": LANES, "action · thrust": PLOT}
     seen = {"state · camera": PICTURE, "state · task": TEXT, "state · task: log": "TextLog"}
     assert views(state).items() >= {**plots, **rest, **seen, **REWARDS, **ABOUT}.items()
+    (camera,) = (view for view in state.views if view.view_class == PICTURE)
+    assert viewer.screenshot(camera).size > 0.13 * viewer.screenshot().size
     heat = "state · lidar: 24 dimensions, each from its lowest to its highest"
     assert views(state)[heat] == "Tensor"
     drawn = [

@@ -19,7 +19,11 @@ _Sources = Annotated[
 _Episode = Annotated[
     str | None,
     typer.Option(
-        "--episodes", "--episode", "-e", metavar="WHICH", help="Such as 3,7,9, best, worst, first, last, all."
+        "--episodes",
+        "--episode",
+        "-e",
+        metavar="WHICH",
+        help="Such as 3,7,9, best, worst, first, last, all; of many, by default last,best,worst.",
     ),
 ]
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
@@ -62,7 +66,8 @@ def replay(
 ) -> None:
     """Look at recordings in the Rerun viewer.
 
-    States, actions, rewards, infos and images over time, all episodes in an overview. Needs the extra `rerun`.
+    States, actions, rewards, infos and images over time; of more than ten episodes the last, the best and the worst,
+    with the returns of all above them (--episodes all shows the others). Needs the extra `rerun`.
     Timelines: step, episode_time (where the recording knows how long a step takes), and wall clock.
     """
     goals = sum([web, save is not None, connect is not None])
@@ -85,20 +90,36 @@ def replay(
     form: viewer.Form = "compare" if compare else "split" if split else "joined"
     wanted = filter_of(filter_text)
     import_quickly()
+    notes: list[str] = []
     if save is not None:
         commands: list[str] = []
         path = viewer.save(
-            sources, save, episode, filter=wanted, form=form, force=force, tell=commands.append
+            sources,
+            save,
+            episode,
+            filter=wanted,
+            form=form,
+            force=force,
+            tell=commands.append,
+            note=notes.append,
         )
-        say(f"{path}: {bytes_of(path.stat().st_size)}; open it with: {commands[0]}")
+        say(f"{path}: {bytes_of(path.stat().st_size)}; open it with: {commands[0]}", *notes)
     elif web:
-        viewer.serve(sources, episode, filter=wanted, form=form, tell=_tell)
+        viewer.serve(
+            sources,
+            episode,
+            filter=wanted,
+            form=form,
+            tell=lambda url: _tell(url, *notes),
+            note=notes.append,
+        )
     else:
-        viewer.show(sources, episode, filter=wanted, form=form, connect=connect)
+        viewer.show(sources, episode, filter=wanted, form=form, connect=connect, note=notes.append)
+        say(*notes)
 
 
-def _tell(url: str) -> None:
-    say(url, "open it in a browser; Ctrl-C ends it")
+def _tell(url: str, *notes: str) -> None:
+    say(url, "open it in a browser; Ctrl-C ends it", *notes)
     flush()
 
 

@@ -34,6 +34,7 @@ __all__ = [
     "candidates",
     "choose_episodes",
     "chosen_from",
+    "extremes",
     "named_positions",
     "subjects_of",
 ]
@@ -291,6 +292,25 @@ def chosen_from(
         if not chosen:
             raise RecordingError("expected a recording to show, found none; give its path")
         yield chosen
+
+
+def extremes(chosen: Sequence[Chosen]) -> tuple[list[Chosen], list[str]]:
+    """The last, the best and the worst of some episodes, and a few words on each: `199 (last, best)`."""
+    returns = np.concatenate([item.recording.index["return"][list(item.positions)] for item in chosen])
+    bounds = np.cumsum([0, *(len(item.positions) for item in chosen)])
+    words: dict[int, list[str]] = {}
+    for word in ("last", "best", "worst"):
+        at = len(returns) - 1 if word == "last" else _extreme(word, returns)
+        words.setdefault(at, []).append(word)
+    found: dict[int, list[int]] = {}
+    told = []
+    for at, said in words.items():
+        which = int(np.searchsorted(bounds, at, side="right")) - 1
+        recording, positions = chosen[which]
+        position = positions[at - int(bounds[which])]
+        found.setdefault(which, []).append(position)
+        told.append(f"{recording.index['episode'][position]} ({', '.join(said)})")
+    return [Chosen(chosen[which].recording, positions) for which, positions in found.items()], told
 
 
 def _parsed(text: str) -> BaseFilter:

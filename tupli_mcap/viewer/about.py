@@ -10,21 +10,32 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from tupli_mcap.dataset.which import Chosen
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.description import describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import plain, title_of
+from tupli_mcap.viewer.panels import PALETTE
 from tupli_mcap.viewer.sending import column_of, pooled, tensor_array
 
-__all__ = ["card", "send_about"]
+__all__ = ["card", "run_title", "send_about"]
 
 _MOST_BARS = 1000
+_MOST_MARKS = 200
+_BAR, _MARK = PALETTE[:2]
 _MOST_LEAVES = 16
+_LONGEST_TITLE = 80  # characters
 _MOST_CARDS, _MOST_UNSEEN = 5, 20
 
 
-def send_about(stream: Any, recordings: Sequence[Recording], shown: str, unseen: Sequence[str]) -> None:
-    """Sends `/card`, and `/overview/return` and `/overview/length` of all episodes, on the timeline `episode`."""
+def send_about(
+    stream: Any, recordings: Sequence[Recording], chosen: Sequence[Chosen], shown: str, unseen: Sequence[str]
+) -> None:
+    """Sends `/card`, and `/overview/return` and `/overview/length` of all episodes, on the timeline `episode`.
+
+    Args:
+        chosen: episodes that are marked among the returns.
+    """
     import rerun as rr
 
     texts = [card(recording) for recording in recordings[:_MOST_CARDS]]
@@ -45,6 +56,23 @@ def send_about(stream: Any, recordings: Sequence[Recording], shown: str, unseen:
             f"/overview/{name}", [number], [column_of(rr.Scalars.descriptor_scalars(), pa.array(values))]
         )
         stream.log(f"/overview/{name}", _bars(values), static=True)
+    if chosen:
+        stream.log("/overview/shown", _marks(recordings, chosen), static=True)
+
+
+def _marks(recordings: Sequence[Recording], chosen: Sequence[Chosen]) -> Any:
+    """The bars of chosen episodes, in front of those of all; wide enough to be seen among many."""
+    import rerun as rr
+
+    sizes = [len(recording.index) for recording in recordings]
+    first = dict(zip(map(id, recordings), np.cumsum([0, *sizes]).tolist(), strict=False))
+    pairs = [(item.recording, position) for item in chosen for position in item.positions]
+    at = np.array([first[id(recording)] + position for recording, position in pairs], np.float64)
+    values = np.array([recording.index["return"][position] for recording, position in pairs], np.float64)
+    finite = np.where(np.isfinite(values), values, 0.0)
+    width = max(1.0, sum(sizes) / _MOST_MARKS)
+    bars, places = (tensor_array([column], ["episode"]) for column in (finite, at + 0.5 - width / 2))
+    return rr.BarChart(bars, abscissa=places, widths=np.full(len(at), width), color=_MARK)
 
 
 def _bars(values: Any) -> Any:
@@ -53,10 +81,12 @@ def _bars(values: Any) -> Any:
 
     finite = np.where(np.isfinite(values), values, 0.0)
     if len(finite) <= _MOST_BARS:
-        return rr.BarChart(tensor_array([finite], ["episode"]))
+        return rr.BarChart(tensor_array([finite], ["episode"]), color=_BAR)
     means, bounds = pooled(finite, _MOST_BARS)
     bars, places = (tensor_array([column], ["episode"]) for column in (means, bounds[:-1]))
-    return rr.BarChart(bars, abscissa=places, widths=np.diff(bounds))  # as wide as the episodes it stands for
+    return rr.BarChart(
+        bars, abscissa=places, widths=np.diff(bounds), color=_BAR
+    )  # as wide as the episodes it stands for
 
 
 def card(recording: Recording) -> str:
@@ -72,6 +102,8 @@ def card(recording: Recording) -> str:
             odd = nan_text(spread.nan, d.episodes)
             text = f"mean {spread.mean:.4g}, from {spread.min:.4g} to {spread.max:.4g}{f'; {odd}' if odd else ''}"
             rows.append((name, odd if spread.nan == d.episodes else text))
+    if d.success is not None:
+        rows.append(("success", f"{d.success:.0%} of the episodes that say it"))
     rows += _leaf_rows(recording)
     rows += [
         ("benchmark", d.benchmark_id[:12] or "none"),
@@ -79,7 +111,13 @@ def card(recording: Recording) -> str:
         ("file", d.name),
     ]
     lines = [f"| {plain(name)} | {plain(value)} |" for name, value in rows]
-    return "\n".join([f"### {plain(Path(d.name).stem)}", "", lines[0], "|---|---|", *lines[1:]])
+    return "\n".join([f"### {plain(run_title(recording))}", "", lines[0], "|---|---|", *lines[1:]])
+
+
+def run_title(recording: Recording) -> str:
+    """The name of the run, else the file's; without what cannot be printed, and not too long."""
+    name = recording.run.name or Path(recording.name).stem
+    return "".join(char for char in name[:_LONGEST_TITLE] if char.isprintable())
 
 
 def _ends(ends: Mapping[str, int]) -> str:

@@ -61,6 +61,11 @@ class Block(NamedTuple):
     def __len__(self) -> int:
         return len(self.number)
 
+    @property
+    def seams(self) -> list[int]:
+        """The rows with which episodes begin behind others."""
+        return [piece.begin for piece in self.pieces if not piece.step and self.number[piece.begin]]
+
     def with_finals(self) -> Block:
         """The states only, with the known final ones behind the last steps of their episodes."""
         if self.finals is None or not self.finals.known.any():

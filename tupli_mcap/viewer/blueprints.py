@@ -11,55 +11,81 @@ from tupli_mcap.viewer.scene import Scene
 __all__ = ["blueprint_of"]
 
 _STACKED, _A_PAGE = 4, 12
-_MOST_LINKED = 1000  # rows
 _WINDOW = 500  # rows that are shown of a rollout that goes on
 _SHARE = 3.0  # of a column's height, a panel like any other
 _LANES, _LANE, _MOST_LANES = 1.2, 0.8, 6.0  # of a panel of lanes: itself, each of its lanes, at most
+_ABOVE, _ALONE, _BESIDE = (
+    8.0,
+    12.0,
+    6.0,
+)  # of all pictures: above plots of states, without them, in the other column
+_CROWDED = 10.0  # shares of plots that leave no room for pictures in the same column
 _SHARES: dict[type, float] = {
     Words: 2.0,
     Infos: 2.0,
-    Picture: 4.0,
-    Camera: 4.0,
     Grid: 4.0,
     HeatMap: 6.0,
 }
 
 
-def blueprint_of(scene: Scene, roots: Sequence[str] = ("",), *, listed: bool = False) -> Any:
-    """The blueprint of a scene whose panels are below each of `roots`; `listed` shows the list of recordings, too."""
+def blueprint_of(
+    scene: Scene, roots: Sequence[str] = ("",), *, listed: bool = False, overview: bool = False
+) -> Any:
+    """The blueprint of a scene whose panels are below each of `roots`.
+
+    Args:
+        listed: the list of recordings is open.
+        overview: the returns of all episodes stand above what is shown of a few.
+    """
     import rerun.blueprint as rrb
 
-    # without plots of states, images and texts take their place
-    main, beside = (scene.states, scene.beside) if scene.states else (scene.beside, [])
-    axis = _newest() if scene.grows else _time_axis(scene.rows)
-    groups = ((main, "state"), (scene.actions, "action"))
+    axis = _newest() if scene.grows else _time_axis(linked=scene.linked)
+    pictures = [panel for panel in scene.beside if isinstance(panel, Picture | Camera)]
+    beside = [panel for panel in scene.beside if not isinstance(panel, Picture | Camera)]
+    if not scene.states and not pictures:  # texts take their place
+        states, beside = beside, []
+    else:
+        states = scene.states
     left = [
-        (_stack(group, roots, axis, name), _share(group, len(roots), group is main))
-        for group, name in groups
+        (_stack(group, roots, axis, name), _share(group, len(roots), group is states))
+        for group, name in ((states, "state"), (scene.actions, "action"))
         if group
     ]
-    right = [(_stack(beside, roots, axis, "beside"), _share(beside, len(roots), False))] if beside else []
-    right += [(panel.view(roots, axis), 4.0) for panel in scene.rewards]
-    about = rrb.Tabs(
-        rrb.TextDocumentView(name="recording", origin="/card"),
-        rrb.BarChartView(name="returns", origin="/overview/return"),
-        rrb.BarChartView(name="lengths", origin="/overview/length"),
-        name="about",
+    plots = sum(share for _, share in left)
+    crowded = plots > _CROWDED  # so pictures stand beside them, not above
+    if pictures and not crowded:
+        left.insert(0, (_pictures(pictures, roots, axis), _ABOVE if states else _ALONE))
+    returns = rrb.BarChartView(
+        name="returns", origin="/overview", contents=["/overview/return", "/overview/shown"]
     )
-    right.append((about, 3.0))
+    lengths = rrb.BarChartView(name="lengths", origin="/overview/length")
+    card = rrb.TextDocumentView(name="recording", origin="/card")
+    right: list[tuple[Any, float]] = [(returns, 3.0)] if overview else []
+    right += [(_pictures(pictures, roots, axis), _BESIDE)] if pictures and crowded else []
+    right += [(_stack(beside, roots, axis, "beside"), _share(beside, len(roots), False))] if beside else []
+    right += [(panel.view(roots, axis), 4.0) for panel in scene.rewards]
+    right.append((rrb.Tabs(card, *([] if overview else [returns]), lengths, name="about"), 3.0))
     columns = [
         rrb.Vertical(*(view for view, _ in column), row_shares=[share for _, share in column])
         for column in (left, right)
         if column
     ]
     return rrb.Blueprint(
-        rrb.Horizontal(*columns, column_shares=[3, 2][-len(columns) :]),
+        rrb.Horizontal(*columns, column_shares=([1, 1] if pictures and crowded else [3, 2])[-len(columns) :]),
         rrb.BlueprintPanel(state=rrb.PanelState.Expanded if listed else rrb.PanelState.Collapsed),
         rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
         rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline="step"),
         auto_layout=False,
         auto_views=False,
     )
+
+
+def _pictures(panels: Sequence[Panel], roots: Sequence[str], axis: Any) -> Any:
+    """Images and cameras beside each other."""
+    import rerun.blueprint as rrb
+
+    views = [panel.view(roots, axis) for panel in panels]
+    return views[0] if len(views) == 1 else rrb.Grid(*views, name="pictures")
 
 
 def _stack(panels: Sequence[Panel], roots: Sequence[str], axis: Any, name: str) -> Any:
@@ -114,11 +140,11 @@ def _share(panels: Sequence[Panel], episodes: int, main: bool) -> float:
     )
 
 
-def _time_axis(rows: int) -> Any:
-    """The time axis of plots: moved together, or if there are many rows, each showing them all."""
+def _time_axis(*, linked: bool) -> Any:
+    """The time axis of plots: moved together, or each showing all its rows."""
     import rerun.blueprint as rrb
 
-    if rows <= _MOST_LINKED:  # linked plots begin with a window around the cursor
+    if linked:
         return rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
     forever = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
     return rrb.archetypes.TimeAxis(view_range=forever)

@@ -10,12 +10,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from tupli_mcap.dataset.which import Chosen
+import numpy as np
+
+from tupli_mcap.dataset.which import Chosen, extremes
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.description import describe
-from tupli_mcap.viewer.about import send_about
+from tupli_mcap.recording.about.success import KEYS, success_of
+from tupli_mcap.viewer.about import run_title, send_about
 from tupli_mcap.viewer.blocks import Block, blocks_of, row_counts
 from tupli_mcap.viewer.blueprints import blueprint_of
 from tupli_mcap.viewer.names import plain
@@ -24,11 +26,13 @@ from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk
 from tupli_mcap.viewer.sending import Times
 
-__all__ = ["Form", "Plan", "plans_of"]
+__all__ = ["Form", "Plan", "extremes_of", "plans_of"]
 
 Form = Literal["joined", "split", "compare"]
 _MOST_SPLIT = 200
 _MOST_COMPARED = 16
+_FEW = 10  # episodes, each of which is told of, and which can be seen at once
+_EACH = 3  # recordings at most, of each of which some episodes are chosen
 
 
 class Part(NamedTuple):
@@ -65,7 +69,17 @@ class Plan(NamedTuple):
     def blueprint(self) -> Any:
         """The blueprint of the parts."""
         roots = list(dict.fromkeys(part.root for part in self.parts))
-        return blueprint_of(self.parts[0].scene, roots, listed=self.listed)
+        return blueprint_of(self.parts[0].scene, roots, listed=self.listed, overview=self._shows_some_of_many)
+
+    @property
+    def _shows_some_of_many(self) -> bool:
+        total = sum(len(recording.index) for recording in self.recordings)
+        return total > max(_FEW, sum(len(part.chosen.positions) for part in self.parts))
+
+    @property
+    def recordings(self) -> list[Recording]:
+        """The recordings that its episodes are of."""
+        return list({id(part.chosen.recording): part.chosen.recording for part in self.parts}.values())
 
     @property
     def application(self) -> str:
@@ -73,7 +87,7 @@ class Plan(NamedTuple):
         first = self.parts[0]
         recording = first.chosen.recording
         looks = _spaces_of(recording) + repr([part.root for part in self.parts] if first.root else "")
-        looks += first.scene.looks + "listed" * self.listed
+        looks += first.scene.looks + "listed" * self.listed + "overview" * self._shows_some_of_many
         name = re.sub(r"[^\w-]+", "-", name_of(recording))  # the viewer warns of other characters
         return f"{name} {hashlib.sha256(looks.encode()).hexdigest()[:6]}"
 
@@ -87,8 +101,8 @@ class Plan(NamedTuple):
     def send(self, stream: Any) -> None:
         """Sends everything, a block of steps at a time."""
         stream.send_recording_name(self.name)
-        recordings = list({id(part.chosen.recording): part.chosen.recording for part in self.parts}.values())
-        send_about(stream, recordings, self.shown, self.parts[0].scene.unseen)
+        chosen = [part.chosen for part in self.parts] if self._shows_some_of_many else []
+        send_about(stream, self.recordings, chosen, self.shown, self.parts[0].scene.unseen)
         steps: dict[str, int] = {}
         for part in self.parts:
             steps[part.root] = steps.get(part.root, 0) + part.steps
@@ -112,12 +126,35 @@ def _send_block(place: Place, scene: Scene, block: Block) -> None:
 
 def times_of(block: Block) -> Times:
     """Where a block's rows lie on the timelines."""
-    return Times(block.number, block.times, block.recording.labels.step_seconds)
+    return Times(block.number, block.times, block.recording.labels.step_seconds, block.seams)
 
 
 def name_of(recording: Recording) -> str:
     """The environment's name, else the file's."""
-    return describe(recording).environment or Path(recording.name).stem
+    carried = "benchmark.json" in recording.attachments
+    return (carried and recording.benchmark.record.name) or Path(recording.name).stem
+
+
+def extremes_of(chosen: Sequence[Chosen]) -> tuple[list[Chosen], str]:
+    """The last, the best and the worst of many episodes, and what to say of it; all of them and "" if they are few.
+
+    They are those of each recording, or of more recordings than three, of all.
+    """
+    total = sum(len(item.positions) for item in chosen)
+    if total <= _FEW:
+        return list(chosen), ""
+    groups = [[item] for item in chosen] if len(chosen) <= _EACH else [chosen]
+    some: list[Chosen] = []
+    told: list[str] = []
+    for group in groups:
+        found, words = extremes(group)
+        some += found
+        of = f" of {run_title(group[0].recording)}" if len(groups) > 1 else ""
+        told.append(", ".join(words) + of)
+    number = sum(len(item.positions) for item in some)
+    return some, (
+        f"{number} of {total:,} episodes: {'; '.join(told)}. Others: --episodes 3,7 or all (in Python: episodes=)"
+    )
 
 
 def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
@@ -155,7 +192,7 @@ def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
         scene.rows = int(row_counts(*item).max())
         for position in item.positions:
             number = item.recording.episodes[position].number
-            name = f"episode {number} · {Path(item.recording.name).stem}"  # the viewer's list shows only the beginning
+            name = f"episode {number} · {run_title(item.recording)}"  # the viewer's list shows only the beginning
             part = Part(Chosen(item.recording, [position]), scene)
             text = _episode_told(item.recording, position)
             yield Plan(name, f"{item.recording.uuid}-{number}", [part], text, listed=several)
@@ -169,25 +206,44 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
         parts.append(Part(item, scene, first=first))
         first += parts[-1].rows
     total = sum(len(item.positions) for item in chosen)
-    name = Path(chosen[0].recording.name).stem
     if total == 1:
         text = _episode_told(chosen[0].recording, chosen[0].positions[0])
     else:
         text = f"{total:,} episodes, {sum(part.steps for part in parts):,} steps, on one timeline"
+        text += "".join(_told_in_turn(parts)) if total <= _FEW else ""
     scene.rows = first
-    return Plan(name, chosen[0].recording.uuid, parts, text)
+    return Plan(run_title(chosen[0].recording), chosen[0].recording.uuid, parts, text)
+
+
+def _told_in_turn(parts: Sequence[Part]) -> Iterator[str]:
+    """Where each episode begins on the timeline, and its facts."""
+    yield "\n"
+    for part in parts:
+        recording, positions = part.chosen
+        of = f" of {plain(run_title(recording))}" if len(parts) > 1 else ""
+        starts = part.first + np.cumsum([0, *row_counts(recording, positions)])
+        for position, start in zip(positions, starts.tolist(), strict=False):
+            yield f"\n- from step {start:,}: {_episode_in_short(recording, position, of)}"
 
 
 def _episode_told(recording: Recording, position: int) -> str:
-    """An episode's facts in Markdown."""
+    """An episode's facts and metadata in Markdown."""
+    metadata = recording.episodes[position].metadata
+    said = () if success_of(metadata) is None else KEYS  # in the line before
+    others = [(key, value) for key, value in metadata.items() if key not in said]
+    lines = "".join(f"\n- {plain(key)}: {plain(shown(value))}" for key, value in others[:20])
+    return f"{_episode_in_short(recording, position)}\n{lines}"
+
+
+def _episode_in_short(recording: Recording, position: int, of: str = "") -> str:
+    """An episode's facts in a line of Markdown."""
     episode = recording.episodes[position]
-    seed = "" if episode.seed is None else f", seed {episode.seed}"
-    steps = "1 step" if len(episode) == 1 else f"{len(episode):,} steps"
-    facts = f"**Episode {episode.number}**: {steps}, return {episode.return_:.6g}, {episode.end}{seed}"
-    metadata = "".join(
-        f"\n- {plain(key)}: {plain(shown(value))}" for key, value in list(episode.metadata.items())[:20]
-    )
-    return f"{facts}\n{metadata}"
+    facts = ["1 step" if len(episode) == 1 else f"{len(episode):,} steps"]
+    facts += [f"return {episode.return_:.6g}", episode.end]
+    succeeded = success_of(episode.metadata)
+    facts += [] if succeeded is None else ["success" if succeeded else "no success"]
+    facts += [] if episode.seed is None else [f"seed {episode.seed}"]
+    return f"**Episode {episode.number}**{of}: {', '.join(facts)}"
 
 
 def _spaces_of(recording: Recording) -> str:
@@ -204,12 +260,14 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
             )
     scene = scene_of(*chosen[0], apart=True)
     parts: list[Part] = []
-    for item in chosen:
-        stem = Path(item.recording.name).stem
+    titles = [run_title(item.recording) for item in chosen]
+    if len(set(titles)) < len(titles):  # files of one run
+        titles = [Path(item.recording.name).stem for item in chosen]
+    for item, name in zip(chosen, titles, strict=True):
         for position in item.positions:
             number = item.recording.episodes[position].number
-            title = f"episode {number}" if len(chosen) == 1 else f"{stem} {number}"
-            root = "/compared/" + re.sub(r"[^\w-]+", "_", title)
+            title = f"episode {number}" if len(chosen) == 1 else f"{name} {number}"
+            root = "/" + re.sub(r"[^\w-]+", "_", title)
             if root in {part.root for part in parts}:  # files of one name
                 root += f"_{len(parts)}"
             parts.append(
@@ -218,9 +276,9 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
                 )
             )
     scene.rows = max(int(row_counts(*item).max()) for item in chosen)
-    lines = [f"\n- {plain(part.title)}: {_episode_told(*_only(part))}" for part in parts]
+    lines = [
+        f"\n- {_episode_in_short(item.recording, position, f' of {plain(name)}' if len(chosen) > 1 else '')}"
+        for item, name in zip(chosen, titles, strict=True)
+        for position in item.positions
+    ]
     return Plan("comparison", first.uuid, parts, f"**Compared**\n{''.join(lines)}")
-
-
-def _only(part: Part) -> tuple[Recording, int]:
-    return part.chosen.recording, part.chosen.positions[0]

@@ -39,6 +39,7 @@ _LINES_SMALL: Final = 6
 _MOST_LANES: Final = 12  # values of a Discrete leaf that get a colour each
 _MOST_LANE_ROWS: Final = 20_000  # the state timeline draws every change, however narrow
 _MOST_INFOS: Final = 12
+_MOST_LINKED: Final = 1000  # rows
 _TITLED: Final = 4  # dimensions that a title names
 _MOST_FRAMES: Final = 16  # of a stack that is not declared as one
 _LEAST_FRAME: Final = 16  # pixels of each of its sides
@@ -63,12 +64,18 @@ class Scene:
         return [*self.states, *self.actions, *self.rewards, *self.beside]
 
     @property
+    def linked(self) -> bool:
+        """Whether plots move together in time. They begin with a window around the cursor, too small for many rows."""
+        return self.rows <= _MOST_LINKED
+
+    @property
     def looks(self) -> str:
         """The panels and what they show, as text: scenes with the same text can share a blueprint."""
         facts = ("title", "entity", "numbers", "texts")
-        return repr(
-            [(type(panel).__name__, *(getattr(panel, fact, None) for fact in facts)) for panel in self.panels]
-        )
+        panels = [
+            (type(panel).__name__, *(getattr(panel, fact, None) for fact in facts)) for panel in self.panels
+        ]
+        return repr((panels, self.linked))
 
 
 class _Material(NamedTuple):
@@ -157,8 +164,11 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
 
 
 def _are_frames(leaf: Leaf, column: str, material: _Material) -> bool:
-    """Whether an array that is not declared as a stack of frames looks like one."""
-    if not can_stack(leaf) or leaf.shape[0] > _MOST_FRAMES or min(leaf.shape[1:3]) < _LEAST_FRAME:
+    """Whether an array that is not declared as such looks like a grey image, or like a stack of frames."""
+    grey = leaf.dtype == np.uint8 and len(leaf.shape) == 2
+    if not grey and (not can_stack(leaf) or leaf.shape[0] > _MOST_FRAMES):
+        return False
+    if min(leaf.shape if grey else leaf.shape[1:3]) < _LEAST_FRAME:
         return False
     return all(leaf.get(getattr(part, column)).dtype == np.uint8 for part in material.sample)
 

@@ -24,9 +24,13 @@ class Times:
         wall: wall clock (ns).
         step_seconds: time that a step takes in the environment (s); None if it is not known, then there is no such
             timeline.
+        seams: the rows with which episodes begin behind others.
     """
 
-    def __init__(self, step: Array, wall: Array, step_seconds: float | None) -> None:
+    def __init__(
+        self, step: Array, wall: Array, step_seconds: float | None, seams: Sequence[int] = ()
+    ) -> None:
+        self.seams = seams
         self._step = step
         self._wall = wall
         self._step_seconds = step_seconds
@@ -57,6 +61,11 @@ class Times:
         return Times(
             np.insert(self._step, before, step), np.insert(self._wall, before, wall), self._step_seconds
         )
+
+    @cached_property
+    def broken(self) -> Times:
+        """With each of the seams twice."""
+        return self.at(np.insert(np.arange(len(self._step)), self.seams, self.seams)) if self.seams else self
 
 
 def pooled(values: Array, most: int, axis: int = 0) -> tuple[Array, Array]:

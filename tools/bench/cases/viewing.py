@@ -36,7 +36,7 @@ def replay_cartpole(run: Run) -> Iterator[Target]:
 
     def mine() -> float:
         goal = run.fresh("ours.rrd")
-        seconds = seconds_of(lambda: viewer.save(path, goal))
+        seconds = seconds_of(lambda: viewer.save(path, goal, "all"))
         return _checked("tupli-mcap", goal, columns, seconds)
 
     def by_hand() -> float:
@@ -65,15 +65,21 @@ def _columns(path: Path) -> _Columns:
     step = np.arange(len(wall))
     of_steps = np.delete(step, ends + np.arange(len(ends)))  # a row each is left for the final states
 
-    def placed(values: Any, rows: Any) -> dict[str, Any]:
+    def placed(values: Any, rows: Any, starts: Any) -> dict[str, Any]:
+        values = np.insert(values, starts, np.nan, axis=0)  # lines break where an episode begins
+        rows = np.insert(rows, starts, rows[starts])
         times = [step[rows], wall[rows], None if seconds is None else step[rows] * seconds]
         return {**dict(zip(_TIMES, times, strict=True)), "values": values}
 
     return {
-        "/state": placed(np.insert(read.states, ends, finals, axis=0).astype(np.float64), step),
-        "/action": placed(read.actions.astype(np.float64)[:, None], of_steps),
-        "/reward": placed(read.rewards[:, None], of_steps),
-        "/return": placed((sums - before)[:, None], of_steps),
+        "/state": placed(
+            np.insert(read.states, ends, finals, axis=0).astype(np.float64),
+            step,
+            (ends + np.arange(1, len(ends) + 1))[:-1],
+        ),
+        "/action": placed(read.actions.astype(np.float64)[:, None], of_steps, ends[:-1]),
+        "/reward": placed(read.rewards[:, None], of_steps, ends[:-1]),
+        "/return": placed((sums - before)[:, None], of_steps, ends[:-1]),
     }
 
 
@@ -110,7 +116,10 @@ def _checked(side: str, goal: Path, columns: _Columns, seconds: float) -> float:
         parts = sorted(found.get(entity, []), key=lambda part: int(part[0][0]))
         check(bool(parts), f"{side}: nothing at {entity}")
         steps, values = (np.concatenate(kind) for kind in zip(*parts, strict=True))
-        check(np.array_equal(values, column["values"].reshape(-1)), f"{side}: other values at {entity}")
+        check(
+            np.array_equal(values, column["values"].reshape(-1), equal_nan=True),
+            f"{side}: other values at {entity}",
+        )
         check(np.array_equal(steps, column["step"]), f"{side}: other steps at {entity}")
     goal.unlink()
     return seconds

@@ -8,6 +8,8 @@ from functools import cached_property
 from pathlib import PurePosixPath
 from typing import Any
 
+import numpy as np
+
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, TupliError
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, MAX_ANNOTATIONS, Annotations
@@ -104,7 +106,10 @@ class DescribedRecording(OpenedRecording):
 
     def all_metadata(self) -> list[str]:
         """The metadata of all episodes as JSON texts; "{}" where there is none."""
-        texts = [self._contents.index.metadata_text(i) for i in range(len(self.index))]
+        index = self._contents.index
+        texts = ["{}"] * len(index.episodes)
+        for i in np.flatnonzero(index.episodes["metadata_length"]).tolist():
+            texts[i] = index.metadata_text(i)
         if self.annotations.said:
             for i, number in enumerate(self.index["episode"].tolist()):
                 if self.annotations.of(number):

@@ -164,7 +164,7 @@ class LiveEnv:
         bounds = [0, *(np.flatnonzero(np.diff(steps.facts.episode)) + 1).tolist(), len(steps)]
         ends = _ends_of(steps, bounds)
         block = _block(steps, columns, bounds, ends)
-        times = self._times(block.number, block.times)
+        times = Times(block.number, block.times, self._seconds, block.seams)
         for panel in self._panels:
             if not _is_apart(panel):
                 panel.send(self._place, block, times)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,12 +22,13 @@ _MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
 # By dimensions of a leaf. The viewer knows height and width by these names, and would lay other ones on their side.
 _AXES = {2: ("row", "column"), 3: ("[0]", "height", "width")}
 _FRAMES_AT_ONCE = 64
-_FRAMES_A_LINE = 4  # of a stack
+_FRAMES_A_LINE = 4  # of a stack, at most
+_ATARI = (84, 84, 4)  # four frames, where nothing says what the channels are
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image leaf: one picture a step. A stack shows all its frames side by side, the oldest first."""
+    """An image leaf: one picture a step. A stack shows all its frames side by side, the newest first."""
 
     leaf: Leaf
     column: str
@@ -53,11 +55,14 @@ class Picture:
     def _tiled(self, values: Array) -> Array:
         """Pictures (rows x height x width x channels) of a column; black where the last line of a stack is not full."""
         leaf = self.leaf
-        if leaf.kind == "image":
+        frames_last = leaf.frames_last or leaf.shape == _ATARI
+        if len(leaf.shape) == 2:
+            return values[..., None]
+        if leaf.kind == "image" and not frames_last:
             return values
-        frames = np.moveaxis(values, -1, 1) if leaf.frames_last else values
+        frames = (np.moveaxis(values, -1, 1) if frames_last else values)[:, ::-1]
         rows, count, height, width = frames.shape[:4]
-        across = min(count, _FRAMES_A_LINE)
+        across = min(math.ceil(math.sqrt(count)), _FRAMES_A_LINE)
         down = -(-count // across)
         tiles = np.zeros(
             (rows, down * across, height, width, leaf.size // (count * height * width)), np.uint8

@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.panels.panel import Place, flat_values, plot
+from tupli_mcap.viewer.panels.panel import Place, flat_values, plot, send_lines
 from tupli_mcap.viewer.sending import Times, send_scalars
 
 __all__ = ["Rewards", "Series"]
@@ -43,7 +43,7 @@ class Series:
         values = flat_values(self.leaf, self.column, block)
         if len(self.dims) < values.shape[1]:
             values = values[:, list(self.dims)]
-        send_scalars(place.stream, place.root + self.entity, times, values)
+        send_lines(place, self.entity, times, values)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         # compared episodes are named once, beside the returns
@@ -76,8 +76,8 @@ class Rewards:
     def send(self, place: Place, block: Block, times: Times) -> None:
         rewards = self._totals(block)
         returns = self._returns(rewards, block)
-        send_scalars(place.stream, f"{place.root}/reward", times, rewards[:, None])
-        send_scalars(place.stream, f"{place.root}/return", times, returns[:, None])
+        send_lines(place, "/reward", times, rewards[:, None])
+        send_lines(place, "/return", times, returns[:, None])
         heights = np.where(np.isfinite(returns), returns, 0.0)  # a marker has to be somewhere
         for code, name in enumerate(_ENDS):
             at = np.array([piece.end - 1 for piece in block.pieces if piece.how_ended == code], np.int64)

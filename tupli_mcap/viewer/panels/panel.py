@@ -10,9 +10,9 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.sending import Times
+from tupli_mcap.viewer.sending import Times, send_scalars
 
-__all__ = ["PALETTE", "Panel", "Place", "flat_values", "named", "plot"]
+__all__ = ["PALETTE", "Panel", "Place", "flat_values", "named", "plot", "send_lines"]
 
 PALETTE: Final = (
     0x4C9BE8FF, 0xF28E2BFF, 0x59C36AFF, 0xE15759FF, 0xB07AD9FF, 0xEDC948FF,
@@ -99,9 +99,16 @@ def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
     return values.reshape(len(block), -1)
 
 
+def send_lines(place: Place, entity: str, times: Times, values: Array) -> None:
+    """Sends `values` (rows x width), with a row of NaN at the time of each seam, which breaks the lines there."""
+    if times.seams:
+        values = np.insert(values.astype(np.float64, copy=False), times.seams, np.nan, axis=0)
+    send_scalars(place.stream, place.root + entity, times.broken, values)
+
+
 def named(title: str, root: str) -> str:
     """A view's title, after the name of the episode if there are several."""
-    return f"{root.rpartition('/')[2]}: {title}" if root else title
+    return f"{root.strip('/').replace('_', ' ')}: {title}" if root else title
 
 
 def plot(title: str, entities: Sequence[str], axis: Any, *, legend: bool = True) -> Any:

@@ -127,13 +127,20 @@ class Infos:
         import rerun as rr
 
         pairs_of: dict[str, list[tuple[int, Any]]] = {key: [] for key in (*self.numbers, *self.texts)}
+        seams = set(times.seams)
+        breaking: set[str] = set()  # keys whose next value is of another episode than the one before
         for piece in block.pieces:
+            if piece.begin in seams:
+                breaking = set(self.numbers)
             infos = block.recording.infos(piece.position) or []
             for row, info in enumerate(infos[piece.step : piece.step + piece.end - piece.begin], piece.begin):
                 for key, value in (info or {}).items():
                     if key in pairs_of and (
                         isinstance(value, str) if key in self.texts else _is_number(value)
                     ):
+                        if key in breaking:
+                            breaking.remove(key)
+                            pairs_of[key].append((row, np.nan))
                         pairs_of[key].append((row, value))
         for key, pairs in pairs_of.items():
             if not pairs:
