@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from rerun.chunk import RrdReader
 
 from tupli_mcap.recording import Episode
@@ -22,6 +23,11 @@ def joined_rows(lengths: np.ndarray) -> tuple[list[int], list[int]]:
 def states_of(episode: Episode) -> np.ndarray:
     """All that were seen: one for each step, and the final one."""
     return np.concatenate([episode.states, [episode.final_state]])
+
+
+def _values(column: pa.Array) -> list[Any]:
+    """The values of a column; times as nanoseconds, which Python's own have not."""
+    return (column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column).to_pylist()
 
 
 class Rrd:
@@ -54,7 +60,7 @@ class Rrd:
     def _sent(self, entity: str, component: str, recording: int) -> list[Any]:
         batches = [b for b in self._batches[recording][entity] if component in b.schema.names]
         batches.sort(key=lambda batch: batch.column("rerun.controls.RowId")[0].as_py())
-        return [row for batch in batches for row in batch.column(component).to_pylist()]
+        return [row for batch in batches for row in _values(batch.column(component))]
 
     def breaks(self, entity: str, recording: int = 0) -> list[int]:
         """The rows of numbers that break lines: of NaN, at the time of the next row."""

@@ -155,7 +155,7 @@ class TestVectors:
         self, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """Resets are no steps; where one value differs, there is no time. Each contender is tried with another leaf."""
-        worker, path = Worker(name), str(tmp_path / "run")
+        worker, path = Worker(name), str(tmp_path / "run.data")
         ask = {"do": "build", "work": workloads.VECTOR, "steps": 6400}
         answer = worker.answer({**ask, "path": path})
         if "NotFoundError" in answer.get("failed", ""):
@@ -173,7 +173,7 @@ class TestVectors:
             return found
 
         monkeypatch.setattr(worker._contender, "read_vector", changed)
-        answer = worker.answer({**ask, "path": str(tmp_path / leaf)})
+        answer = worker.answer({**ask, "path": str(tmp_path / f"{leaf}.data")})
         assert answer["failed"].startswith("WrongResultError: other ")
 
 

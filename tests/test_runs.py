@@ -550,6 +550,10 @@ class TestOfStrangers:
         path = self.put(record(tmp_path / "r.mcap"), "run.json", "junk")
         with pytest.warns(UserWarning, match=r"run\.json"):
             assert len(tupli_mcap.open(path).read().rewards) > 0
+        for look in (["info"], ["ls"], ["plot", "-o", str(tmp_path / "p.png")]):
+            assert "run.json" in command(*look, str(path))
+        with pytest.warns(UserWarning, match=r"run\.json"):
+            Recording(path).replay(save=tmp_path / "r.rrd")
         storage = FileStorage(tmp_path)
         with pytest.warns(UserWarning, match=r"run\.json"):
             assert len(storage.list_episodes()) == 3

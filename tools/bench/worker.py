@@ -99,7 +99,7 @@ class Worker:
 
     def _affordable(self, workload: Workload, where: Path, data: Data, seconds: float) -> int:
         """How many episodes may be recorded and read in about `seconds`, at least two."""
-        trial = where.with_name(f"{where.name}-trial")
+        trial = where.with_name(f"trial-{where.name}")
         before, per_step = (0, 0.0), 0.0  # of the trial before: steps, seconds
         for steps in (1, 100, 1000):  # the first one imports, and is not counted
             _remove(trial)

@@ -104,7 +104,7 @@ def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES
     layout = recording.layout if recording.num_envs else None
     rows = recording.index[positions]
     measured = Measured(
-        recording.name, describe(recording), recording.run, recording.index, positions, layout,
+        recording.name, describe(recording), recording.readable_runs[0], recording.index, positions, layout,
         _metadata_numbers(recording, positions),
     )  # fmt: skip
     if layout is None:

@@ -134,7 +134,7 @@ def describe(recording: Recording) -> RecordingDescription:
         benchmark_id=recording.benchmark_id,
         environment=recording.benchmark.record.name if carried else None,
         signed_by=claimed_signer(recording),
-        run={key: value for key, value in vars(recording.run).items() if value},
+        run={key: value for key, value in vars(recording.readable_runs[0]).items() if value},
         made_of=made_of(recording),
         metadata_keys=_metadata_keys(recording),
         success=success_rate(recording, np.arange(len(rows))),

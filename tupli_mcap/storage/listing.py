@@ -233,9 +233,9 @@ def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] 
                 created_ns=recording.created_ns,
                 benchmark_id=recording.benchmark_id,
                 state=state_of(recording),
-                name=", ".join(dict.fromkeys(run.name for run in recording.runs)),
-                environment=recording.run.environment,
-                started=recording.run.started,
+                name=", ".join(dict.fromkeys(run.name for run in recording.readable_runs)),
+                environment=recording.readable_runs[0].environment,
+                started=recording.readable_runs[0].started,
                 success=success_rate(recording, kept),
             )
     except (TupliError, OSError) as err:

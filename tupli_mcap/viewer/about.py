@@ -116,7 +116,7 @@ def card(recording: Recording) -> str:
 
 def run_title(recording: Recording) -> str:
     """The name of the run, else the file's; without what cannot be printed, and not too long."""
-    name = recording.run.name or Path(recording.name).stem
+    name = recording.readable_runs[0].name or Path(recording.name).stem
     return "".join(char for char in name[:_LONGEST_TITLE] if char.isprintable())
 
 

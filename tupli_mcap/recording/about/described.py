@@ -77,17 +77,20 @@ class DescribedRecording(OpenedRecording):
             raise FormatError(f"{where}: expected at most {MAX_ANNOTATIONS} bytes, found {info.size}")
         return Annotations(self.read_attachment(ANNOTATIONS_NAME), where)
 
-    def listed_runs(self) -> list[dict[str, Any]]:
-        """The run of each episode as filters see it; that of the file alone, with a warning, where it is damaged."""
+    @cached_property
+    def readable_runs(self) -> list[Run]:
+        """`runs`, or where they are damaged, with a warning, one run that is known by the file only."""
         try:
-            runs, places = self.runs, self.run_places
+            return self.runs
         except FormatError as err:
-            warnings.warn(f"{err}; the run is not known", UserWarning, stacklevel=2)
-            runs, places = (
-                [Run().known_as(PurePosixPath(file_name(self.name)).stem, "", self.created_ns, 0)],
-                [],
-            )
-        found = [run.as_dict() for run in runs]
+            warnings.warn(f"{err}; the run is not known", UserWarning, stacklevel=3)
+            name = PurePosixPath(file_name(self.name)).stem
+            return [Run().known_as(name, "", self.created_ns, 0)]
+
+    def listed_runs(self) -> list[dict[str, Any]]:
+        """The run of each episode as filters see it; see `readable_runs`."""
+        found = [run.as_dict() for run in self.readable_runs]
+        places = self.run_places if len(found) > 1 else []
         return [found[place] for place in places] or found * len(self.index)
 
     def episode_metadata(self, i: int) -> dict[str, Any]:
