@@ -27,7 +27,7 @@ from tupli_mcap.messages.images.png import PngCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings
-from tupli_mcap.recording.edit.repair import recover_recording
+from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter

@@ -37,7 +37,7 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.environment import EnvironmentRecord, note
 from tupli_mcap.recording.edit.attach import add_attachments
-from tupli_mcap.recording.edit.repair import recover_recording
+from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.replay import Certificate, certify, recorded_values, render
 from tupli_mcap.signing import SigningKey

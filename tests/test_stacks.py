@@ -26,7 +26,7 @@ from tupli_mcap.messages.images.stack import StackCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings
-from tupli_mcap.recording.edit.repair import recover_recording
+from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

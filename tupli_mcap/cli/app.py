@@ -213,6 +213,7 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "tag": edit.tag,
         "edit": edit.edit,
         "filter": edit.filter_,
+        "trim": edit.trim,
         "merge": edit.merge,
         "split": edit.split,
         "recover": edit.recover,
@@ -262,6 +263,10 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning"),
     "verify": ("verify run.mcap", "verify run.mcap --rerun --episodes 0,4,10-19"),
     "filter": ("filter run.mcap 'return > 100 and metadata.success' -o good.mcap",),
+    "trim": (
+        "trim run.mcap --steps 10:-5 -o trimmed.mcap",
+        "trim run.mcap --episodes 3 --steps :200 -o trimmed.mcap",
+    ),
     "merge": ("merge a.mcap b.mcap -o all.mcap",),
     "split": ("split all.mcap -o part.mcap --episodes 1000",),
     "recover": ("recover run.mcap", "recover run.mcap --dry-run"),

@@ -23,7 +23,7 @@ from tupli_mcap.cli.terminal import say
 if TYPE_CHECKING:
     from tupli_mcap.recording import RecoveryReport
 
-__all__ = ["edit", "filter_", "merge", "recover", "split", "tag"]
+__all__ = ["edit", "filter_", "merge", "recover", "split", "tag", "trim"]
 
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The new recording (.mcap).")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
@@ -189,6 +189,47 @@ def filter_(
     from tupli_mcap.dataset import filter_recording
 
     report = filter_recording(file, output, filter_text, overwrite=force, dry_run=dry_run)
+    if as_json:
+        print_json({"dry_run": dry_run, **_plain(report)})
+        return
+    _print_made(report, dry_run)
+
+
+def trim(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
+    steps: Annotated[
+        str, typer.Option("--steps", metavar="10:-5", help="The steps that stay: first, and where to stop.")
+    ],
+    output: _Output,
+    episodes: Annotated[
+        str | None,
+        typer.Option("--episodes", "--episode", metavar="3,7", help="Numbers, best, last, …; all else."),
+    ] = None,
+    filter_text: FilterText = None,
+    force: _Force = False,
+    dry_run: _DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Write a recording with fewer steps at the ends of episodes.
+
+    10:-5 leaves out the first ten steps and the last five, :200 all from step 200 on. Episodes that are not chosen stay
+    whole. One that loses its end ends as interrupted, with the state that followed as its final one; one that loses
+    its beginning has no seed. The new recording has an id of its own, and no signature.
+    """
+    from tupli_mcap.dataset.which import choose_episodes
+    from tupli_mcap.recording import Recording, trim_recording
+
+    begin, colon, stop = steps.partition(":")
+    try:
+        kept = slice(int(begin) if begin else None, int(stop) if stop else None)
+    except ValueError:
+        colon = ""
+    if not colon:
+        raise typer.BadParameter(f"expected steps such as 10:-5, 10: or :200, found {steps!r:.80}")
+    with Recording(file) as recording:
+        chosen = choose_episodes(recording, episodes or "all", filter_of(filter_text))
+        wanted = {episode.number: kept for episode in chosen}
+        report = trim_recording(recording, output, wanted, overwrite=force, dry_run=dry_run)
     if as_json:
         print_json({"dry_run": dry_run, **_plain(report)})
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,13 +19,14 @@ from tupli_mcap.recording import (
     relabel_recording,
     rewrite_recording,
     say_made_of,
+    trim_recording,
 )
 from tupli_mcap.schema import BaseFilter, parse_filter
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
 
-__all__ = ["FilterReport", "filter_recording", "relabel", "save"]
+__all__ = ["FilterReport", "filter_recording", "relabel", "save", "trim"]
 
 
 class FilterReport(NamedTuple):
@@ -117,6 +119,27 @@ def relabel(
     overwrite: bool,
 ) -> Path:
     """See `Dataset.map`."""
+    make = partial(relabel_recording, function=function, fields=fields)
+    return _made_anew(dataset, target, make, overwrite=overwrite)
+
+
+def trim(
+    dataset: Dataset, steps: slice | Callable[[Episode], slice], target: Path, *, overwrite: bool
+) -> Path:
+    """See `Dataset.trim`."""
+
+    def make(recording: Recording, target: Path, **options: Any) -> None:
+        kept = {
+            episode.number: steps if isinstance(steps, slice) else steps(episode)
+            for episode in recording.episodes
+        }
+        trim_recording(recording, target, kept, overwrite=True, **options)
+
+    return _made_anew(dataset, target, make, overwrite=overwrite)
+
+
+def _made_anew(dataset: Dataset, target: Path, make: Callable[..., None], *, overwrite: bool) -> Path:
+    """Has `target` made out of one recording that has all episodes of a dataset."""
     if target.exists() and not overwrite:
         raise DatasetError(f"{target} exists; choose another path, or overwrite it")
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -125,7 +148,7 @@ def relabel(
         chosen = save(dataset, Path(folder) / target.name, overwrite=False)
         with Recording(chosen) as recording:
             sources = [dataset._recordings.get(name) for name in names]
-            relabel_recording(recording, target, function, fields, sources=sources)
+            make(recording, target, sources=sources)
     return target
 
 

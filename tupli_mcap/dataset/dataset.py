@@ -499,6 +499,29 @@ class Dataset(RandomAccess):
         """
         return curate.relabel(self, function, Path(target), fields, overwrite=overwrite)
 
+    def trim(
+        self,
+        steps: slice | Callable[[Episode], slice],
+        target: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+    ) -> Path:
+        """Writes the episodes to a new recording, each with only some consecutive steps; all else of them is kept.
+
+        `ds.trim(slice(10, -5), "trimmed.mcap")` leaves out the first ten steps of each episode and the last five.
+
+        Args:
+            steps: the steps that stay, or a function from an `Episode` to them.
+
+        An episode that loses its end ends as interrupted, and the state that followed is its final state; one that
+        loses its beginning has no seed, because no reset leads to its first state.
+
+        Raises:
+            DatasetError: there is no episode, or the target exists (and not `overwrite`).
+            RecordingError: no step of an episode would stay, the slice has a stride, or the target cannot be written.
+        """
+        return curate.trim(self, steps, Path(target), overwrite=overwrite)
+
     # ---- looking
 
     def plot(self, **options: Any) -> Any:

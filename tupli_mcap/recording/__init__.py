@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.edit.made_of import made_of, say_made_of
     from tupli_mcap.recording.edit.merge import MergeReport, Part, merge_recordings, split_recording
     from tupli_mcap.recording.edit.relabel import relabel_recording
-    from tupli_mcap.recording.edit.repair import RecoveryReport, recover_recording
+    from tupli_mcap.recording.edit.repair.recover import RecoveryReport, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording
+    from tupli_mcap.recording.edit.trim import trim_recording
     from tupli_mcap.recording.write.from_values import EpisodeData, write_recording
 
 # Imported on first use: who records or reads needs none of them.
@@ -41,17 +42,18 @@ _HOMES = {
     "MergeReport": "edit.merge",
     "Part": "edit.merge",
     "Problem": "check.verify",
-    "RecoveryReport": "edit.repair",
+    "RecoveryReport": "edit.repair.recover",
     "VerifyReport": "check.verify",
     "annotate_episodes": "edit.annotate",
     "edit_run": "edit.annotate",
     "made_of": "edit.made_of",
     "merge_recordings": "edit.merge",
-    "recover_recording": "edit.repair",
+    "recover_recording": "edit.repair.recover",
     "relabel_recording": "edit.relabel",
     "rewrite_recording": "edit.rewrite",
     "say_made_of": "edit.made_of",
     "split_recording": "edit.merge",
+    "trim_recording": "edit.trim",
     "undo_annotation": "edit.annotate",
     "verify_recording": "check.verify",
     "write_recording": "write.from_values",
@@ -81,6 +83,7 @@ __all__ = [
     "rewrite_recording",
     "say_made_of",
     "split_recording",
+    "trim_recording",
     "undo_annotation",
     "verify_recording",
     "write_recording",

@@ -114,6 +114,16 @@ class DatasetVerbs:
         """Writes the episodes to a new recording, with new rewards or actions."""
         return self.dataset.map(function, target, fields=fields, overwrite=overwrite)
 
+    def trim(
+        self,
+        steps: slice | Callable[[Episode], slice],
+        target: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+    ) -> Path:
+        """Writes the episodes to a new recording, each with only some consecutive steps."""
+        return self.dataset.trim(steps, target, overwrite=overwrite)
+
     def __add__(self, other: Recording | Dataset) -> Dataset:
         """The episodes of both, these first."""
         return self.dataset + other

@@ -5,10 +5,10 @@ copy_episodes                     episodes of a recording into it
 copy_chunks                       chunks that can be copied as they are
 merge                             several recordings into one, with new numbers; one into several
 rewrite                           a recording with fewer episodes
-relabel                           a recording with other rewards or actions
+relabel, trim                     a recording with other rewards or actions; with fewer steps of episodes
 made_of                           what a recording was made of
 attach, annotate                  adds attachments; says more about episodes and the run
 carry_runs                        what recordings say of runs and episodes, for one made of them
-repair                            `recover_recording`; write_repaired and repaired_frames write what it found
+repair                            a recording out of a damaged one
 replacing                         the new file takes the place of the old one
 """

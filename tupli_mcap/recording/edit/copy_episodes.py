@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -9,13 +10,16 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.records import BODY
-from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart
+from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.recording import Recording
 
-__all__ = ["EpisodeCopier", "NewFrames", "NewValues"]
+__all__ = ["EpisodeCopier", "NewFrames", "NewValues", "Trim"]
+
+
+_NUMBERS = struct.Struct("<II")  # an episode's, and a step's or a sub-environment's
 
 
 class NewFrames(Protocol):
@@ -39,6 +43,18 @@ class NewValues(NamedTuple):
     returns: Mapping[int, float]
 
 
+class Trim(NamedTuple):
+    """What stays of an episode: its steps from `start` to before `stop`, and their return.
+
+    `final` is the state after them, as it follows `episode` and `env` in `/final_state`; None where its end stays.
+    """
+
+    start: int
+    stop: int
+    episode_return: float
+    final: bytes | None
+
+
 class EpisodeCopier:
     """Appends episodes of `source` to `target`.
 
@@ -48,6 +64,7 @@ class EpisodeCopier:
         cameras: by camera, then by sub-environment, the ids of its channels.
         frames: of a camera, in place of the source's.
         values: of steps of constant layout, in place of the source's.
+        trims: of episodes of which some steps stay, by number.
     """
 
     def __init__(
@@ -60,7 +77,9 @@ class EpisodeCopier:
         shift: int = 0,
         frames: NewFrames | None = None,
         values: NewValues | None = None,
+        trims: Mapping[int, Trim] | None = None,
     ) -> None:
+        self._trims = trims or {}
         self._values = values or NewValues({}, {})
         self._source, self._target, self._shift = source, target, shift
         self._channels = channels or {}
@@ -73,6 +92,7 @@ class EpisodeCopier:
     def run(self, rows: Array) -> None:
         """Copies the episodes that `rows` of the source's index name."""
         layout = self._source.layout
+        rows = self._trimmed(rows)
         firsts = np.zeros(len(rows), dtype=np.int64)
         for env, channel in enumerate(self._file.steps):
             chosen = np.flatnonzero(rows["env"] == env)
@@ -88,7 +108,29 @@ class EpisodeCopier:
         self._events(rows, firsts)
         self._frames(rows)
         if INFO in self._topics:
-            self._infos(rows["episode"])
+            self._infos(rows)
+
+    def _trimmed(self, rows: Array) -> Array:
+        """The index's rows as they are of the steps that stay; `first_row` counts in the source."""
+        rows = rows.copy()
+        for row in rows:
+            trim = self._trims.get(int(row["episode"]))
+            if trim is None:
+                continue
+            channel = self._file.steps[int(row["env"])]
+            if trim.start:
+                row["start_time"] = self._time_of(channel, int(row["first_row"]) + trim.start - 1)
+                row["seed"] = row["has_seed"] = 0
+            if trim.final is not None:
+                row["end_time"] = self._time_of(channel, int(row["first_row"]) + trim.stop - 1)
+                row["end"], row["final_row"] = INTERRUPTED, max(0, row["final_row"])
+            row["first_row"] += trim.start
+            row["length"], row["return"] = trim.stop - trim.start, trim.episode_return
+        return rows
+
+    def _time_of(self, channel: int, place: int) -> int:
+        ((time_ns, _),) = self._messages(channel, place, 1)
+        return time_ns
 
     def _to(self, channel: int) -> int:
         """The target's id of a channel."""
@@ -116,15 +158,21 @@ class EpisodeCopier:
         for first, count in spans:
             for span in self._store.spans(channel, first, count):
                 part: Array = self._store.rows(span.chunk, dtype, keep=False)[span.begin : span.end]
-                renumbered = self._shift and "episode" in (dtype.names or ())
+                renumbered = (self._shift or self._trims) and "episode" in (dtype.names or ())
                 if renumbered or new:
                     part = np.frombuffer(bytearray(part.tobytes()), dtype)
                 if renumbered:
-                    part["episode"] += np.uint32(self._shift)
+                    self._renumber_rows(part)
                 for name, column in new.items():
                     part[name] = column[first : first + len(part)]
                 first += len(part)
                 yield part
+
+    def _renumber_rows(self, part: Array) -> None:
+        for number in np.unique(part["episode"]).tolist() if self._trims else ():
+            if number in self._trims:
+                part["step"][part["episode"] == number] -= np.uint32(self._trims[number].start)
+        part["episode"] += np.uint32(self._shift)
 
     def _messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
         """(log_time, body) of messages of a channel."""
@@ -137,20 +185,22 @@ class EpisodeCopier:
     def _copy_places(self, channel: int, places: Array, *, numbered: bool) -> None:
         """The rows `places` (ascending) of a channel of single messages."""
         moved = np.flatnonzero(places != np.arange(len(places)))
-        done = self._copy_first(channel, int(moved[0]) if len(moved) else len(places), None)
+        same = int(moved[0]) if len(moved) else len(places)
+        done = 0 if numbered and self._trims else self._copy_first(channel, same, None)
         spans = _merged([(place, 1) for place in places[done:].tolist()])
         messages = (m for first, count in spans for m in self._messages(channel, first, count))
         self._write(channel, messages, numbered=numbered)
 
     def _write(self, channel: int, messages: Iterable[tuple[int, bytes]], *, numbered: bool = False) -> None:
-        """Adds messages of a channel (log_time, body); `numbered` ones begin with the number of an episode."""
-        if numbered and self._shift:
+        """Adds messages of a channel (log_time, body); `numbered` ones begin with those of an episode and a step."""
+        if numbered and (self._shift or self._trims):
             messages = ((time_ns, self._renumbered(body)) for time_ns, body in messages)
         self._target.add_messages(self._to(channel), messages)
 
     def _renumbered(self, body: bytes) -> bytes:
-        number = int.from_bytes(body[:4], "little") + self._shift
-        return number.to_bytes(4, "little") + body[4:]
+        number, step = _NUMBERS.unpack_from(body)
+        trim = self._trims.get(number)
+        return _NUMBERS.pack(number + self._shift, step - trim.start if trim else step) + body[8:]
 
     def _events(self, rows: Array, firsts: Array) -> None:
         """Starts, ends and final states, and the rows of the index."""
@@ -160,28 +210,33 @@ class EpisodeCopier:
             for topic in (EPISODE_START, EPISODE_END, FINAL_STATE)
         }
         latest = {topic: target.latest(self._to(topics[topic])) for topic in (EPISODE_START, EPISODE_END)}
-        starts: list[tuple[int, bytes]] = []
+        starts = self._starts(rows)
+        by_time = np.argsort(rows["start_time"], kind="stable").tolist()
+        start_rows = np.zeros(len(rows), np.int64)
+        start_rows[by_time] = begins[EPISODE_START] + np.cumsum([len(starts[i]) for i in by_time]) - 1
         ends: list[tuple[int, bytes]] = []
         finals: list[tuple[int, bytes]] = []
-        # ends keep their order, which is not that of the episodes in a vector environment
-        end_places = _places(rows["end_row"])
+        # in a vector environment, episodes end in another order than that in which they begin
+        end_places = np.argsort(np.lexsort((rows["end_row"], rows["end_time"]))).tolist()
         final_places = _places(rows["final_row"][rows["final_row"] >= 0])
-        positions = {int(number): i for i, number in enumerate(self._source.index["episode"])}
-        for row, first in zip(rows, firsts, strict=True):
-            last = int(row["start_row"])
-            resets = len(self._source.resets_before(positions[int(row["episode"])]))
-            for start_time, body in self._messages(topics[EPISODE_START], last - resets, resets + 1):
-                start = EpisodeStart.decode(memoryview(body))
-                number = start.episode + self._shift
-                starts.append((start_time, start._replace(episode=number, first_row=int(first)).encode()))
+        for place, (row, first) in enumerate(zip(rows, firsts, strict=True)):
+            number = int(row["episode"])
+            trim = self._trims.get(number)
             ((end_time, body),) = self._messages(topics[EPISODE_END], int(row["end_row"]), 1)
             end = EpisodeEnd.decode(memoryview(body))
-            total = self._values.returns.get(end.episode, end.episode_return)
-            end = end._replace(episode=end.episode + self._shift, first_row=int(first), episode_return=total)
+            total = self._values.returns.get(number, end.episode_return)
+            if trim is not None:
+                total = trim.episode_return
+                end = end._replace(length=int(row["length"]), end=int(row["end"]))
+            end = end._replace(episode=number + self._shift, first_row=int(first), episode_return=total)
             final = -1
             if row["final_row"] >= 0:
                 final = begins[FINAL_STATE] + final_places[len(finals)]
-                finals += self._messages(topics[FINAL_STATE], int(row["final_row"]), 1)
+                if trim is not None and trim.final is not None:
+                    end_time, end = int(row["end_time"]), end._replace(has_final_state=True)
+                    finals.append((end_time, _NUMBERS.pack(number, end.env) + trim.final))
+                else:
+                    finals += self._messages(topics[FINAL_STATE], int(row["final_row"]), 1)
             target.index.add(
                 int(first),
                 end.length,
@@ -189,7 +244,7 @@ class EpisodeCopier:
                 max(int(row["start_time"]), latest[EPISODE_START]),
                 max(int(row["end_time"]), latest[EPISODE_END]),
                 int(row["seed"]) if row["has_seed"] else None,
-                begins[EPISODE_START] + len(starts) - 1,
+                int(start_rows[place]),
                 begins[EPISODE_END] + end_places[len(ends)],
                 final,
                 end.episode,
@@ -198,9 +253,46 @@ class EpisodeCopier:
                 end.metadata,
             )
             ends.append((end_time, end.encode()))
-        self._write(topics[EPISODE_START], _in_time(starts))
+        numbered = (
+            (time_ns, start._replace(episode=start.episode + self._shift, first_row=int(firsts[i])).encode())
+            for i in by_time
+            for time_ns, start in starts[i]
+        )
+        self._write(topics[EPISODE_START], _in_time(numbered))
         self._write(topics[EPISODE_END], _in_time(_in_order(ends, end_places)))
-        self._write(topics[FINAL_STATE], _in_time(_in_order(finals, final_places)), numbered=True)
+        finals = [
+            (time_ns, (int.from_bytes(body[:4], "little") + self._shift).to_bytes(4, "little") + body[4:])
+            for time_ns, body in finals
+        ]
+        self._write(topics[FINAL_STATE], _in_time(_in_order(finals, final_places)))
+
+    def _starts(self, rows: Array) -> list[list[tuple[int, EpisodeStart]]]:
+        """(log_time, start) of the resets without a step before each episode, and of its own.
+
+        Nobody can repeat what led to a state within an episode, nor the resets that follow one that ends early: a start
+        that is `continued` says so.
+        """
+        positions = {int(number): i for i, number in enumerate(self._source.index["episode"])}
+        ends_early = [False] * self._source.num_envs  # the episode before
+        found = []
+        for row in rows:
+            env, number = int(row["env"]), int(row["episode"])
+            trim = self._trims.get(number)
+            resets = len(self._source.resets_before(positions[number]))
+            messages = self._messages(self._topics[EPISODE_START], int(row["start_row"]) - resets, resets + 1)
+            starts = [(time_ns, EpisodeStart.decode(memoryview(body))) for time_ns, body in messages]
+            lost = ends_early[env]
+            if trim is not None and trim.start:
+                bare = starts[-1][1]._replace(
+                    seed="", seed_given=False, continued=False, options="", reset_info="{}"
+                )
+                starts, lost = [(int(row["start_time"]), bare)], True
+            if lost:
+                time_ns, first = starts[0]
+                starts = [(time_ns, first._replace(seed="", seed_given=False, continued=True)), *starts]
+            ends_early[env] = trim is not None and trim.final is not None
+            found.append(starts)
+        return found
 
     def _frames(self, rows: Array) -> None:
         """The frames of episodes: pictures, and what they show row by row."""
@@ -223,7 +315,9 @@ class EpisodeCopier:
     def _frame_rows(self, camera: str, row: Any) -> Array:
         """Which rows of its channels show an episode."""
         number, length = int(row["episode"]), int(row["length"])
-        return self._file.cameras.rows(camera, int(row["env"]), number, length)[0]
+        start = self._trims[number].start if number in self._trims else 0
+        places, steps, _ = self._file.cameras.rows(camera, int(row["env"]), number, start + length)
+        return places[steps >= start]
 
     def _frames_of(
         self, new: NewFrames, row: Any, channel: int, pictures: bool
@@ -240,11 +334,17 @@ class EpisodeCopier:
             for place in self._frame_rows(new.camera, row).tolist():
                 yield from self._messages(channel, place, 1)
 
-    def _infos(self, numbers: Array) -> None:
+    def _infos(self, rows: Array) -> None:
         channel = self._topics[INFO]
         messages = self._messages(channel, 0, self._store.count(channel))
-        episodes = np.array([int.from_bytes(body[:4], "little") for _, body in messages], np.int64)
-        self._copy_places(channel, np.flatnonzero(np.isin(episodes, numbers)), numbered=True)
+        numbers = np.array([_NUMBERS.unpack_from(body) for _, body in messages], np.int64).reshape(-1, 2)
+        kept = np.isin(numbers[:, 0], rows["episode"])
+        if self._trims:
+            trimmed = np.array([(n, t.start, t.stop) for n, t in sorted(self._trims.items())], np.int64)
+            places = np.searchsorted(trimmed[:, 0], numbers[:, 0]).clip(max=len(trimmed) - 1)
+            of, starts, stops = trimmed[places].T
+            kept &= (of != numbers[:, 0]) | ((numbers[:, 1] >= starts) & (numbers[:, 1] < stops))
+        self._copy_places(channel, np.flatnonzero(kept), numbered=True)
 
 
 def _places(rows: Any) -> list[int]:
@@ -259,7 +359,7 @@ def _in_order(messages: list[tuple[int, bytes]], places: Sequence[int]) -> list[
     return [messages[i] for i in np.argsort(places, kind="stable").tolist()]
 
 
-def _in_time(messages: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+def _in_time(messages: Iterable[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
     """Times that never decrease (episodes of several sub-environments end out of order)."""
     latest, kept = 0, []
     for log_time, body in messages:

@@ -22,8 +22,8 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
     """The attachment that names the sources of a new recording.
 
     Args:
-        how: "merge", "filter", "map".
-        facts: what else was decided: the query, the function's name.
+        how: "merge", "filter", "map", "trim".
+        facts: what else was decided: the query, the function's name, the steps.
     """
     document = {
         "how": how,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-import uuid
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,13 +11,12 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.edit.copy_episodes import NewValues
 from tupli_mcap.recording.edit.made_of import say_made_of
 from tupli_mcap.recording.edit.replacing import replacing
-from tupli_mcap.recording.edit.rewrite import write
+from tupli_mcap.recording.edit.rewrite import new_metadata, return_of, write
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
@@ -59,21 +56,22 @@ def relabel_recording(
     if not layout.constant:
         raise RecordingError(f"{source.name}: expected values of a fixed size, found some of variable size")
     values = _new_values(source, function, list(fields))
-    metadata = {
-        "uuid": uuid.uuid4().hex,
-        "format_version": source.metadata["format_version"],
-        "library": library(),
-        "created_ns": str(time.time_ns()),
-        "benchmark_id": source.benchmark_id,
-        "next_episode": str(source.file.contents.next_episode),
-    }
     name = (
         f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(function).__name__)}"
     )
     said = say_made_of(sources or [source], "map", function=name, fields=list(fields))
     with replacing(target) as (fd, _):
         container = Container(fd, str(target), "zstd")
-        write(source, container, metadata, None, said, values=values, signed=False, left_out=STATEMENTS)
+        write(
+            source,
+            container,
+            new_metadata(source),
+            None,
+            said,
+            values=values,
+            signed=False,
+            left_out=STATEMENTS,
+        )
 
 
 def _new_values(source: Recording, function: Callable[[Episode], Any], fields: list[str]) -> NewValues:
@@ -101,7 +99,7 @@ def _new_values(source: Recording, function: Callable[[Episode], Any], fields: l
                 column = _checked(by_field[field], leaf, layout, episode, field)
                 columns[channel][leaf.name][first : first + len(episode)] = column
         if "rewards" in fields:
-            returns[episode.number] = _total(layout, by_field["rewards"], len(episode))
+            returns[episode.number] = return_of(layout, by_field["rewards"], len(episode))
     return NewValues(columns, returns)
 
 
@@ -119,10 +117,3 @@ def _checked(made: Any, leaf: Leaf, layout: StepLayout, episode: Episode, field:
     if not np.array_equal(stored.astype(given.dtype), given, equal_nan=given.dtype.kind == "f"):
         raise RecordingError(f"expected {where} that {dtype} holds exactly, found {given.dtype}; cast them")
     return stored
-
-
-def _total(layout: StepLayout, rewards: Any, steps: int) -> float:
-    total = 0.0
-    for i in range(steps):  # in the order in which a recorder adds them
-        total += layout.reward_total(rewards[i])
-    return total

@@ -7,20 +7,32 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tupli_mcap.mcap.container import Container
+from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.carry_runs import carry_runs
-from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, NewValues
+from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, NewValues, Trim
 from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.episode import reward_getter
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
 
-__all__ = ["NewFrames", "camera_channels", "define", "rewrite_recording", "write"]
+__all__ = [
+    "NewFrames",
+    "camera_channels",
+    "define",
+    "new_metadata",
+    "return_of",
+    "rewrite_recording",
+    "write",
+]
 
 
 def rewrite_recording(
@@ -60,6 +72,27 @@ def rewrite_recording(
         write(source, container, metadata, episodes, attachments or {}, frames, signed=same)
 
 
+def new_metadata(source: Recording) -> dict[str, str]:
+    """The metadata of a recording of its own that is made of `source`."""
+    return {
+        "uuid": uuid.uuid4().hex,
+        "format_version": source.metadata["format_version"],
+        "library": library(),
+        "created_ns": str(time.time_ns()),
+        "benchmark_id": source.benchmark_id,
+        "next_episode": str(source.file.contents.next_episode),
+    }
+
+
+def return_of(layout: StepLayout, rewards: Any, steps: int) -> float:
+    """The return of a column of rewards, added up in the order in which a recorder does."""
+    reward = reward_getter(layout.reward_space, rewards)
+    total = 0.0
+    for i in range(steps):
+        total += layout.reward_total(reward(i))
+    return total
+
+
 def write(
     source: Recording,
     container: Container,
@@ -71,6 +104,7 @@ def write(
     signed: bool,
     left_out: Sequence[str] = (),
     values: NewValues | None = None,
+    trims: Mapping[int, Trim] | None = None,
 ) -> int:
     """Writes some of a source's episodes, and its attachments but those `left_out`, to a new recording.
 
@@ -97,7 +131,7 @@ def write(
     cameras = camera_channels(source, container, frames) if source.num_envs else {}
     container.define_channels()
     if source.num_envs:
-        EpisodeCopier(source, target, cameras, frames=frames, values=values).run(rows)
+        EpisodeCopier(source, target, cameras, frames=frames, values=values, trims=trims).run(rows)
     target.finish(now)
     return target.copied
 

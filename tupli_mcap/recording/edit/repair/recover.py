@@ -19,9 +19,9 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.edit.repaired_frames import OldCameras, frames_lost
+from tupli_mcap.recording.edit.repair.frames import OldCameras, frames_lost
+from tupli_mcap.recording.edit.repair.write import RepairWriter
 from tupli_mcap.recording.edit.replacing import replacing, tidy
-from tupli_mcap.recording.edit.write_repaired import RepairWriter
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.add_journal import add_journal

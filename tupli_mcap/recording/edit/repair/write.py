@@ -23,7 +23,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.channels import Channels, register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
-from tupli_mcap.recording.edit.repaired_frames import OldCameras, kept_frames
+from tupli_mcap.recording.edit.repair.frames import OldCameras, kept_frames
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 

@@ -1,0 +1,130 @@
+"""Recordings of which steps at the ends of episodes are left out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import jsonschema
+import numpy as np
+import pytest
+from environments import same
+from test_golden import NAMES, place
+from typer.testing import CliRunner
+
+import tupli_mcap
+from tupli_mcap import RecordEpisodes, Recording, RecordingError, doctor
+from tupli_mcap.cli.app import app
+from tupli_mcap.dataset import DatasetError
+from tupli_mcap.recording import Episode, made_of, verify_recording
+from tupli_mcap.replay.starts import plan_episodes
+
+ROOT = Path(__file__).parents[1]
+
+
+def record(path: Path, seeds: tuple[int | None, ...] = (0, 1, None, None)) -> Path:
+    """Episodes of CartPole, by seed; None goes on with the random stream."""
+    with RecordEpisodes(gym.make("CartPole-v1"), path, name="ppo") as recorded:
+        recorded.action_space.seed(1)
+        for seed in seeds:
+            recorded.reset(seed=seed)
+            ended = False
+            while not ended:
+                _, _, terminal, timeout, _ = recorded.step(recorded.action_space.sample())
+                ended = terminal or timeout
+    return path
+
+
+def steps_of(episode: Episode) -> list[Any]:
+    return [
+        (step.state, step.action, step.reward, step.terminal, step.timeout, step.info) for step in episode
+    ]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_stays_is_what_it_was(name: str, tmp_path: Path) -> None:
+    """Of every kind of recording: values, times, infos and frames of the steps that stay, and the state after them."""
+    before = Recording(place(name, tmp_path))
+    kept = {e.number: slice(1, -1) for e in before.episodes if len(e) >= 3 and e.number % 3 != 1}
+    kept |= {e.number: slice(1, None) for e in before.episodes if len(e) >= 3 and e.number % 3 == 1}
+    report = tupli_mcap.recording.trim_recording(before, tmp_path / "new.mcap", kept)
+    after = Recording(tmp_path / "new.mcap")
+    assert (report.episodes, report.steps) == (len(before), after.num_steps)
+    for old, new in zip(before.episodes, after.episodes, strict=True):
+        start, stop, _ = kept.get(old.number, slice(None)).indices(len(old))
+        assert new.number == old.number
+        assert same(steps_of(new), steps_of(old)[start:stop])
+        whole_end = stop == len(old)
+        assert same(new.final_state, old.final_state if whole_end else old[stop].state)
+        assert new.end == (old.end if whole_end else "interrupted")
+        assert new.seed == (old.seed if start == 0 else None)
+        times = before.read([old.position], fields=["times"]).times
+        np.testing.assert_array_equal(after.read([new.position], fields=["times"]).times, times[start:stop])
+        assert new.start_time == (old.start_time if start == 0 else times[start - 1])
+        assert new.metadata == old.metadata
+        frames = [(s - start, i) for i, s in enumerate(old.frames.steps.tolist()) if start <= s <= stop]
+        assert new.frames.steps.tolist() == [step for step, _ in frames]
+        for i, (_, at) in enumerate(frames):
+            np.testing.assert_array_equal(new.frames[i], old.frames[at])
+    found = verify_recording(tmp_path / "new.mcap")
+    assert found.ok, found.problems
+
+
+def test_says_where_it_comes_from_and_what_no_reset_leads_to(tmp_path: Path) -> None:
+    ds = tupli_mcap.open(record(tmp_path / "r.mcap"))
+    new = ds.trim(
+        lambda e: slice(2 if e.number == 1 else 0, -2 if e.number == 2 else None), tmp_path / "n.mcap"
+    )
+    after = Recording(new)
+    assert [plan.how for plan in plan_episodes(after, captured=False)[0]] == [
+        "seeded", "unknown", "follows", "unknown",
+    ]  # fmt: skip
+    assert after.returns.tolist() == [float(len(episode)) for episode in after]
+    assert [episode.run.name for episode in after] == ["ppo"] * 4
+    said = made_of(after)
+    jsonschema.validate(said, json.loads((ROOT / "schemas" / "made_of.schema.json").read_text()))
+    assert said is not None
+    lengths = [len(episode) for episode in ds]
+    assert said["steps"] == {"1": [2, lengths[1]], "2": [0, lengths[2] - 2]}
+    assert not [finding.check for finding in doctor.examine(new).findings if finding.check == "missing-reset"]
+
+
+def test_of_a_part_of_several_recordings(tmp_path: Path) -> None:
+    paths = [record(tmp_path / f"{i}.mcap") for i in range(2)]
+    ds = tupli_mcap.open(paths).filter("seed == 1")
+    new = tupli_mcap.open(ds.trim(slice(3, -3), tmp_path / "deep" / "n.mcap"))
+    assert [len(episode) for episode in new] == [len(episode) - 6 for episode in ds]
+    said = made_of(Recording(tmp_path / "deep" / "n.mcap"))
+    assert said is not None
+    assert [one["name"] for one in said["sources"]] == ["0.mcap", "1.mcap"]
+
+
+def test_refuses_to_leave_nothing(tmp_path: Path) -> None:
+    source = record(tmp_path / "r.mcap")
+    for steps in (slice(600, None), slice(0, 0), slice(None, None, 2)):
+        with pytest.raises(RecordingError):
+            Recording(source).trim(steps, tmp_path / "n.mcap")
+    with pytest.raises(DatasetError, match="exists"):
+        Recording(source).trim(slice(1, None), source)
+    with pytest.raises(RecordingError, match="the recording itself"):
+        tupli_mcap.recording.trim_recording(Recording(source), source, {0: slice(1, None)}, overwrite=True)
+    with pytest.raises(RecordingError, match="no episode 9"):
+        tupli_mcap.recording.trim_recording(Recording(source), tmp_path / "n.mcap", {9: slice(1, None)})
+    assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
+
+
+def test_command(tmp_path: Path) -> None:
+    source, target = record(tmp_path / "r.mcap"), tmp_path / "n.mcap"
+    words = ["trim", str(source), "--steps", "2:-1", "--episodes", "0,2", "-o", str(target)]
+    steps = Recording(source).num_steps - 6
+    done = CliRunner().invoke(app, [*words, "--dry-run"])
+    assert done.output.split() == f"would write {target}: 4 episodes, {steps:,} steps".split()
+    assert not target.exists()
+    assert f"{steps:,} steps" in CliRunner().invoke(app, words).output
+    assert Recording(target).num_steps == steps
+    assert "exists" in CliRunner().invoke(app, words).output
+    assert CliRunner().invoke(app, [*words, "--force"]).exit_code == 0
+    for wrong in ("2", "a:b", "1:2:3"):
+        assert CliRunner().invoke(app, [*words[:3], wrong, *words[4:]]).exit_code == 2

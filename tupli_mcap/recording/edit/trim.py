@@ -1,0 +1,98 @@
+"""A recording whose episodes begin later or end earlier: everything else of them is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.mcap.container import Container
+from tupli_mcap.recording.edit.copy_episodes import Trim
+from tupli_mcap.recording.edit.made_of import say_made_of
+from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.rewrite import new_metadata, return_of, write
+from tupli_mcap.recording.episode import Episode
+from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.signature_file import STATEMENTS
+from tupli_mcap.recording.write.rows.variable import final_encoder
+
+__all__ = ["TrimReport", "trim_recording"]
+
+
+class TrimReport(NamedTuple):
+    """What trimming wrote, or would write; `left_out` counts steps, `size` bytes, 0 where nothing was written."""
+
+    path: Path
+    episodes: int
+    steps: int
+    left_out: int
+    size: int = 0
+
+
+def trim_recording(
+    source: Recording,
+    target: Path,
+    steps: Mapping[int, slice],
+    *,
+    sources: Sequence[Recording] = (),
+    overwrite: bool = False,
+    dry_run: bool = False,
+) -> TrimReport:
+    """Writes `target` with only some consecutive steps of some episodes.
+
+    An episode that loses its end ends as interrupted, and the state that followed is its final state. One that loses
+    its beginning has no seed, no options and no reset info, because no reset leads to its first state. Steps are
+    counted anew, and returns are those of the steps that stay; metadata and annotations stay. The recording has a UUID
+    of its own, and no signature.
+
+    Args:
+        steps: by number of the episode, which steps stay; other episodes stay whole.
+        sources: what the recording is made of, where that is not `source`.
+
+    Raises:
+        RecordingError: there is no such episode, none of its steps would stay, or they are not consecutive; the target
+            exists (and not `overwrite`), or cannot be written.
+    """
+    if target.exists() and not overwrite:
+        raise RecordingError(f"{target} exists; choose another path, or overwrite it")
+    if target.exists() and source.path is not None and target.samefile(source.path):
+        raise RecordingError(f"{target} is the recording itself; write to another path")
+    by_number = {episode.number: episode for episode in source.episodes}
+    unknown = sorted(set(steps) - set(by_number))
+    if unknown:
+        raise RecordingError(f"{source.name}: there is no episode {unknown[0]}")
+    trims: dict[int, Trim] = {}
+    for number, kept in steps.items():
+        trim = _trim(source, by_number[number], kept)
+        if trim is not None:
+            trims[number] = trim
+    left_out = sum(len(by_number[number]) - (trim.stop - trim.start) for number, trim in trims.items())
+    counts = {str(number): [trim.start, trim.stop] for number, trim in trims.items()}
+    report = TrimReport(target, len(source), source.num_steps - left_out, left_out)
+    if dry_run:
+        return report
+    said = say_made_of(sources or [source], "trim", steps=counts)
+    with replacing(target) as (fd, _):
+        container = Container(fd, str(target), "zstd")
+        metadata = new_metadata(source)
+        write(source, container, metadata, None, said, trims=trims, signed=False, left_out=STATEMENTS)
+    return report._replace(size=target.stat().st_size)
+
+
+def _trim(source: Recording, episode: Episode, kept: slice) -> Trim | None:
+    """None where all steps stay."""
+    start, stop, stride = kept.indices(len(episode))
+    if stride != 1:
+        raise RecordingError(f"expected consecutive steps, found a stride of {stride}")
+    if stop <= start:
+        raise RecordingError(
+            f"{source.name}: no step of episode {episode.number} would stay, which has {len(episode)}; "
+            "leave it out, or keep more"
+        )
+    if (start, stop) == (0, len(episode)):
+        return None
+    layout = source.layout
+    total = return_of(layout, episode[start:stop].rewards, stop - start)
+    final = None if stop == len(episode) else final_encoder(layout)(episode[stop].state)
+    return Trim(start, stop, total, final)
