@@ -213,6 +213,8 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "tag": edit.tag,
         "edit": edit.edit,
         "filter": edit.filter_,
+        "delete": storage.delete,
+        "restore": storage.restore,
         "trim": edit.trim,
         "merge": edit.merge,
         "split": edit.split,
@@ -263,6 +265,8 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning"),
     "verify": ("verify run.mcap", "verify run.mcap --rerun --episodes 0,4,10-19"),
     "filter": ("filter run.mcap 'return > 100 and metadata.success' -o good.mcap",),
+    "delete": ("delete run.mcap --episodes 3,7", "delete lab/ --filter 'return < 10' --dry-run"),
+    "restore": ("restore run.mcap", "restore run.mcap --episodes 3"),
     "trim": (
         "trim run.mcap --steps 10:-5 -o trimmed.mcap",
         "trim run.mcap --episodes 3 --steps :200 -o trimmed.mcap",

@@ -1,7 +1,8 @@
-"""Commands on storages: list-benchmarks, list-artifacts, list-episodes, compact, reindex."""
+"""Commands on storages: delete, restore, compact, list-benchmarks, list-artifacts, list-episodes, reindex."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -27,8 +28,9 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import say, terminal_width
+from tupli_mcap.errors import RecordingError
 
-__all__ = ["compact", "list_artifacts", "list_benchmarks", "list_episodes", "reindex"]
+__all__ = ["compact", "delete", "list_artifacts", "list_benchmarks", "list_episodes", "reindex", "restore"]
 
 _ROOMY = 100  # columns of a terminal on which benchmarks and their environments fit side by side
 
@@ -105,6 +107,92 @@ def list_episodes(
     with open_storage(storage_path) as storage:
         headers = storage.list_episodes(filter_of(filter_text), limit=limit)
     print_episodes(headers, as_json=as_json)
+
+
+_Paths = Annotated[
+    list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", readable=False)
+]
+_Chosen = Annotated[
+    str | None, typer.Option("--episodes", "--episode", metavar="3,7", help="Numbers, best, last, …")
+]
+_DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say how many there are.")]
+
+
+def delete(
+    paths: _Paths,
+    episodes: _Chosen = None,
+    filter_text: FilterText = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Remove a recording of which nothing is left.")
+    ] = False,
+    dry_run: _DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Delete episodes, so that restore brings them back.
+
+    compact frees their space. A note beside the recording (FILE.json) says that they are gone; the recording itself is not touched. Who copies
+    the recording alone copies them too, unless it was compacted.
+    """
+    from tupli_mcap.dataset.which import candidates, named_positions
+    from tupli_mcap.recording import Recording
+    from tupli_mcap.schema import FilterIN
+    from tupli_mcap.storage.listing import find_recordings
+    from tupli_mcap.storage.sidecar import storage_of
+
+    if episodes is None and filter_text is None:
+        raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
+    wanted = filter_of(filter_text)
+    doomed: dict[Path, list[str]] = {}
+    for path in (file for given in paths for file in find_recordings(given)):
+        with Recording(path) as recording:
+            among = candidates(recording, wanted)
+            positions = among if episodes is None else named_positions(recording, among, episodes, wanted)
+            if len(positions) and len(positions) == len(candidates(recording)) and not force:
+                raise RecordingError(
+                    f"{path}: every episode would be deleted, and the file with them, which nothing brings back; "
+                    "choose fewer, or remove it with --force"
+                )
+            ids = [recording.episodes[position].id for position in positions]
+        doomed.setdefault(storage_of(path.absolute()), []).extend(ids)
+    count = sum(map(len, doomed.values()))
+    for root, ids in doomed.items():
+        if ids and not dry_run:
+            with open_storage(root) as storage:
+                storage.delete_episodes(FilterIN(key="id", value=ids))
+    if as_json:
+        print_json({"dry_run": dry_run, "episodes": [one for ids in doomed.values() for one in ids]})
+        return
+    say(f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}")
+
+
+def restore(paths: _Paths, episodes: _Chosen = None, dry_run: _DryRun = False, as_json: Json = False) -> None:
+    """Bring deleted episodes back, by default all.
+
+    Those that compact has freed the space of are gone.
+    """
+    from tupli_mcap.recording.recover.prefix import metadata_at
+    from tupli_mcap.storage.listing import find_recordings
+    from tupli_mcap.storage.sidecar import storage_of
+
+    numbers = None if episodes is None else {word.strip() for word in episodes.split(",")}
+    restored: list[str] = []
+    by_root: dict[Path, set[str]] = {}
+    for file in (file for given in paths for file in find_recordings(given)):
+        by_root.setdefault(storage_of(file.absolute()), set()).add(metadata_at(file)["uuid"])
+    for root, uuids in by_root.items():
+        with open_storage(root) as storage:
+            chosen = []
+            for one in storage.deleted_episodes():
+                uuid, _, found = one.partition("-")
+                if uuid in uuids and (numbers is None or found in numbers):
+                    chosen.append(one)
+            if not dry_run:
+                storage.restore_episodes(chosen)
+            restored += chosen
+    if as_json:
+        print_json({"dry_run": dry_run, "episodes": restored})
+        return
+    say(f"{'would restore' if dry_run else 'restored'} {counted(len(restored), 'episode')}")
 
 
 def compact(

@@ -245,6 +245,20 @@ class FileStorage(TupliStorage):
     def delete_episodes(self, filter: BaseFilter) -> int:
         return self._recordings.delete(self._recordings.headers(filter))
 
+    def deleted_episodes(self) -> list[str]:
+        """The ids of the episodes that are deleted, as long as `compact` has not freed their space.
+
+        Where no episode of a recording was left, it was removed, and nothing of it can be restored.
+        """
+        return self._recordings.deleted()
+
+    def restore_episodes(self, ids: Iterable[str] | None = None) -> int:
+        """Takes back the deletion of episodes, by default of all that `deleted_episodes` names; returns how many.
+
+        Ids of others are ignored.
+        """
+        return self._recordings.restore(set(self._recordings.deleted() if ids is None else ids))
+
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:
         self._recordings.publish(self._recordings.header(uri), publish_in)
 

@@ -10,7 +10,7 @@ import re
 import secrets
 import stat
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -397,6 +397,36 @@ class RecordingFiles:
                 ).write(self._root)
             self._do_deletion(doomed)
         return sum(len(note.deleted) for note in doomed.values())
+
+    def deleted(self) -> list[str]:
+        """The ids of the episodes that are deleted and still in their recordings."""
+        found = []
+        for item in sorted(scan(self._root)):
+            notes = Notes.read(self._root / item.relative, self._root)
+            if notes.deleted:
+                with Recording(self._root / item.relative) as recording:
+                    numbers = notes.about(recording.metadata).deleted & set(
+                        recording.index["episode"].tolist()
+                    )
+                    found += [episode_id(recording.uuid, number) for number in sorted(numbers)]
+        return found
+
+    def restore(self, ids: Collection[str]) -> int:
+        """Take back what is noted of deleted episodes; returns how many there were."""
+        restored = 0
+        with self._lock:
+            self._finish_deletion()
+            for item in sorted(scan(self._root)):
+                path = self._root / item.relative
+                notes = Notes.read(path, self._root)
+                if notes.deleted:
+                    sidecar = notes.about(metadata_at(path))
+                    back = {n for n in sidecar.deleted if episode_id(sidecar.uuid, n) in ids}
+                    if back:
+                        sidecar.deleted -= back
+                        sidecar.write(path)  # the next query notices
+                        restored += len(back)
+        return restored
 
     def _finish_deletion(self) -> None:
         """Do what is left of a deletion that was broken off; only recordings that are listed are touched."""

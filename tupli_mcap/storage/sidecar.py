@@ -33,7 +33,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.storage.atomic import os_errors, write_bytes
 from tupli_mcap.storage.texts import escape_text, first_defect, unescape_text
 
-__all__ = ["Deletion", "Notes", "Sidecar", "sidecar_path"]
+__all__ = ["Deletion", "Notes", "Sidecar", "sidecar_path", "storage_of"]
 
 DELETING = "deleting.json"
 EpisodeNumber = Annotated[int, Field(ge=0, lt=1 << 32)]
@@ -157,7 +157,7 @@ class Notes(NamedTuple):
             FormatError: A file with notes holds something else.
         """
         recording = recording.absolute()
-        root = _storage_of(recording) if root is None else root.absolute()
+        root = storage_of(recording) if root is None else root.absolute()
         # first: who finishes it notes everything beside the recordings before he removes it
         deleting = Deletion.read(root).of(recording.relative_to(root).as_posix())
         return cls(deleting, Sidecar.read(recording))
@@ -187,7 +187,7 @@ def _content(path: Path) -> tuple[bytes | None, int]:
             return None, 0
 
 
-def _storage_of(recording: Path) -> Path:
+def storage_of(recording: Path) -> Path:
     """The directory of the storage that a recording seems to be in: it lies there, or below `recordings/<id>`."""
     above = recording.parent.parent
     return above.parent if above.name == "recordings" else recording.parent

@@ -1,0 +1,87 @@
+"""Episodes that are deleted and brought back, in files, directories and storages."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from typer.testing import CliRunner
+
+import tupli_mcap
+from tupli_mcap import FileStorage, RecordEpisodes, Recording
+from tupli_mcap.cli.app import app
+
+
+def record(path: Path, episodes: int = 4) -> Path:
+    with RecordEpisodes(gym.make("CartPole-v1", max_episode_steps=3), path) as recorded:
+        for seed in range(episodes):
+            recorded.reset(seed=seed)
+            for _ in range(3):
+                recorded.step(0)
+    return path
+
+
+def run(*words: str, code: int = 0) -> str:
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    for name in ("a", "deep/b"):
+        record(tmp_path / "runs" / f"{name}.mcap")
+    return tmp_path / "runs"
+
+
+def seeds(path: Path) -> list[int | None]:
+    return [episode.seed for episode in tupli_mcap.open(path)]
+
+
+def test_of_a_file_and_back(runs: Path) -> None:
+    file = runs / "a.mcap"
+    before = file.read_bytes()
+    assert "would delete 2 episodes" in run("delete", str(file), "--episodes", "1,last", "--dry-run")
+    assert seeds(file) == [0, 1, 2, 3]
+    assert "deleted 2 episodes" in run("delete", str(file), "--episodes", "1,last")
+    assert seeds(file) == [0, 2]
+    assert file.read_bytes() == before
+    assert seeds(runs) == [0, 2, 0, 1, 2, 3]
+    run("delete", str(file), "--episodes", "1", code=1)  # it is not there any more
+    assert "would restore 2 episodes" in run("restore", str(runs), "--dry-run")
+    assert "restored 1 episode" in run("restore", str(file), "--episodes", "3")
+    assert seeds(file) == [0, 2, 3]
+    assert json.loads(run("restore", str(runs), "--json"))["episodes"] == [f"{Recording(file).uuid}-1"]
+    assert seeds(file) == [0, 1, 2, 3]
+    assert sorted(path.name for path in runs.rglob("[!.]*")) == ["a.mcap", "b.mcap", "deep"]
+
+
+def test_of_a_directory_by_filter(runs: Path) -> None:
+    assert "deleted 4 episodes" in run("delete", str(runs), "--filter", "seed >= 2")
+    assert seeds(runs) == [0, 1, 0, 1]
+    storage = FileStorage(runs)
+    assert len(storage.deleted_episodes()) == 4
+    assert storage.restore_episodes(storage.deleted_episodes()[:1]) == 1
+    assert storage.restore_episodes(["nobody-1"]) == 0
+    run("compact", "--storage", str(runs))
+    assert storage.deleted_episodes() == []
+    assert storage.restore_episodes() == 0
+    assert seeds(runs) == [0, 1, 2, 0, 1]
+
+
+def test_never_a_whole_recording_by_the_way(runs: Path) -> None:
+    assert "nothing brings back" in run("delete", str(runs), "--filter", "steps > 0", code=1)
+    assert seeds(runs) == [0, 1, 2, 3] * 2
+    assert "say which" in run("delete", str(runs), code=2)
+    run("delete", str(runs / "a.mcap"), "--episodes", "all", "--force")
+    assert [path.name for path in runs.rglob("*.mcap")] == ["b.mcap"]
+
+
+def test_another_recording_of_the_same_name_loses_nothing(runs: Path) -> None:
+    run("delete", str(runs / "a.mcap"), "--episodes", "0")
+    (runs / "a.mcap").unlink()
+    record(runs / "a.mcap", episodes=2)
+    assert "restored 0 episodes" in run("restore", str(runs / "a.mcap"))
+    assert seeds(runs / "a.mcap") == [0, 1]
