@@ -130,8 +130,8 @@ def delete(
 ) -> None:
     """Delete episodes, so that restore brings them back.
 
-    compact frees their space. A note beside the recording (FILE.json) says that they are gone; the recording itself is not touched. Who copies
-    the recording alone copies them too, unless it was compacted.
+    compact frees their space. A note beside the recording (FILE.json) says that they are gone; the recording itself
+    is not touched. Who copies the recording alone copies them too, unless it was compacted.
     """
     from tupli_mcap.dataset.which import candidates, named_positions
     from tupli_mcap.recording import Recording
