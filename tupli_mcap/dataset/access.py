@@ -8,7 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.dataset.items import DeltaWindows, Pad, SamplingError, Steps, Transitions, Unit, Windows
+from tupli_mcap.dataset.items import (
+    INFOS,
+    DeltaWindows,
+    Pad,
+    SamplingError,
+    Steps,
+    StepsWithInfos,
+    Transitions,
+    Unit,
+    Windows,
+    info_columns,
+)
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.dataset.items.windows import FIVE
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate
@@ -46,12 +57,15 @@ class RandomAccess:
     ) -> Windows:
         """Sub-trajectories of `length` steps that never cross episodes, nor the cuts of a tuple filter.
 
-        See `Windows`: an index gives one window, an array of numbers gives a batch of them.
+        See `Windows`: an index gives one window, an array of numbers gives a batch of them. The fields "infos", for all
+        keys, and "infos.<key>" give a dict of columns by key; all of them are put into memory. Numbers are arrays, with
+        NaN where a step has no such info.
 
         Raises:
             SamplingError: no episode is long enough, or the arguments mean nothing.
         """
-        made = Windows(self.steps, length, stride, pad, history, fields=fields)
+        steps, fields = self._with_infos(fields)
+        made = Windows(steps, length, stride, pad, history, fields=fields)
         return made.of_episodes(self._values_now())
 
     def transitions(
@@ -59,12 +73,30 @@ class RandomAccess:
     ) -> Transitions:
         """The transition (s, a, r, s') that starts at each step, by its number; an array of numbers gives a batch.
 
-        See `Transitions` for several steps, and `Transition` for what to bootstrap with.
+        See `Transitions` for several steps, and `Transition` for what to bootstrap with. Fields are those of
+        `Transition`; "infos" and "infos.<key>" are as for `windows`.
 
         Raises:
             SamplingError: the dataset is empty, or the arguments mean nothing.
         """
-        return Transitions(self.steps, n_step, discount, fields=fields).of_episodes(self._values_now())
+        steps, fields = self._with_infos(fields)
+        return Transitions(steps, n_step, discount, fields=fields).of_episodes(self._values_now())
+
+    def _with_infos(self, fields: Sequence[str]) -> tuple[Steps, Sequence[str]]:
+        """The steps, and the names of what is read of them; infos are put into memory where a field names them."""
+        given = list(fields) if isinstance(fields, Sequence) and not isinstance(fields, str) else [fields]
+        keys = [name for name in given if isinstance(name, str) and name.partition(".")[0] == INFOS]
+        if not keys:
+            return self.steps, fields
+        wanted = None if INFOS in keys else [name.partition(".")[2] for name in keys]
+        columns = info_columns(self._infos(), wanted)
+        return StepsWithInfos(self.steps, columns), [name for name in given if name not in keys] + [INFOS]
+
+    def _infos(self) -> Sequence[Mapping[str, Any]]:
+        """The info of each step."""
+        raise SamplingError(
+            "infos are read out of recordings; open these with tupli_mcap.open, and take windows of that"
+        )
 
     def episode_values(self, expression: F | BaseFilter) -> np.ndarray[Any, np.dtype[np.float64]]:
         """The number that each episode has at a key, such as `F("metadata.score")`; of a filter, 1 where it is true,

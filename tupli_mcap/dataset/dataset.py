@@ -387,6 +387,10 @@ class Dataset(RandomAccess):
             )
         return self._steps
 
+    def _infos(self) -> Sequence[Mapping[str, Any]]:
+        infos: Sequence[Mapping[str, Any]] = self.read(["infos"]).infos
+        return infos
+
     def _step_seconds(self) -> float | None:
         names = dict.fromkeys(header.recording for header in self.headers)
         known = {self._recordings.get(name).labels.step_seconds for name in names}

@@ -233,6 +233,8 @@ class SavedColumns(RandomAccess):
 class SavedSteps:
     """The steps of saved columns, by number (see `Steps`): rows of arrays that are mapped into memory."""
 
+    fields: tuple[str, ...] = FIELDS
+
     def __init__(
         self, directory: Path, layout: StepLayout, identity: str, arrays: Mapping[str, Array]
     ) -> None:

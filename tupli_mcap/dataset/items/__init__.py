@@ -1,6 +1,7 @@
 """Steps by number, and what is made of them: windows, transitions, the values around a step.
 
 steps                          what all of these read from; steps in memory
+infos                          steps with their infos as columns
 recorded, index, kept          steps read out of recordings; where they lie; those kept decoded
 items                          what windows, transitions and delta windows have in common
 windows, transitions, deltas   the three kinds of items
@@ -12,6 +13,7 @@ from tupli_mcap.dataset.items.batches import Batches
 from tupli_mcap.dataset.items.deltas import DeltaWindow, DeltaWindows, Unit
 from tupli_mcap.dataset.items.draws import Sampler
 from tupli_mcap.dataset.items.index import ListedEpisodes
+from tupli_mcap.dataset.items.infos import INFOS, StepsWithInfos, info_columns
 from tupli_mcap.dataset.items.items import Items
 from tupli_mcap.dataset.items.order import Numbers, Order
 from tupli_mcap.dataset.items.recorded import RecordedSteps, steps_of
@@ -21,6 +23,7 @@ from tupli_mcap.dataset.items.windows import Pad, Window, Windows
 
 __all__ = [
     "FIELDS",
+    "INFOS",
     "Batches",
     "DeltaWindow",
     "DeltaWindows",
@@ -34,10 +37,12 @@ __all__ = [
     "Sampler",
     "SamplingError",
     "Steps",
+    "StepsWithInfos",
     "Transition",
     "Transitions",
     "Unit",
     "Window",
     "Windows",
+    "info_columns",
     "steps_of",
 ]

@@ -13,7 +13,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.index import ListedEpisodes, OpenFiles, StepIndex
 from tupli_mcap.dataset.items.kept import NumberedRows
-from tupli_mcap.dataset.items.steps import SamplingError, checked_fields, rows_of_runs
+from tupli_mcap.dataset.items.steps import FIELDS, SamplingError, checked_fields, rows_of_runs
 from tupli_mcap.errors import FormatError, memory_for
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
@@ -45,6 +45,8 @@ class RecordedSteps:
         SpaceError: two recordings do not fit into one array.
         NotFoundError: an episode is not in its recording any more.
     """
+
+    fields: tuple[str, ...] = FIELDS
 
     def __init__(
         self,

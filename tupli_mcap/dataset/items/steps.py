@@ -41,6 +41,7 @@ class Steps(Protocol):
     """The wanted steps of a query, numbered 0 to n - 1, episode after episode in the query's order.
 
     Attributes:
+        fields: what `read` knows.
         layout: says how columns nest, and of which leaves they are; None where there is no step.
         episode_lengths: int64, the wanted steps of each episode; may be 0.
         breaks: int64, ascending: the steps that are not followed by their own episode's next step, that is the last
@@ -49,6 +50,7 @@ class Steps(Protocol):
         identity: a digest of which steps these are; the same for the same steps, however they are read.
     """
 
+    fields: tuple[str, ...]
     layout: StepLayout | None
     episode_lengths: Array
     breaks: Array
@@ -89,6 +91,7 @@ class MemorySteps:
     def __init__(self, columns: Mapping[str, Any], rest: Steps) -> None:
         self._columns = dict(columns)
         self._rest = rest
+        self.fields = rest.fields
         self.layout = rest.layout
         self.episode_lengths, self.breaks = rest.episode_lengths, rest.breaks
         self.open_ends, self.identity = rest.open_ends, rest.identity

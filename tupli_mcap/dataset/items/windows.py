@@ -11,7 +11,6 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.items import Items, Parts
 from tupli_mcap.dataset.items.steps import (
-    FIELDS,
     SamplingError,
     Steps,
     checked_count,
@@ -33,6 +32,7 @@ class Window(Parts):
     They are nested as the space is; values that differ in size are in a list (of B lists). `mask` (bool, (B, T)) is
     False where there was no step and the columns are filled up. `steps` (int64, (B,)) is the number of the step the
     window starts at (its history lies before), `episodes` (int64, (B,)) the place of its episode in the query.
+    `infos` is a dict of columns by key.
     """
 
     mask: Array
@@ -45,6 +45,7 @@ class Window(Parts):
     timeouts: Any = None
     next_states: Any = None
     times: Any = None
+    infos: Any = None
 
 
 class Windows(Items[Window]):
@@ -75,7 +76,7 @@ class Windows(Items[Window]):
         if pad not in PADS:
             raise SamplingError(f"expected pad to be one of {', '.join(map(repr, PADS))}, found {pad!r:.80}")
         self.pad = pad
-        self.fields = tuple(checked_fields(fields))
+        self.fields = tuple(checked_fields(fields, steps.fields))
         self._lasts = steps.breaks
         self._firsts = np.concatenate([[0], self._lasts[:-1] + 1])
         sizes = self._lasts - self._firsts + 1
@@ -118,7 +119,10 @@ class Windows(Items[Window]):
         found = self._read(items)
         shape = found["mask"].shape
         return Window(
-            **{name: shaped_rows(part, shape) if name in FIELDS else part for name, part in found.items()}
+            **{
+                name: shaped_rows(part, shape) if name in self.fields else part
+                for name, part in found.items()
+            }
         )
 
     def _read(self, items: Array) -> dict[str, Any]:
