@@ -41,14 +41,14 @@ def test_of_windows(dataset: tupli_mcap.Dataset) -> None:
     assert batch.infos["force"].dtype == np.float32
     assert batch.infos["name"] == [["at 1", "at 2"], ["at 2", "at 3"]]
     np.testing.assert_array_equal(batch.infos["rare"], [[np.nan, np.nan], [np.nan, 1.5]])
-    one = dataset.windows(2, history=1, pad="zero", fields="infos.force")[0]
+    one = dataset.windows(2, history=1, pad="zero", fields="info.force")[0]
     assert set(one.infos) == {"force"}
     np.testing.assert_array_equal(one.infos["force"], [[0, 0], [1, -1], [2, -2]])
     assert one.states is None
 
 
 def test_of_transitions(dataset: tupli_mcap.Dataset) -> None:
-    items = dataset.sort("seed", descending=True).head(2).transitions(2, fields=["rewards", "infos.step"])
+    items = dataset.sort("seed", descending=True).head(2).transitions(2, fields=["rewards", "info.step"])
     assert items[:].infos["step"].tolist() == [1, 2, 3, 4, 5] * 2
     assert items[3].infos["step"] == 4
 
@@ -56,7 +56,7 @@ def test_of_transitions(dataset: tupli_mcap.Dataset) -> None:
 @pytest.mark.parametrize("workers", [0, 1])
 def test_of_a_loader(dataset: tupli_mcap.Dataset, workers: int) -> None:
     torch = pytest.importorskip("torch", reason="PyTorch is not installed")
-    fields = ["states", "infos.step", "infos.force"]
+    fields = ["states", "info.step", "infos.force"]
     loader = dataset.loader(3, batch_size=4, seed=1, num_workers=workers, fields=fields)
     batches = list(loader)
     assert sum(len(batch["states"]) for batch in batches) == 9
@@ -72,4 +72,4 @@ def test_says_what_there_is(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None
     with pytest.raises(SamplingError, match=r"tupli_mcap\.open"):
         TupliDataset(tmp_path).windows(2, fields=["infos"])
     with pytest.raises(SamplingError, match="expected fields"):
-        dataset.transitions(fields=["info"])
+        dataset.transitions(fields=["inform"])

@@ -10,11 +10,12 @@ import gymnasium as gym
 import jsonschema
 import numpy as np
 import pytest
+from environments import Sampler, same
 from gymnasium import spaces
 from typer.testing import CliRunner
 
 import tupli_mcap
-from tupli_mcap import RecordEpisodes, Recording, RecordingError
+from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
 from tupli_mcap.recording import made_of, merge_recordings, say_made_of, verify_recording
@@ -111,6 +112,30 @@ def test_of_a_vector_environment_with_a_dict_of_actions(tmp_path: Path) -> None:
     np.testing.assert_array_equal(after.actions["grip"], before.actions["grip"])
     np.testing.assert_array_equal(after.states, before.states)
     assert verify_recording(new).ok
+
+
+def test_of_steps_that_differ_in_size(tmp_path: Path) -> None:
+    space = spaces.Dict(
+        note=spaces.Text(30), see=spaces.Box(0, 255, (4, 4, 3), np.uint8), x=spaces.Box(-1, 1, (2,))
+    )
+    actions = spaces.Tuple([spaces.Text(9), spaces.Discrete(3)])
+    source = record(tmp_path / "r.mcap", env=Sampler(space, actions))
+    before = tupli_mcap.open(source)
+    new = before.map(lambda episode: np.arange(len(episode)) * 2.0, tmp_path / "rewards.mcap")
+    after = tupli_mcap.open(new)
+    np.testing.assert_array_equal(after[1].rewards, np.arange(7) * 2.0)
+    assert after.returns.tolist() == [42.0] * 4
+    assert same(after.read().states, before.read().states)
+    assert same(after.read().actions, before.read().actions)
+    assert verify_recording(new).ok
+    named = before.map(lambda e: (["left"] * len(e), e.actions[1]), tmp_path / "a.mcap", fields=["actions"])
+    assert set(tupli_mcap.open(named).read().actions[0]) == {"left"}
+    assert same(tupli_mcap.open(named).read().actions[1], before.read().actions[1])
+    with pytest.raises(StepError):
+        before.map(lambda e: ([5] * len(e), e.actions[1]), tmp_path / "b.mcap", fields=["actions"])
+    with pytest.raises(RecordingError, match="expected 7 actions"):
+        before.map(lambda e: (["left"], e.actions[1]), tmp_path / "b.mcap", fields=["actions"])
+    assert not (tmp_path / "b.mcap").exists()
 
 
 @pytest.mark.parametrize(

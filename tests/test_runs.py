@@ -249,8 +249,27 @@ class TestRun:
             _ = recording.run
         assert not verify_recording(path).ok
 
+    def test_with_paths_in_its_metadata(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap", metadata={"out": Path("a/b"), "more": [{"in": Path("c")}]})
+        assert Recording(path).run.metadata == {"out": "a/b", "more": [{"in": "c"}]}
+
 
 class TestAnnotations:
+    def test_a_dataset_sees_those_that_were_made_through_it(self, tmp_path: Path) -> None:
+        ds = tupli_mcap.open(record(tmp_path / "r.mcap"))
+        best = ds.sort("return").head(1)
+        best[0].annotate(good=True)
+        assert [episode.id for episode in ds.filter("metadata.good")] == [best[0].id]
+        assert len(best.filter("metadata.good")) == 1
+
+    @pytest.mark.parametrize(
+        ("word", "value"), [("True", True), ("false", False), ("1e3", 1000.0), ("yes", "yes")]
+    )
+    def test_of_the_command_line(self, word: str, value: Any, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap")
+        assert json.dumps(value) in command("tag", str(path), f"good={word}", "--episode", "0")
+        assert Recording(path).episodes[0].metadata["good"] is value or value not in (True, False)
+
     def test_count_more_than_what_was_recorded(self, tmp_path: Path) -> None:
         class Callback(tupli_mcap.EpisodeMetadataCallback):
             def reset(self) -> None: ...

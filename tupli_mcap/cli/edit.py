@@ -109,6 +109,7 @@ def tag(
     it and when is kept. A signature is left out.
     """
     from tupli_mcap.dataset.which import choose_episodes
+    from tupli_mcap.jsonvalue import dumps_any
     from tupli_mcap.recording import Recording, annotate_episodes, undo_annotation
 
     paths = [Path(text) for text in files if "=" not in text]
@@ -117,7 +118,7 @@ def tag(
         raise typer.BadParameter(
             "give recordings, and KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 success=true"
         )
-    wanted, done = filter_of(filter_text), []
+    wanted, done = filter_of(filter_text), list[dict[str, Any]]()
     for path in paths:
         if undo:
             last = undo_annotation(path, dry_run=dry_run)
@@ -132,9 +133,10 @@ def tag(
         return
     for one in done:
         would = "would be " if dry_run else ""
-        say(
-            f"{one['path']}: {counted(len(one['episodes']), 'episode')} {would}{'undone' if undo else 'annotated'}"
-        )
+        said = one["undone" if undo else "values"]
+        shown = ", ".join(f"{key}={'' if value is None else dumps_any(value)}" for key, value in said.items())
+        count = counted(len(one["episodes"]), "episode")
+        say(f"{one['path']}: {count} {would}{'undone' if undo else 'annotated'}: {shown}")
 
 
 def edit(

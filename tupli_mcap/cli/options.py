@@ -41,7 +41,8 @@ def filter_of(text: str | None) -> BaseFilter | None:
 
 
 def pair_of(text: str) -> tuple[str, Any]:
-    """KEY=VALUE; the value is None where there is none, JSON where it looks like it, else a text."""
+    """KEY=VALUE; the value is None where there is none, JSON or Python's True or False where it looks like that, else a
+    text."""
     from tupli_mcap import jsonvalue
     from tupli_mcap.errors import FormatError
 
@@ -50,6 +51,8 @@ def pair_of(text: str) -> tuple[str, Any]:
         raise typer.BadParameter(f"expected KEY=VALUE, found {text!r}")
     if not value:
         return key, None
+    if value in ("True", "False"):
+        return key, value == "True"
     try:
         return key, jsonvalue.loads(value)
     except (FormatError, ValueError, RecursionError):

@@ -58,7 +58,7 @@ class RandomAccess:
         """Sub-trajectories of `length` steps that never cross episodes, nor the cuts of a tuple filter.
 
         See `Windows`: an index gives one window, an array of numbers gives a batch of them. The fields "infos", for all
-        keys, and "infos.<key>" give a dict of columns by key; all of them are put into memory. Numbers are arrays, with
+        keys, and "info.<key>" give a dict of columns by key; all of them are put into memory. Numbers are arrays, with
         NaN where a step has no such info.
 
         Raises:
@@ -74,7 +74,7 @@ class RandomAccess:
         """The transition (s, a, r, s') that starts at each step, by its number; an array of numbers gives a batch.
 
         See `Transitions` for several steps, and `Transition` for what to bootstrap with. Fields are those of
-        `Transition`; "infos" and "infos.<key>" are as for `windows`.
+        `Transition`; "infos" and "info.<key>" are as for `windows`.
 
         Raises:
             SamplingError: the dataset is empty, or the arguments mean nothing.
@@ -85,11 +85,11 @@ class RandomAccess:
     def _with_infos(self, fields: Sequence[str]) -> tuple[Steps, Sequence[str]]:
         """The steps, and the names of what is read of them; infos are put into memory where a field names them."""
         given = list(fields) if isinstance(fields, Sequence) and not isinstance(fields, str) else [fields]
-        keys = [name for name in given if isinstance(name, str) and name.partition(".")[0] == INFOS]
+        keys = [name for name in given if isinstance(name, str) and name.partition(".")[0] in (INFOS, "info")]
         if not keys:
             return self.steps, fields
-        wanted = None if INFOS in keys else [name.partition(".")[2] for name in keys]
-        columns = info_columns(self._infos(), wanted)
+        wanted = [name.partition(".")[2] for name in keys]
+        columns = info_columns(self._infos(), wanted if all(wanted) else None)
         return StepsWithInfos(self.steps, columns), [name for name in given if name not in keys] + [INFOS]
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:

@@ -199,6 +199,7 @@ class Dataset(RandomAccess):
         recording = self._recordings.get(header.recording)
         position = int(np.searchsorted(recording.index["episode"], header.episode))
         episode = recording.episodes[position]
+        episode.listed = header
         if episode.number != header.episode:
             raise DatasetError(f"{header.recording} has no episode {header.episode} any more; open it again")
         return episode
@@ -498,8 +499,9 @@ class Dataset(RandomAccess):
 
         Raises:
             DatasetError: there is no episode, or the target exists (and not `overwrite`).
-            RecordingError: the function gives something else than the recording's dtype holds exactly; values are of
-                variable size; or the target cannot be written.
+            RecordingError: the function gives something else than the recording's dtype holds exactly, or the target
+                cannot be written.
+            StepError: a value of variable size is none of its space.
         """
         return curate.relabel(self, function, Path(target), fields, overwrite=overwrite)
 

@@ -56,6 +56,8 @@ def _episode_columns(dataset: Dataset) -> dict[str, Any]:
     columns: dict[str, Any] = {
         "id": [header.id for header in headers],
         "episode": np.arange(len(headers)),  # as in the table of steps
+        "run": [header.run.get("name", "") for header in headers],
+        "split": [header.run.get("split", "") for header in headers],
         "recording": [header.recording for header in headers],
         "number": np.array([header.episode for header in headers], np.int64),
         "env": np.array([header.env for header in headers], np.int64),
@@ -66,6 +68,7 @@ def _episode_columns(dataset: Dataset) -> dict[str, Any]:
         "ended": np.array([header.created_at.removesuffix("+00:00") for header in headers], "datetime64[ns]"),
         "benchmark_id": [header.benchmark_id for header in headers],
     }
+    columns |= _columns_of("run.metadata", [header.run.get("metadata", {}) for header in headers])
     return columns | _columns_of("metadata", [header.metadata for header in headers])
 
 
@@ -99,7 +102,7 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
         columns |= _named(found.rewards, recording.layout, recording.labels, "reward")
     columns |= {"terminal": found.terminals, "timeout": found.timeouts}
     columns |= _columns_of("info", found.infos)
-    repeated = {"id", "env", "seed", *(key for key in episodes if key.startswith("metadata."))}
+    repeated = {"id", "run", "env", "seed", *(key for key in episodes if key.startswith("metadata."))}
     for key in episodes:
         if key in repeated:
             values = pandas.Series(episodes[key])

@@ -6,7 +6,7 @@ import html
 import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, overload
 
 import numpy as np
 
@@ -44,6 +44,12 @@ class Step(_Step):
     env: int = 0
 
 
+class Described(Protocol):
+    """Something that says what the metadata of an episode are."""
+
+    metadata: dict[str, Any]
+
+
 class Episode(GymnasiumNames):
     """One episode of a recording. Columns are arrays (lists for leaves of variable size), nested as the space is.
 
@@ -54,6 +60,8 @@ class Episode(GymnasiumNames):
         self._recording = recording
         self._position = position
         self._row = recording.index[position]
+        self.listed: Described | None = None
+        """What a dataset lists of it, whose metadata follow annotations."""
 
     def __len__(self) -> int:
         return int(self._row["length"])
@@ -152,6 +160,8 @@ class Episode(GymnasiumNames):
         """
         self._recording.annotate([self.number], values)
         self.__dict__.pop("metadata", None)
+        if self.listed is not None:
+            self.listed.metadata = self.metadata
 
     @cached_property
     def start(self) -> EpisodeStart:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import PurePosixPath
+from pathlib import PurePath, PurePosixPath
 from typing import Any, Final, NamedTuple, Self
 from urllib.parse import urlsplit
 
@@ -53,7 +53,7 @@ class Run:
     def given(
         cls, name: str | None, metadata: Mapping[str, Any] | None, tags: Sequence[str], split: str
     ) -> Self:
-        """What somebody says of a run.
+        """What somebody says of a run; paths in the metadata become texts.
 
         Raises:
             RecordingError: a part is something else than text, or than JSON can hold.
@@ -67,9 +67,9 @@ class Run:
                 )
         if metadata is not None and not (isinstance(metadata, Mapping) and all(map(_is_text, metadata))):
             raise RecordingError(
-                f"metadata: expected a dict with keys that are texts, found {metadata!r:.80}"
+                f"metadata: expected a dict with texts as keys (of a Namespace, vars(args)), found {metadata!r:.80}"
             )
-        run = cls(name=name or "", metadata=dict(metadata or {}), tags=tuple(tags), split=split)
+        run = cls(name=name or "", metadata=_plain(dict(metadata or {})), tags=tuple(tags), split=split)
         RecordedRuns([run]).to_json()
         return run
 
@@ -171,6 +171,14 @@ class RecordedRuns(NamedTuple):
         if not isinstance(spans, list) or not all(_is_span(span, len(runs)) for span in spans):
             raise FormatError(f"{where}: found {spans!r:.80} as the spans of runs; see run.schema.json")
         return cls([Run.of_document(run, where) for run in runs], [(span[0], span[1]) for span in spans])
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(map(_plain, value)) if type(value) in (list, tuple) else value
+    return str(value) if isinstance(value, PurePath) else value
 
 
 def _is_text(value: object) -> bool:

@@ -10,11 +10,13 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.records import BODY
+from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.write.rows.variable import leaf_encoders
 
 __all__ = ["EpisodeCopier", "NewFrames", "NewValues", "Trim"]
 
@@ -39,7 +41,7 @@ class NewValues(NamedTuple):
     number.
     """
 
-    columns: Mapping[int, Mapping[str, Array]]
+    columns: Mapping[int, Mapping[str, Array | list[Any]]]
     returns: Mapping[int, float]
 
 
@@ -63,7 +65,7 @@ class EpisodeCopier:
         shift: added to the numbers of the episodes.
         cameras: by camera, then by sub-environment, the ids of its channels.
         frames: of a camera, in place of the source's.
-        values: of steps of constant layout, in place of the source's.
+        values: of steps, in place of the source's.
         trims: of episodes of which some steps stay, by number.
     """
 
@@ -147,7 +149,7 @@ class EpisodeCopier:
         if done:
             spans = [(done, spans[0][1] - done), *spans[1:]]
         if dtype is None:
-            messages = (m for first, count in spans for m in self._messages(channel, first, count))
+            messages = (m for first, count in spans for m in self._step_messages(channel, first, count))
             self._write(channel, messages, numbered=True)
             return
         self._target.add_rows(self._to(channel), self._rows(channel, spans, dtype))
@@ -181,6 +183,22 @@ class EpisodeCopier:
             data = memoryview(loaded)
             for start, end in records[span.begin : span.end].tolist():
                 yield int.from_bytes(data[start + 15 : start + 23], "little"), bytes(data[start + BODY : end])
+
+    def _step_messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
+        """Those of a channel of steps that differ in size, with new values."""
+        messages, new = self._messages(channel, first, count), self._values.columns.get(channel)
+        if new is None:
+            yield from messages
+            return
+        layout = self._source.layout
+        decoder, encoders = MessageDecoder(layout), leaf_encoders(layout, layout.step_leaves)
+        for row, (time_ns, body) in enumerate(messages, first):
+            values = decoder.step(memoryview(body)) | {name: column[row] for name, column in new.items()}
+            out = bytearray(body[:8])
+            for leaf, encode in encoders:
+                if leaf.name in values:  # others are empty
+                    encode(values[leaf.name], out, 0)
+            yield time_ns, bytes(out) + body[-2:]
 
     def _copy_places(self, channel: int, places: Array, *, numbered: bool) -> None:
         """The rows `places` (ascending) of a channel of single messages."""

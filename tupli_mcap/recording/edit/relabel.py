@@ -47,14 +47,12 @@ def relabel_recording(
         sources: what the recording is made of, where that is not `source`.
 
     Raises:
-        RecordingError: another field; the function returns something else; values are of variable size.
+        RecordingError: another field; the function returns something else.
+        StepError: a value of variable size is none of its space.
     """
     for field in fields:
         if field not in _FIELDS:
             raise RecordingError(f"expected fields among {', '.join(_FIELDS)}, found {field!r:.80}")
-    layout = source.layout
-    if not layout.constant:
-        raise RecordingError(f"{source.name}: expected values of a fixed size, found some of variable size")
     values = _new_values(source, function, list(fields))
     name = (
         f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(function).__name__)}"
@@ -79,7 +77,7 @@ def _new_values(source: Recording, function: Callable[[Episode], Any], fields: l
     leaves = {field: field_leaves(field, layout) or [] for field in fields}
     columns = {
         channel: {
-            leaf.name: np.zeros((source.file.store.count(channel), *leaf.shape), layout.dtypes[leaf.name])
+            leaf.name: _empty(leaf, layout, source.file.store.count(channel))
             for found in leaves.values()
             for leaf in found
         }
@@ -103,9 +101,22 @@ def _new_values(source: Recording, function: Callable[[Episode], Any], fields: l
     return NewValues(columns, returns)
 
 
-def _checked(made: Any, leaf: Leaf, layout: StepLayout, episode: Episode, field: str) -> Array:
+def _empty(leaf: Leaf, layout: StepLayout, rows: int) -> Array | list[Any]:
+    return (
+        [None] * rows if leaf.kind == "variable" else np.zeros((rows, *leaf.shape), layout.dtypes[leaf.name])
+    )
+
+
+def _checked(
+    made: Any, leaf: Leaf, layout: StepLayout, episode: Episode, field: str
+) -> Array | Sequence[Any]:
     where = f"{field} of episode {episode.number}"
     try:
+        if leaf.kind == "variable":  # its values are looked at when they are encoded
+            values: Sequence[Any] = leaf.get(made)
+            if len(values) != len(episode):
+                raise RecordingError(f"expected {len(episode)} {where}, found {len(values)}")
+            return values
         given = np.asarray(leaf.get(made))
     except (KeyError, IndexError, TypeError, ValueError) as err:
         raise RecordingError(f"expected {where} as {leaf.path} has them: {err}") from err
