@@ -231,40 +231,20 @@ class TestMerge:
                 int(one.index["end_time"].max()) for one in opened
             )
 
-    def test_only_what_overlaps_is_held(self, tmp_path: Path) -> None:
-        """Two workers at the same time, twice: the second time does not wait for the end of the first."""
-        paths = [tmp_path / f"{i}.mcap" for i in range(2)]
-        for mode in ("x", "a"):
-            envs = [RecordEpisodes(Sampled("box"), path, mode=mode, attachments={}) for path in paths]  # type: ignore[arg-type]
-            for env in envs:
-                env.reset(seed=1)
-            for _ in range(60):
-                for env in envs:
-                    if any(env.step(0)[2:4]):
-                        env.reset()
-            for env in envs:
-                env.close()
-        with pytest.warns(UserWarning, match="rows of .* have the time of the row ahead of them"):
-            report = merge_recordings(paths, tmp_path / "all.mcap")
-        assert_sound(report.path)
-        with Recording(report.path) as merged, Recording(paths[0]) as one, Recording(paths[1]) as other:
-            begun = int(np.median(one.index["start_time"]))
-            wanted = np.sort(np.concatenate([r.read(fields=["times"]).times for r in (one, other)]))
-            found = merged.read(fields=["times"]).times
-            assert (found >= begun).sum() == (wanted >= begun).sum()
-
-    def test_recordings_that_take_too_many_turns_have_one_each(
+    def test_recordings_that_take_too_many_turns_become_sub_environments(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("tupli_mcap.recording.edit.merge._MOST_TURNS", 2)
         a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"
         for path, seed in ((a, 1), (b, 2), (a, 3)):
             record(path, seed=seed, steps=40, mode="a" if path.exists() else "x")
-        with pytest.warns(UserWarning, match="rows of .* have the time of the row ahead of them"):
-            report = merge_recordings([a, b], tmp_path / "all.mcap")
-        assert report.held >= 40
+        report = merge_recordings([a, b], tmp_path / "all.mcap")
+        assert report.held == 0
+        assert_sound(report.path)
         with Recording(report.path) as merged:
-            assert same(facts(merged), facts(Recording(a)) + facts(Recording(b)))
+            assert same(
+                facts(merged), facts(Recording(a)) + [{**fact, "env": 1} for fact in facts(Recording(b))]
+            )
 
     def test_vector_recordings_appended_in_turns(self, tmp_path: Path) -> None:
         a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"
@@ -280,26 +260,52 @@ class TestMerge:
         with Recording(report.path) as merged:
             assert sorted(merged.read(fields=["times"]).times.tolist()) == times
 
-    def test_recordings_made_at_the_same_time(self, tmp_path: Path) -> None:
-        """Times are held, values stay."""
-        envs = [
-            RecordEpisodes(Sampled("box"), tmp_path / f"{i}.mcap", attachments={}, record_info=True)
-            for i in range(2)
-        ]
-        for env in envs:
-            env.reset(seed=1)
-        for _ in range(60):
+    @pytest.mark.parametrize("kind", SPACES)
+    def test_recordings_made_at_the_same_time(self, tmp_path: Path, kind: str) -> None:
+        """Parallel workers keep their times: each is a sub-environment, and the next pair takes their places."""
+        paths = [tmp_path / f"{i}.mcap" for i in range(4)]
+        for pair in (paths[:2], paths[2:]):
+            inner: list[Any] = [Sampled(kind, "rgb_array") for _ in pair]
+            if "stack" in kind:
+                inner = [gym.wrappers.FrameStackObservation(env, 3) for env in inner]
+            envs = [
+                RecordEpisodes(env, path, name=path.stem, attachments={}, record_info=True, frames=3)
+                for env, path in zip(inner, pair, strict=True)
+            ]
             for env in envs:
-                if any(env.step(0)[2:4]):
-                    env.reset()
-        for env in envs:
-            env.close()
-        with pytest.warns(UserWarning, match="rows of .* have the time of the row ahead of them"):
-            report = merge_recordings([env.path for env in envs], tmp_path / "all.mcap")
-        assert report.held > 60
+                env.reset(seed=1)
+            for _ in range(60):
+                for env in envs:
+                    if any(env.step(0)[2:4]):
+                        env.reset()
+            for env in envs:
+                env.close()
+        report = merge_recordings(paths, tmp_path / "all.mcap")
+        assert report.held == 0
+        assert_sound(report.path)
+        opened = [Recording(path) for path in paths]
+        with Recording(report.path) as merged:
+            assert (merged.num_envs, merged.is_vector) == (2, True)
+            wanted = [{**fact, "env": i % 2} for i, one in enumerate(opened) for fact in facts(one)]
+            assert same(facts(merged), wanted)
+            assert times_of(merged) == [moments for one in opened for moments in times_of(one)]
+            found = [e for one in opened for e in one.episodes]
+            for name in ("start_time", "end_time"):
+                assert [getattr(e, name) for e in merged.episodes] == [getattr(e, name) for e in found]
+            assert [e.run.name for e in merged.episodes] == [e.run.name for e in found]
+            assert {e.run.name for e in merged.episodes if e.env == 0} == {"0", "2"}
+
+    def test_single_and_vector_recordings(self, tmp_path: Path) -> None:
+        single, vector = record(tmp_path / "i.mcap", "image"), record_vector(tmp_path / "v.mcap")
+        report = merge_recordings([vector, single], tmp_path / "all.mcap")
         assert_sound(report.path)
         with Recording(report.path) as merged:
-            assert same(facts(merged), [fact for env in envs for fact in facts(Recording(env.path))])
+            assert merged.num_envs == 2
+            assert same(facts(merged), facts(Recording(single)) + facts(Recording(vector)))
+        again = merge_recordings(
+            [report.path, record(tmp_path / "j.mcap", "image", seed=5)], tmp_path / "b.mcap"
+        )
+        assert_sound(again.path)
 
     def test_merged_again_appended_and_filtered(self, tmp_path: Path) -> None:
         paths = [record(tmp_path / f"{i}.mcap", seed=i) for i in range(3)]
@@ -375,7 +381,6 @@ class TestMerge:
 
     def test_what_does_not_fit_is_refused(self, tmp_path: Path) -> None:
         one, text = record(tmp_path / "1.mcap"), record(tmp_path / "t.mcap", "text")
-        image, vector = record(tmp_path / "i.mcap", "image"), record_vector(tmp_path / "v.mcap")
         named = record(tmp_path / "n.mcap", record_info=["left"])
         benchmark = record(tmp_path / "b.mcap", benchmark_id="b" * 64)
         copy = tmp_path / "copy.mcap"
@@ -386,11 +391,6 @@ class TestMerge:
                 [one, text],
                 SpaceError,
                 r"t\.mcap: expected the observation_space of .*1\.mcap, Box.*, found Dict",
-            ),
-            (
-                [image, vector],
-                SpaceError,
-                "expected a single environment, as in .*, found 2 sub-environments",
             ),
             ([one, named], RecordingError, "records /info with other fields"),
             ([one, benchmark], RecordingError, "expected a recording of benchmark none"),
@@ -405,7 +405,7 @@ class TestMerge:
         with pytest.raises(RecordingError, match="is one of the recordings to merge"):
             merge_recordings([one, named], one, overwrite=True)
         with pytest.raises(RecordingError, match="exists; choose another path"):
-            merge_recordings([one], image)
+            merge_recordings([one], text)
 
 
 class TestSplit:

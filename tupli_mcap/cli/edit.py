@@ -49,9 +49,8 @@ def merge(
 ) -> None:
     """Write the episodes of several recordings into one.
 
-    They come in the order of their times, and are numbered anew. Of recordings made at the same time, those of the
-    later one follow the others, and rows that may not go back in time get a later one; a warning says how many.
-    The new recording has ids of its own, the environment of the first one, and no signature.
+    They keep their times, and are numbered anew. Recordings that were made at the same time, or of different numbers of
+    sub-environments, become sub-environments of one; the run of each episode says where it comes from. The new recording has ids of its own, the environment of the first one, and no signature.
     """
     from tupli_mcap.recording import merge_recordings
 

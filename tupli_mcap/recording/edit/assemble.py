@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,15 +13,30 @@ from tupli_mcap.journal.logs import group_records
 from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.mcap.writer_name import library
-from tupli_mcap.messages.episodes import record
+from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.opened import OpenFile
 
-__all__ = ["Assembler"]
+__all__ = ["Assembler", "CopiedEpisode"]
 
 _CHUNK = 256 * 1024
+
+
+class CopiedEpisode(NamedTuple):
+    """What a recording says of an episode beside its steps, numbered as it is to be.
+
+    starts: (log_time, start) of the resets without a step before it, and of its own.
+    end: (log_time, end). end_row: the row of that in its source, which decides between ends of one time.
+    final: gives (log_time, body) of its final state; None where that is not known.
+    """
+
+    starts: Sequence[tuple[int, EpisodeStart]]
+    end: tuple[int, EpisodeEnd]
+    end_row: int
+    final: Callable[[], tuple[int, bytes]] | None
 
 
 class Assembler:
@@ -123,8 +139,53 @@ class Assembler:
         self.container.add_chunk(rows)
         self._latest[rows.channel] = int(rows.times[-1])
 
+    def add_episodes(self, episodes: Sequence[CopiedEpisode]) -> None:
+        """Adds starts, ends and final states in the order of their times, and the episodes to the index in theirs."""
+        ids = {channel.topic: channel.id for channel in self.container.channels.values()}
+        by_start = sorted(range(len(episodes)), key=lambda i: episodes[i].starts[-1][0])
+        by_end = sorted(range(len(episodes)), key=lambda i: (episodes[i].end[0], episodes[i].end_row))
+        places: dict[int, int] = {}
+        messages = []
+        for i in by_start:
+            messages += [(time_ns, start.encode()) for time_ns, start in episodes[i].starts]
+            places[i] = len(messages) - 1
+        started = [self.next_row(ids[EPISODE_START]) + places[i] for i in range(len(episodes))]
+        messages = _in_time(messages)
+        start_times = [messages[places[i]][0] for i in range(len(episodes))]
+        self.add_messages(ids[EPISODE_START], messages)
+        ends = _in_time([(episodes[i].end[0], episodes[i].end[1].encode()) for i in by_end])
+        ended = dict(zip(by_end, itertools.count(self.next_row(ids[EPISODE_END])), strict=False))
+        end_times = {i: time_ns for i, (time_ns, _) in zip(by_end, ends, strict=True)}
+        self.add_messages(ids[EPISODE_END], ends)
+        with_final = [i for i in by_end if episodes[i].final is not None]
+        finals = dict(zip(with_final, itertools.count(self.next_row(ids[FINAL_STATE])), strict=False))
+        self.add_messages(ids[FINAL_STATE], (found() for i in with_final if (found := episodes[i].final)))
+        for i, episode in enumerate(episodes):
+            start, end = episode.starts[-1][1], episode.end[1]
+            self.index.add(
+                end.first_row,
+                end.length,
+                end.episode_return,
+                start_times[i],
+                end_times[i],
+                start.seed_number,
+                started[i],
+                ended[i],
+                finals.get(i, -1),
+                end.episode,
+                end.env,
+                end.end,
+                end.metadata,
+            )
+
     def finish(self, time_ns: int) -> None:
         """Writes the episode index and the summary."""
         data = self.index.encode(self.container.chunk_rows)
         self.container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, time_ns)
         self.container.finish()
+
+
+def _in_time(messages: Sequence[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    """Times that never decrease."""
+    times = itertools.accumulate((time_ns for time_ns, _ in messages), max)
+    return [(time_ns, body) for time_ns, (_, body) in zip(times, messages, strict=True)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -14,7 +15,7 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
-from tupli_mcap.recording.edit.assemble import Assembler
+from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.rows.variable import leaf_encoders
 
@@ -63,6 +64,7 @@ class EpisodeCopier:
     Args:
         channels: the target's ids of the source's channels, where they differ.
         shift: added to the numbers of the episodes.
+        first_env: the target's sub-environment that the source's first one becomes; None: each stays what it is.
         cameras: by camera, then by sub-environment, the ids of its channels.
         frames: of a camera, in place of the source's.
         values: of steps, in place of the source's.
@@ -77,10 +79,12 @@ class EpisodeCopier:
         *,
         channels: Mapping[int, int] | None = None,
         shift: int = 0,
+        first_env: int | None = None,
         frames: NewFrames | None = None,
         values: NewValues | None = None,
         trims: Mapping[int, Trim] | None = None,
     ) -> None:
+        self._first_env = first_env
         self._trims = trims or {}
         self._values = values or NewValues({}, {})
         self._source, self._target, self._shift = source, target, shift
@@ -93,6 +97,13 @@ class EpisodeCopier:
 
     def run(self, rows: Array) -> None:
         """Copies the episodes that `rows` of the source's index name."""
+        self._target.add_episodes(self.copy(rows))
+
+    def copy(self, rows: Array) -> list[CopiedEpisode]:
+        """Copies the steps of episodes, with their images, frames and infos; returns what is to be said of them.
+
+        Infos are left to `infos` where the source's sub-environments become others.
+        """
         layout = self._source.layout
         rows = self._trimmed(rows)
         firsts = np.zeros(len(rows), dtype=np.int64)
@@ -107,10 +118,10 @@ class EpisodeCopier:
             for leaf in layout.images:
                 images = self._topics[topics.image(leaf.name)]
                 self._copy(images, spans, layout.image_messages[leaf.name].dtype)
-        self._events(rows, firsts)
         self._frames(rows)
-        if INFO in self._topics:
-            self._infos(rows)
+        if INFO in self._topics and self._first_env is None:
+            self._copy_places(self._topics[INFO], self._infos(rows), numbered=True)
+        return self._episodes(rows, firsts)
 
     def _trimmed(self, rows: Array) -> Array:
         """The index's rows as they are of the steps that stay; `first_row` counts in the source."""
@@ -139,7 +150,8 @@ class EpisodeCopier:
         return self._channels.get(channel, channel)
 
     def _copy_first(self, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
-        if self._shift or self._to(channel) != channel or channel in self._values.columns:
+        moved = self._shift or self._first_env is not None or self._to(channel) != channel
+        if moved or channel in self._values.columns:
             return 0
         return self._target.copy_first(self._file, channel, count, dtype)
 
@@ -220,69 +232,39 @@ class EpisodeCopier:
         trim = self._trims.get(number)
         return _NUMBERS.pack(number + self._shift, step - trim.start if trim else step) + body[8:]
 
-    def _events(self, rows: Array, firsts: Array) -> None:
-        """Starts, ends and final states, and the rows of the index."""
-        target, topics = self._target, self._topics
-        begins = {
-            topic: target.next_row(self._to(topics[topic]))
-            for topic in (EPISODE_START, EPISODE_END, FINAL_STATE)
-        }
-        latest = {topic: target.latest(self._to(topics[topic])) for topic in (EPISODE_START, EPISODE_END)}
-        starts = self._starts(rows)
-        by_time = np.argsort(rows["start_time"], kind="stable").tolist()
-        start_rows = np.zeros(len(rows), np.int64)
-        start_rows[by_time] = begins[EPISODE_START] + np.cumsum([len(starts[i]) for i in by_time]) - 1
-        ends: list[tuple[int, bytes]] = []
-        finals: list[tuple[int, bytes]] = []
-        # in a vector environment, episodes end in another order than that in which they begin
-        end_places = np.argsort(np.lexsort((rows["end_row"], rows["end_time"]))).tolist()
-        final_places = _places(rows["final_row"][rows["final_row"] >= 0])
-        for place, (row, first) in enumerate(zip(rows, firsts, strict=True)):
+    def _episodes(self, rows: Array, firsts: Array) -> list[CopiedEpisode]:
+        """What is said of each episode, with the numbers it has in the target."""
+        found, env = [], self._first_env or 0
+        for row, first, starts in zip(rows, firsts.tolist(), self._starts(rows), strict=True):
             number = int(row["episode"])
             trim = self._trims.get(number)
-            ((end_time, body),) = self._messages(topics[EPISODE_END], int(row["end_row"]), 1)
+            new = {"episode": number + self._shift, "env": int(row["env"]) + env, "first_row": first}
+            ((end_time, body),) = self._messages(self._topics[EPISODE_END], int(row["end_row"]), 1)
             end = EpisodeEnd.decode(memoryview(body))
             total = self._values.returns.get(number, end.episode_return)
+            final = partial(self._final, row, _NUMBERS.pack(new["episode"], new["env"]))
             if trim is not None:
-                total = trim.episode_return
-                end = end._replace(length=int(row["length"]), end=int(row["end"]))
-            end = end._replace(episode=number + self._shift, first_row=int(first), episode_return=total)
-            final = -1
-            if row["final_row"] >= 0:
-                final = begins[FINAL_STATE] + final_places[len(finals)]
-                if trim is not None and trim.final is not None:
-                    end_time, end = int(row["end_time"]), end._replace(has_final_state=True)
-                    finals.append((end_time, _NUMBERS.pack(number, end.env) + trim.final))
-                else:
-                    finals += self._messages(topics[FINAL_STATE], int(row["final_row"]), 1)
-            target.index.add(
-                int(first),
-                end.length,
-                end.episode_return,
-                max(int(row["start_time"]), latest[EPISODE_START]),
-                max(int(row["end_time"]), latest[EPISODE_END]),
-                int(row["seed"]) if row["has_seed"] else None,
-                int(start_rows[place]),
-                begins[EPISODE_END] + end_places[len(ends)],
-                final,
-                end.episode,
-                end.env,
-                end.end,
-                end.metadata,
+                total, end_time = trim.episode_return, int(row["end_time"])
+                end = end._replace(length=trim.stop - trim.start, end=int(row["end"]))
+                if trim.final is not None:
+                    end = end._replace(has_final_state=True)
+            found.append(
+                CopiedEpisode(
+                    [(time_ns, start._replace(**new)) for time_ns, start in starts],
+                    (end_time, end._replace(**new, episode_return=total)),
+                    int(row["end_row"]),
+                    final if row["final_row"] >= 0 else None,
+                )
             )
-            ends.append((end_time, end.encode()))
-        numbered = (
-            (time_ns, start._replace(episode=start.episode + self._shift, first_row=int(firsts[i])).encode())
-            for i in by_time
-            for time_ns, start in starts[i]
-        )
-        self._write(topics[EPISODE_START], _in_time(numbered))
-        self._write(topics[EPISODE_END], _in_time(_in_order(ends, end_places)))
-        finals = [
-            (time_ns, (int.from_bytes(body[:4], "little") + self._shift).to_bytes(4, "little") + body[4:])
-            for time_ns, body in finals
-        ]
-        self._write(topics[FINAL_STATE], _in_time(_in_order(finals, final_places)))
+        return found
+
+    def _final(self, row: Any, numbers: bytes) -> tuple[int, bytes]:
+        """(log_time, body) of a final state, with its new numbers."""
+        trim = self._trims.get(int(row["episode"]))
+        if trim is not None and trim.final is not None:
+            return int(row["end_time"]), numbers + trim.final
+        ((time_ns, body),) = self._messages(self._topics[FINAL_STATE], int(row["final_row"]), 1)
+        return time_ns, numbers + body[8:]
 
     def _starts(self, rows: Array) -> list[list[tuple[int, EpisodeStart]]]:
         """(log_time, start) of the resets without a step before each episode, and of its own.
@@ -352,7 +334,8 @@ class EpisodeCopier:
             for place in self._frame_rows(new.camera, row).tolist():
                 yield from self._messages(channel, place, 1)
 
-    def _infos(self, rows: Array) -> None:
+    def _infos(self, rows: Array) -> Array:
+        """Which rows of `/info` are of the episodes, and of steps that stay."""
         channel = self._topics[INFO]
         messages = self._messages(channel, 0, self._store.count(channel))
         numbers = np.array([_NUMBERS.unpack_from(body) for _, body in messages], np.int64).reshape(-1, 2)
@@ -362,28 +345,14 @@ class EpisodeCopier:
             places = np.searchsorted(trimmed[:, 0], numbers[:, 0]).clip(max=len(trimmed) - 1)
             of, starts, stops = trimmed[places].T
             kept &= (of != numbers[:, 0]) | ((numbers[:, 1] >= starts) & (numbers[:, 1] < stops))
-        self._copy_places(channel, np.flatnonzero(kept), numbered=True)
+        return np.flatnonzero(kept)
 
-
-def _places(rows: Any) -> list[int]:
-    """The new row numbers of some rows, once the others are left out."""
-    places = np.empty(len(rows), np.int64)
-    places[np.argsort(rows, kind="stable")] = np.arange(len(rows))
-    listed: list[int] = places.tolist()
-    return listed
-
-
-def _in_order(messages: list[tuple[int, bytes]], places: Sequence[int]) -> list[tuple[int, bytes]]:
-    return [messages[i] for i in np.argsort(places, kind="stable").tolist()]
-
-
-def _in_time(messages: Iterable[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
-    """Times that never decrease (episodes of several sub-environments end out of order)."""
-    latest, kept = 0, []
-    for log_time, body in messages:
-        latest = max(latest, log_time)
-        kept.append((latest, body))
-    return kept
+    def infos(self, rows: Array) -> Iterator[tuple[int, bytes]]:
+        """(log_time, body) of the infos of episodes, with new numbers."""
+        if INFO in self._topics:
+            for first, count in _merged([(place, 1) for place in self._infos(rows).tolist()]):
+                for time_ns, body in self._messages(self._topics[INFO], first, count):
+                    yield time_ns, self._renumbered(body)
 
 
 def _merged(spans: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import heapq
 import os
 import time
 import uuid
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +20,7 @@ from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
-from tupli_mcap.messages.topics import INFO
+from tupli_mcap.messages.topics import INFO, Topics, parse
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
 from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
@@ -42,7 +44,8 @@ _SPACES = ("observation_space", "action_space", "reward_space")
 class MergeReport(NamedTuple):
     """What a merge wrote, or would write.
 
-    held: rows whose time was changed: it was before that of the row ahead, which a file does not allow.
+    held: rows whose time was changed: it was before that of the row ahead, which a file does not allow. Only frames
+        that were rendered after the end of their episode can be among them.
     copied: chunks that were copied as they are. size: bytes; 0 where nothing was written.
     """
 
@@ -77,13 +80,14 @@ def merge_recordings(
 ) -> MergeReport:
     """Writes one recording, with a UUID of its own, of the episodes of several, in the order of their times.
 
-    Everything comes along: infos, frames, images, final states, metadata, attachments; but no signature and no
-    certificate, which would not hold. Episodes are numbered anew. Times stay as they are, but they must never decrease
-    within a channel: episodes of several recordings that overlap in time come one recording after the other, those of
-    the later one are held, and a warning says of how many rows. The environment and the labels are the first one's.
+    Everything comes along: infos, frames, images, final states, metadata, runs, attachments; but no signature and no
+    certificate, which would not hold. Episodes are numbered anew, times stay as they are. Recordings that were made at
+    the same time, or of different numbers of sub-environments, become sub-environments of one; their episodes are
+    numbered one recording after the other, and their runs tell them apart. The environment and the labels are the
+    first one's.
 
     Raises:
-        SpaceError: they have different spaces, dtypes, or numbers of sub-environments.
+        SpaceError: they have different spaces or dtypes.
         RecordingError: one cannot be read, holds episodes of another one again, or belongs to another benchmark;
             attachments of one name differ; the target exists (and not `overwrite`) or cannot be written.
         FormatError: one is damaged.
@@ -112,8 +116,7 @@ def merge_recordings(
             merged = _merge(recordings, Container(fd, str(target), compression), attachments)
     if merged.held:
         warnings.warn(
-            f"{merged.held:,} rows of {target} have the time of the row ahead of them, which was later than theirs: "
-            "some of the recordings were made at the same time",
+            f"{merged.held:,} rows of {target} have the time of the row ahead of them, which was later than theirs",
             UserWarning,
             stacklevel=2,
         )
@@ -124,42 +127,96 @@ def _merge(
     sources: Sequence[Recording], container: Container, attachments: Mapping[str, tuple[str, bytes]]
 ) -> Assembler:
     now, first = time.time_ns(), sources[0]
-    turns, next_episode = _numbered(sources, _turns(sources))
+    turns = _turns(sources)
+    lanes = _lanes(sources, turns=len(turns))
+    if lanes is not None:
+        turns = [(i, np.arange(len(recording))) for i, recording in enumerate(sources)]
+    numbered, next_episode = _numbered(sources, turns)
     target = Assembler(container)
-    said = {**carry_runs(turns), **say_made_of(sources, "merge")}
+    said = {**carry_runs(numbered), **say_made_of(sources, "merge")}
     target.begin(_metadata(first, next_episode=next_episode), {**attachments, **said}, now)
-    define(first, target)
-    for recording in sources[1:]:
-        _define_missing(recording, container)
+    if lanes is None:
+        define(first, target)
+    envs = first.num_envs if first.is_vector else None
+    if lanes is not None:
+        envs = max(lane + recording.num_envs for lane, recording in zip(lanes, sources, strict=True))
+    for recording in sources:
+        _define_missing(recording, container, envs)
     container.define_channels()
-    ids = {channel.topic: channel.id for channel in container.channels.values()}
-    for recording, rows, shift in turns:
-        channels = {i: ids.get(topic, i) for topic, i in recording.file.topics.items()}
+    episodes, infos = [], []
+    for (i, _), (recording, rows, shift) in zip(turns, numbered, strict=True):
+        lane = lanes[i] if lanes is not None else None
+        channels = _channels(recording, container, lane)
         cameras = {
             name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
             for name, pairs_of in camera_channels(recording, container).items()
         }
-        EpisodeCopier(recording, target, cameras, channels=channels, shift=shift).run(rows)
+        copier = EpisodeCopier(recording, target, cameras, channels=channels, shift=shift, first_env=lane)
+        episodes += copier.copy(rows)
+        infos.append(copier.infos(rows))
+    target.add_episodes(episodes)
+    if lanes is not None:
+        for channel in container.channels.values():
+            if channel.topic == INFO:
+                target.add_messages(channel.id, heapq.merge(*infos, key=itemgetter(0)))
     target.finish(now)
     return target
 
 
-def _turns(sources: Sequence[Recording]) -> list[tuple[int, np.ndarray]]:
-    """Which recording's turn it is, and which rows of its index it brings then, in the order of their times.
+def _lanes(sources: Sequence[Recording], turns: int) -> list[int] | None:
+    """The sub-environment that the first one of each source becomes; None where each stays what it is.
 
-    Episodes that overlap make a group, each recording has one turn in it. Where there would be too many turns, each
-    recording has one: every one costs a look at all infos of its recording, and ends a chunk.
+    A channel holds one episode after the other, in the order of their times. So episodes that were recorded at the same
+    time need channels of their own: recordings that overlap become different sub-environments, and one that begins
+    when another one has ended takes its place. Recordings that take too many turns do so, too: every turn costs a look
+    at all infos of its recording, and ends a chunk.
     """
+    alike = len({(recording.is_vector, recording.num_envs) for recording in sources}) == 1
+    if alike and turns < max(_MOST_TURNS, len(sources) + 1) and not _overlap(sources):
+        return None
+    free: list[int] = []  # by sub-environment, when its last episode ends
+    lanes = []
+    for recording in sources:  # in the order in which they begin
+        begin, n = int(recording.index["start_time"].min()), recording.num_envs
+        at = 0
+        while any(end > begin for end in free[at : at + n]):
+            at += 1
+        free[at : at + n] = [int(recording.index["end_time"].max())] * n
+        lanes.append(at)
+    return lanes
+
+
+def _overlap(sources: Sequence[Recording]) -> bool:
+    """Whether episodes of two recordings were recorded at the same time."""
+    which = np.repeat(np.arange(len(sources)), [len(recording) for recording in sources])
+    start, end = (np.concatenate([r.index[name] for r in sources]) for name in ("start_time", "end_time"))
+    order = np.lexsort((end, start))
+    which, start, latest = which[order], start[order], np.maximum.accumulate(end[order])
+    group = np.concatenate([[0], np.cumsum(start[1:] >= latest[:-1])])
+    return bool((np.diff(which)[np.diff(group) == 0] != 0).any())
+
+
+def _channels(source: Recording, container: Container, lane: int | None) -> dict[int, int]:
+    """The target's ids of a source's channels, with its first sub-environment at `lane`."""
+    ids = {channel.topic: channel.id for channel in container.channels.values()}
+    found = {}
+    for topic, channel in source.file.topics.items():
+        parsed = parse(topic)
+        if lane is not None and parsed is not None:
+            there = Topics.of(lane + parsed.env).top + topic.removeprefix(parsed.topics.top)
+        else:
+            there = topic
+        found[channel] = ids.get(there, channel)
+    return found
+
+
+def _turns(sources: Sequence[Recording]) -> list[tuple[int, np.ndarray]]:
+    """Which recording's turn it is, and which rows of its index it brings then, in the order of their times."""
     which = np.repeat(np.arange(len(sources)), [len(recording) for recording in sources])
     place = np.concatenate([np.arange(len(recording)) for recording in sources])
-    start, end = (np.concatenate([r.index[name] for r in sources]) for name in ("start_time", "end_time"))
+    start = np.concatenate([recording.index["start_time"] for recording in sources])
     order = np.lexsort((place, which, start))
-    apart = start[order][1:] >= np.maximum.accumulate(end[order])[:-1]  # all before it have ended
-    group = np.concatenate([[0], np.cumsum(apart)])
-    order = order[np.lexsort((place[order], which[order], group))]
     bounds = np.flatnonzero(np.diff(which[order])) + 1
-    if len(bounds) >= max(_MOST_TURNS, len(sources)):
-        return [(i, np.arange(len(recording))) for i, recording in enumerate(sources)]
     return [(int(which[part[0]]), np.sort(place[part])) for part in np.split(order, bounds)]
 
 
@@ -193,17 +250,16 @@ def _metadata(source: Recording, *, next_episode: int) -> dict[str, str]:
     }
 
 
-def _define_missing(source: Recording, container: Container) -> None:
-    """Adds the channels of infos and cameras that earlier sources do not have."""
+def _define_missing(source: Recording, container: Container, envs: int | None) -> None:
+    """Adds the channels that earlier sources do not have; `envs` is None for those of a single environment."""
     info = None
     contents, topics = source.file.contents, source.file.topics
     if INFO in topics:
         channel = contents.channels[topics[INFO]]
         text = contents.schemas[channel.schema_id].data.decode()
         info = text, {key: value for key, value in channel.metadata.items() if key != "crc"}
-    vector = source.num_envs if source.is_vector else None
-    png = png_leaves(container.channels)  # the first recording decides
-    register_channels(container, source.name, source.layout, vector, info, source.cameras, png)
+    png = png_leaves(container.channels or contents.channels)  # the first recording decides
+    register_channels(container, source.name, source.layout, envs, info, source.cameras, png)
 
 
 def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool) -> None:
@@ -235,10 +291,6 @@ def _check_alike(sources: Sequence[Recording]) -> None:
                     f"{other.name}: expected {name} as in {first.name}, {expected.get(name)!s:.200}, found "
                     f"{description.get(name)!s:.200}; steps of other layouts cannot be in one recording"
                 )
-        if (other.is_vector, other.num_envs) != (first.is_vector, first.num_envs):
-            raise SpaceError(
-                f"{other.name}: expected {_envs(first)}, as in {first.name}, found {_envs(other)}"
-            )
         if other.benchmark_id != first.benchmark_id:
             raise RecordingError(
                 f"{other.name}: expected a recording of benchmark {first.benchmark_id or 'none'}, as {first.name} is, "
@@ -250,10 +302,6 @@ def _check_alike(sources: Sequence[Recording]) -> None:
                 raise RecordingError(
                     f"{other.name} holds episode {number} of {before.name} again; leave one out"
                 )
-
-
-def _envs(recording: Recording) -> str:
-    return f"{recording.num_envs} sub-environments" if recording.is_vector else "a single environment"
 
 
 def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
