@@ -366,7 +366,8 @@ class TestAnnotations:
         key = write_key(tmp_path / "id")
         path = record(tmp_path / "r.mcap")
         sign_recording(path, key)
-        annotate_episodes(path, {"x": 1})
+        with pytest.warns(UserWarning, match="its signature .* left out"):
+            annotate_episodes(path, {"x": 1})
         assert "signature.ed25519" not in Recording(path).attachments
         sign_recording(path, key)
         said = Recording(path).read_attachment("annotations.json")

@@ -246,6 +246,7 @@ def test_a_certificate_is_nobody_s_secret(bundle: Path, alice: signing.SigningKe
 
 def test_verify_checks_signatures(bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert verify_recording(bundle).ok
+    assert "(a key that is not trusted here)" in verify_recording(bundle).signed_by
     report = verify_recording(tampered(bundle, tmp_path / "cut.mcap", episodes=[0]))
     (problem,) = report.errors
     assert problem.kind == "signature"

@@ -50,7 +50,8 @@ def merge(
     """Write the episodes of several recordings into one.
 
     They keep their times, and are numbered anew. Recordings that were made at the same time, or of different numbers of
-    sub-environments, become sub-environments of one; the run of each episode says where it comes from. The new recording has ids of its own, the environment of the first one, and no signature.
+    sub-environments, become sub-environments of one; the run of each episode says where it comes from. The new
+    recording has ids of its own, the environment of the first one, and no signature.
     """
     from tupli_mcap.recording import merge_recordings
 

@@ -100,6 +100,8 @@ def _print_verified(report: VerifyReport) -> None:
     damage = counted(count, "problem")
     state = "" if report.state == "complete" else f", {_STATES[report.state]}"
     say(f"{report.path}: {'ok' if report.ok else damage} ({facts}{state})")
+    if report.signed_by:
+        say(f"  signed by {report.signed_by}")
     for problem in roots[:_PROBLEMS]:
         place = f"{problem.place}: " if problem.place else ""
         print_wrapped(f"{problem.severity}: {place}{problem.message}", "  ", "    ")

@@ -54,7 +54,8 @@ class VerifyReport:
     """What was verified in a file, and what was found.
 
     kind: "recording" or "storage". state: "complete", "unfinished" (its writer was killed) or "recording" (a
-    writer is at work on it). more: problems beyond the first thousand.
+    writer is at work on it). signed_by: the fingerprint of the key whose signature fits, and what this user calls it
+    where he trusts it; empty if the file is not signed. more: problems beyond the first thousand.
     """
 
     path: str
@@ -66,6 +67,7 @@ class VerifyReport:
     episodes: int = 0
     steps: int = 0
     attachments: int = 0
+    signed_by: str = ""
     problems: list[Problem] = field(default_factory=list)
     more: int = 0
 

@@ -219,7 +219,9 @@ def _names_pickle(recording: Recording) -> bool:
 
 def _signature(recording: Recording, structure: Structure, findings: Findings) -> None:
     try:
-        verify_signature(recording, structure)
+        found = verify_signature(recording, structure)
+        known = f"trusted as {found.name}" if found.trusted else "a key that is not trusted here"
+        findings.report.signed_by = f"{found.fingerprint} ({known})"
     except MissingExtraError as err:
         findings.note("signature", "it is signed, which was not checked", str(err))
     except SignatureError as err:

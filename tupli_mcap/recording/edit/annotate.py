@@ -6,6 +6,7 @@ import getpass
 import operator
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -126,14 +127,21 @@ def _changing(
 ) -> Iterator[tuple[Recording, Callable[[str, str, bytes], None]]]:
     """A recording that nobody else writes to meanwhile, and a function that replaces an attachment of it.
 
-    The function takes name, media type and bytes. In a dry run it does nothing, and the recording is not kept.
+    The function takes name, media type and bytes; it warns of a signature that is left out. In a dry run it does no
+    more, and the recording is not kept.
     """
 
-    def say(name: str, media_type: str, data: bytes) -> None:
-        attach(Path(recording.name), {name: (media_type, data)}, without=[SIGNATURE_NAME])
-
     with nullcontext(path) if dry_run else held(path) as place, Recording(place) as recording:
-        yield recording, (lambda *_: None) if dry_run else say
+
+        def say(name: str, media_type: str, data: bytes) -> None:
+            if SIGNATURE_NAME in recording.attachments:
+                left_out = "would be left out" if dry_run else "is left out"
+                message = f"{path}: its signature covers what was said before, and {left_out}"
+                warnings.warn(message, UserWarning, stacklevel=4)
+            if not dry_run:
+                attach(Path(recording.name), {name: (media_type, data)}, without=[SIGNATURE_NAME])
+
+        yield recording, say
 
 
 def _user() -> str:
