@@ -22,10 +22,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.mcap.container import PROFILE
 from tupli_mcap.mcap.source import PathSource
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Recording, finish_recording
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.open import read_contents
@@ -123,6 +123,28 @@ def test_reads_what_the_environment_returned(name: str, tmp_path: Path) -> None:
         number = list(load_tool().FEATURES).index(name)
         assert int(recording.uuid, 16) == 1 + number or name == "rewritten"
         assert recording.num_steps == sum(len(episode["rewards"]) for episode in expected(name))
+
+
+@pytest.mark.parametrize("name", UNFINISHED)
+def test_what_was_not_finished_can_be_in_its_place(name: str, tmp_path: Path) -> None:
+    path = place(name, tmp_path)
+    before = path.read_bytes()
+    finish_recording(path, dry_run=True)
+    assert path.read_bytes() == before
+    report = finish_recording(path)
+    assert report.target == str(path)
+    assert [left.name for left in tmp_path.iterdir()] == [path.name]
+    with Recording(path) as recording:
+        assert recording.complete
+        assert_same(list(as_read(recording)), expected(name))
+    assert verify_recording(path).ok
+    finished = path.read_bytes()
+    assert finish_recording(path).intact
+    assert path.read_bytes() == finished
+    path.write_bytes(finished[: len(finished) // 2])
+    with pytest.raises((RecordingError, FormatError)):
+        finish_recording(path)
+    assert path.read_bytes() == finished[: len(finished) // 2]
 
 
 @pytest.mark.parametrize(("folder", "name"), EARLIER)

@@ -157,6 +157,9 @@ def test_refuses_what_does_not_fit(function: Any, fields: list[str], tmp_path: P
 
 def test_replaces_nothing_by_itself(tmp_path: Path) -> None:
     source = record(tmp_path / "r.mcap")
+    for place in (tmp_path, f"{tmp_path}/new/"):
+        with pytest.raises(DatasetError, match="is a directory"):
+            tupli_mcap.open(source).map(lambda episode: episode.rewards, place)
     with pytest.raises(DatasetError, match="exists"):
         tupli_mcap.open(source).map(lambda episode: episode.rewards, source)
 

@@ -255,18 +255,26 @@ def recover(
         typer.Option("--output", "-o", metavar="FILE", help="By default FILE.recovered.mcap, beside it."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="Finish the file itself; only where nothing is lost.")
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what could be saved.")] = False,
     as_json: Json = False,
 ) -> None:
     """Save everything good in a damaged recording into a new one.
 
-    One that its writer did not finish is damaged, too. The file itself is only read. What was lost is said by
-    episode and step; an episode that lost steps in the middle becomes several. Exit code 1 only if nothing
-    could be saved, or no step of a recording that had some.
+    One that its writer did not finish is damaged, too. The file itself is only read, but with --in-place, which
+    finishes it as appending to it would. What was lost is said by episode and step; an episode that lost steps in the
+    middle becomes several. Exit code 1 only if nothing could be saved, or no step of a recording that had some.
     """
-    from tupli_mcap.recording import recover_recording
+    from tupli_mcap.recording import finish_recording, recover_recording
 
-    report = recover_recording(file, output, overwrite=force, dry_run=dry_run)
+    if in_place and (output is not None or force):
+        raise typer.BadParameter("--in-place writes no other file; leave --output and --force out")
+    if in_place:
+        report = finish_recording(file, dry_run=dry_run)
+    else:
+        report = recover_recording(file, output, overwrite=force, dry_run=dry_run)
     if as_json:
         print_json(report.to_json())
     else:

@@ -26,7 +26,7 @@ from tupli_mcap.schema import BaseFilter, parse_filter
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
 
-__all__ = ["FilterReport", "filter_recording", "relabel", "save", "trim"]
+__all__ = ["FilterReport", "file_path", "filter_recording", "relabel", "save", "trim"]
 
 
 class FilterReport(NamedTuple):
@@ -79,16 +79,21 @@ def filter_recording(
     return report._replace(size=target.stat().st_size)
 
 
+def file_path(place: str | os.PathLike[str]) -> Path:
+    """The path of a new file; DatasetError if it is that of a directory."""
+    if os.fspath(place).endswith(os.sep) or Path(place).is_dir():
+        raise DatasetError(f"{os.fspath(place)} is a directory; give the path of a file (.mcap)")
+    return Path(place)
+
+
 def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool) -> Path:
     """See `Dataset.save`."""
-    target = Path(place)
+    target = file_path(place)
     chosen: dict[str, list[int]] = {}
     for header in dataset.headers:
         chosen.setdefault(header.recording, []).append(header.episode)
     if not chosen:
         raise DatasetError("expected episodes to save, found none")
-    if target.is_dir() or os.fspath(place).endswith(os.sep):
-        raise DatasetError(f"{target} is a directory; give the path of a file (.mcap)")
     if target.exists() and not overwrite:
         raise DatasetError(f"{target} exists; choose another path, or overwrite it")
     sources = [dataset._recordings.get(name).path for name in chosen]

@@ -503,7 +503,7 @@ class Dataset(RandomAccess):
                 cannot be written.
             StepError: a value of variable size is none of its space.
         """
-        return curate.relabel(self, function, Path(target), fields, overwrite=overwrite)
+        return curate.relabel(self, function, curate.file_path(target), fields, overwrite=overwrite)
 
     def trim(
         self,
@@ -526,7 +526,7 @@ class Dataset(RandomAccess):
             DatasetError: there is no episode, or the target exists (and not `overwrite`).
             RecordingError: no step of an episode would stay, the slice has a stride, or the target cannot be written.
         """
-        return curate.trim(self, steps, Path(target), overwrite=overwrite)
+        return curate.trim(self, steps, curate.file_path(target), overwrite=overwrite)
 
     # ---- looking
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.edit.made_of import made_of, say_made_of
     from tupli_mcap.recording.edit.merge import MergeReport, Part, merge_recordings, split_recording
     from tupli_mcap.recording.edit.relabel import relabel_recording
-    from tupli_mcap.recording.edit.repair.recover import RecoveryReport, recover_recording
+    from tupli_mcap.recording.edit.repair.recover import RecoveryReport, finish_recording, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording
     from tupli_mcap.recording.edit.trim import trim_recording
     from tupli_mcap.recording.write.from_values import EpisodeData, write_recording
@@ -46,6 +46,7 @@ _HOMES = {
     "VerifyReport": "check.verify",
     "annotate_episodes": "edit.annotate",
     "edit_run": "edit.annotate",
+    "finish_recording": "edit.repair.recover",
     "made_of": "edit.made_of",
     "merge_recordings": "edit.merge",
     "recover_recording": "edit.repair.recover",
@@ -75,6 +76,7 @@ __all__ = [
     "VerifyReport",
     "annotate_episodes",
     "edit_run",
+    "finish_recording",
     "journal_path",
     "made_of",
     "merge_recordings",

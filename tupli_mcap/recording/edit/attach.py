@@ -64,7 +64,7 @@ def attach(path: Path, attachments: Mapping[str, tuple[str, bytes]], *, without:
         contents = read_contents(source)
         if not contents.complete:
             raise RecordingError(
-                f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover` finishes it"
+                f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover --in-place` finishes it"
             )
         _replace(path, source, contents, attachments, without)
 

@@ -1,6 +1,6 @@
 """A new recording out of a damaged one.
 
-recover   `recover_recording`: finds what is left, decides what to keep, and reports
+recover   `recover_recording`, `finish_recording`: find what is left, decide what to keep, and report
 write     writes it, renumbered
 frames    the frames of what is kept
 """

@@ -31,8 +31,18 @@ from tupli_mcap.recording.recover.evidence import Evidence, RecordedChannels
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.losses import losses
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
+from tupli_mcap.recording.write.options import RecordOptions
+from tupli_mcap.recording.write.writer import RecordingWriter
 
-__all__ = ["CutEpisode", "DamagedPlace", "LostSteps", "RecoveryReport", "recover_recording", "recovered_path"]
+__all__ = [
+    "CutEpisode",
+    "DamagedPlace",
+    "LostSteps",
+    "RecoveryReport",
+    "finish_recording",
+    "recover_recording",
+    "recovered_path",
+]
 
 
 class DamagedPlace(NamedTuple):
@@ -210,6 +220,28 @@ def _signature_fits(path: Path) -> bool:
         except (SignatureError, FormatError, MissingExtraError):
             return False
     return True
+
+
+def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> RecoveryReport:
+    """Finishes a recording that its writer did not finish, in its place, as appending to it would.
+
+    Nothing is done to one that is finished, nor to one of which something is lost: that is left to
+    `recover_recording`, which keeps the file as it is.
+
+    Raises:
+        RecordingError: something of it is lost or damaged, a writer is at work on it, or it cannot be written.
+        FormatError: it is no recording.
+    """
+    report = recover_recording(path, dry_run=True)
+    if report.lost or report.damaged or report.notes or report.journal not in ("none", "used"):
+        raise RecordingError(
+            f"{path}: something of it is lost or damaged; it is not changed, save what is good in a new file"
+        )
+    if not dry_run:
+        if not report.finished:
+            RecordingWriter(path, RecordOptions(mode="a")).close()
+        report.target = str(path)
+    return report
 
 
 def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") -> RecoveryReport:
