@@ -27,6 +27,7 @@ from tupli_mcap.recording import (
     merge_recordings,
     rewrite_recording,
     undo_annotation,
+    undo_edit,
     verify_recording,
 )
 from tupli_mcap.recording.edit.attach import add_attachments
@@ -252,6 +253,28 @@ class TestRun:
     def test_with_paths_in_its_metadata(self, tmp_path: Path) -> None:
         path = record(tmp_path / "r.mcap", metadata={"out": Path("a/b"), "more": [{"in": Path("c")}]})
         assert Recording(path).run.metadata == {"out": "a/b", "more": [{"in": "c"}]}
+
+
+class TestEdits:
+    def test_can_be_taken_back(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap", name="ppo", metadata={"lr": 1}, tags=["a"])
+        command("edit", str(path), "--name", "sac", "--set", "lr=2", "--set", "seed=3")
+        command("edit", str(path), "--tag", "b", "--split", "eval")
+        assert Recording(path).run.tags == ("b",)
+        command("edit", str(path), "--undo", "--dry-run")
+        run = undo_edit(path)
+        assert (run.name, run.tags, run.split, run.metadata) == ("sac", ("a",), "", {"lr": 2, "seed": 3})
+        assert "ppo" in command("edit", str(path), "--undo")
+        again = Recording(path).run
+        assert (again.name, again.metadata, again.started) == ("ppo", {"lr": 1}, run.started)
+        with pytest.raises(RecordingError, match="nothing was edited"):
+            undo_edit(path)
+        assert CliRunner().invoke(app, ["edit", str(path), "--undo", "--name", "x"]).exit_code == 2
+        for edit in range(30):
+            edit_run(path, name=f"{edit}")
+        document = json.loads(Recording(path).read_attachment("run.json"))
+        jsonschema.validate(document, json.loads((SCHEMAS / "run.schema.json").read_text()))
+        assert len(document["before"]) == 20
 
 
 class TestAnnotations:

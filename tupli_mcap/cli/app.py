@@ -252,7 +252,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
         "tag run.mcap --filter 'return > 100' quality=good",
         "tag run.mcap --undo",
     ),
-    "edit": ("edit run.mcap --name ppo-seed3 --set lr=0.0003 --tag baseline",),
+    "edit": ("edit run.mcap --name ppo-seed3 --set lr=0.0003 --tag baseline", "edit run.mcap --undo"),
     "info": ("info run.mcap", "info runs/"),
     "episodes": (
         "episodes run.mcap --filter 'return > 100'",

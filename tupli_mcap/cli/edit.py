@@ -150,6 +150,7 @@ def edit(
         list[str] | None, typer.Option("--tag", help="Of the run, in place of those it has.")
     ] = None,
     run_split: Annotated[str | None, typer.Option("--split", help="train, eval, …")] = None,
+    undo: Annotated[bool, typer.Option("--undo", help="Take back the last edit.")] = False,
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
@@ -158,12 +159,15 @@ def edit(
     The recording keeps its identity; the end of the file is written anew, its steps are not touched. A signature is
     left out.
     """
-    from tupli_mcap.recording import edit_run
+    from tupli_mcap.recording import edit_run, undo_edit
 
-    if name is None and not settings and tags is None and run_split is None:
-        raise typer.BadParameter("give what to change: --name, --set KEY=VALUE, --tag or --split")
+    if undo == any(given is not None for given in (name, settings, tags, run_split)):
+        raise typer.BadParameter("give what to change: --name, --set KEY=VALUE, --tag or --split; or --undo")
     metadata = dict(pair_of(text) for text in settings or ())
-    run = edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry_run)
+    if undo:
+        run = undo_edit(file, dry_run=dry_run)
+    else:
+        run = edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry_run)
     if as_json:
         print_json({"dry_run": dry_run, "path": str(file), "run": run.as_dict()})
         return

@@ -27,7 +27,7 @@ from tupli_mcap.recording.recording import Recording
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.check.verify import Problem, VerifyReport, verify_recording
-    from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation
+    from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation, undo_edit
     from tupli_mcap.recording.edit.made_of import made_of, say_made_of
     from tupli_mcap.recording.edit.merge import MergeReport, Part, merge_recordings, split_recording
     from tupli_mcap.recording.edit.relabel import relabel_recording
@@ -56,6 +56,7 @@ _HOMES = {
     "split_recording": "edit.merge",
     "trim_recording": "edit.trim",
     "undo_annotation": "edit.annotate",
+    "undo_edit": "edit.annotate",
     "verify_recording": "check.verify",
     "write_recording": "write.from_values",
 }
@@ -87,6 +88,7 @@ __all__ = [
     "split_recording",
     "trim_recording",
     "undo_annotation",
+    "undo_edit",
     "verify_recording",
     "write_recording",
 ]

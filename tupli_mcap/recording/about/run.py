@@ -124,11 +124,13 @@ class RecordedRuns(NamedTuple):
     """The runs that the episodes of a recording are of.
 
     runs: one, where the recording was not made of others. spans: (episodes, place in `runs`), by the order of episodes
-    in the index; episodes beyond the last span are of the last run.
+    in the index; episodes beyond the last span are of the last run. before: what an only run was called and said to be
+    before it was edited, the latest last.
     """
 
     runs: Sequence[Run]
     spans: Sequence[tuple[int, int]] = ()
+    before: Sequence[Run] = ()
 
     def places(self, episodes: int) -> list[int]:
         """The place in `runs` of each episode."""
@@ -142,13 +144,11 @@ class RecordedRuns(NamedTuple):
         Raises:
             RecordingError: JSON cannot hold the metadata, or they are too many.
         """
-        runs = [
-            {key: value for key, value in asdict(run).items() if value and key != "ended"}
-            for run in self.runs
-        ]
-        document: dict[str, Any] = {"runs": runs}
+        document: dict[str, Any] = {"runs": [_document(run) for run in self.runs]}
         if self.spans:
             document["spans"] = [list(span) for span in self.spans]
+        if self.before:
+            document["before"] = [_document(run) for run in self.before]
         try:
             data = jsonvalue.dumps_plain(document).encode()
         except (TypeError, ValueError) as err:
@@ -170,7 +170,18 @@ class RecordedRuns(NamedTuple):
         spans = document.get("spans", [])
         if not isinstance(spans, list) or not all(_is_span(span, len(runs)) for span in spans):
             raise FormatError(f"{where}: found {spans!r:.80} as the spans of runs; see run.schema.json")
-        return cls([Run.of_document(run, where) for run in runs], [(span[0], span[1]) for span in spans])
+        before = document.get("before", [])
+        if not isinstance(before, list):
+            raise FormatError(f"{where}: expected a list of what a run was before, found {before!r:.80}")
+        return cls(
+            [Run.of_document(run, where) for run in runs],
+            [(span[0], span[1]) for span in spans],
+            [Run.of_document(run, where) for run in before],
+        )
+
+
+def _document(run: Run) -> dict[str, Any]:
+    return {key: value for key, value in asdict(run).items() if value and key != "ended"}
 
 
 def _plain(value: Any) -> Any:

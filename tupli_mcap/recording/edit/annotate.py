@@ -26,7 +26,9 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
 
-__all__ = ["annotate_episodes", "edit_run", "undo_annotation"]
+__all__ = ["annotate_episodes", "edit_run", "undo_annotation", "undo_edit"]
+
+_MOST_EDITS = 20  # that can be taken back
 
 
 def annotate_episodes(
@@ -98,17 +100,14 @@ def edit_run(
 ) -> Run:
     """Changes what a recording says of its run, and returns it; what is not given stays.
 
-    `metadata` are added to those that there are; a value of None takes a key away. The recording keeps its identity.
+    `metadata` are added to those that there are; a value of None takes a key away. The recording keeps its identity,
+    and what was said before, for `undo_edit`.
 
     Raises:
         RecordingError: as `annotate_episodes`; or the recording was made of several runs.
     """
     with _changing(path, dry_run) as (recording, say):
-        if len(recording.runs) > 1:
-            raise RecordingError(
-                f"{path} is made of {len(recording.runs)} runs; edit the recordings that it was made of, and merge them"
-            )
-        (said,) = recording.recorded_runs.runs
+        said, before = _only_run(path, recording)
         added = {**said.metadata, **(metadata or {})}
         run = Run.given(
             said.name if name is None else name,
@@ -116,9 +115,36 @@ def edit_run(
             said.tags if tags is None else tags,
             said.split if split is None else split,
         )
+        was = Run(name=said.name, metadata=said.metadata, tags=said.tags, split=said.split)
         run = replace(said, name=run.name, metadata=run.metadata, tags=run.tags, split=run.split)
-        say(RUN_NAME, RUN_MEDIA_TYPE, RecordedRuns([run]).to_json())
+        say(RUN_NAME, RUN_MEDIA_TYPE, RecordedRuns([run], before=[*before, was][-_MOST_EDITS:]).to_json())
     return run
+
+
+def undo_edit(path: str | os.PathLike[str], *, dry_run: bool = False) -> Run:
+    """Takes back the last `edit_run`, and returns the run as it is then.
+
+    Raises:
+        RecordingError: as `edit_run`; or nothing was edited.
+    """
+    with _changing(path, dry_run) as (recording, say):
+        said, before = _only_run(path, recording)
+        if not before:
+            raise RecordingError(f"{path}: nothing was edited that could be taken back")
+        was = before[-1]
+        run = replace(said, name=was.name, metadata=was.metadata, tags=was.tags, split=was.split)
+        say(RUN_NAME, RUN_MEDIA_TYPE, RecordedRuns([run], before=before[:-1]).to_json())
+    return run
+
+
+def _only_run(path: str | os.PathLike[str], recording: Recording) -> tuple[Run, Sequence[Run]]:
+    """The run of a recording, and what it was before it was edited."""
+    if len(recording.runs) > 1:
+        raise RecordingError(
+            f"{path} is made of {len(recording.runs)} runs; edit the recordings that it was made of, and merge them"
+        )
+    (said,) = recording.recorded_runs.runs
+    return said, recording.recorded_runs.before
 
 
 @contextmanager
