@@ -11,7 +11,8 @@ import pytest
 from environments import Scripted
 
 import tupli_mcap
-from tupli_mcap import RecordEpisodes, TupliDataset
+from tupli_mcap import F, RecordEpisodes, TupliDataset
+from tupli_mcap.dataset import open_columns
 from tupli_mcap.dataset.items import SamplingError
 
 
@@ -69,7 +70,10 @@ def test_of_a_loader(dataset: tupli_mcap.Dataset, workers: int) -> None:
 def test_says_what_there_is(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None:
     with pytest.raises(SamplingError, match="did you mean 'force'"):
         dataset.windows(2, fields=["infos.forse"])
+    later = TupliDataset(tmp_path).with_tuple_filter(F("info.step") > 2)
+    assert later.windows(3, fields=["info.step"])[0].infos["step"].tolist() == [3, 4, 5]
+    later.save_columns(tmp_path / "columns")
     with pytest.raises(SamplingError, match=r"tupli_mcap\.open"):
-        TupliDataset(tmp_path).windows(2, fields=["infos"])
+        open_columns(tmp_path / "columns").windows(2, fields=["infos"])
     with pytest.raises(SamplingError, match="expected fields"):
         dataset.transitions(fields=["inform"])

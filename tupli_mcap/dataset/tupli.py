@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -261,6 +261,9 @@ class TupliDataset(RandomAccess):
     def infos(self) -> list[dict[str, Any]]:
         """The info of each step; empty where none was recorded."""
         return list(self._query.read(["infos"])["infos"])
+
+    def _infos(self) -> Sequence[Mapping[str, Any]]:
+        return self.infos
 
     def __len__(self) -> int:
         """The number of steps, after all filters; with a tuple filter, this evaluates it."""
