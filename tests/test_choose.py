@@ -107,7 +107,9 @@ def test_a_number_out_of_range_names_the_range(file: Path) -> None:
         choose_episodes(recording, "all")
 
 
-@pytest.mark.parametrize("text", ["", "3,", "beste", "-1", "1.0", "0x1", "3-", "1-2-3", "9" * 5000, "²", "1;2"])
+@pytest.mark.parametrize(
+    "text", ["", "3,", "beste", "-1", "1.0", "0x1", "3-", "1-2-3", "9" * 5000, "²", "1;2"]
+)
 def test_other_words_are_refused(file: Path, text: str) -> None:
     with (
         Recording(file) as recording,

@@ -6,12 +6,14 @@ from typing import Annotated
 
 import typer
 
-from tupli_mcap.cli.lists import print_episodes
+from tupli_mcap.cli.lists import episodes
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
+    ColumnNames,
     FilterText,
     Json,
     Limit,
+    Sort,
     StoragePath,
     filter_of,
     open_storage,
@@ -93,6 +95,8 @@ def list_artifacts(
 def list_episodes(
     storage_path: StoragePath = DEFAULT_STORAGE,
     filter_text: FilterText = None,
+    sort: Sort = None,
+    columns: ColumnNames = None,
     limit: Limit = None,
     as_json: Json = False,
 ) -> None:
@@ -102,9 +106,8 @@ def list_episodes(
     metadata.<name>, ... with = != > >= < <= in, and join with and, or, not. Times are "2026-11-23",
     "2026-11-23 03:31:07", "yesterday", "7d ago", ...: a text means all of the time that it names.
     """
-    with open_storage(storage_path) as storage:
-        headers = storage.list_episodes(filter_of(filter_text), limit=limit)
-    print_episodes(headers, as_json=as_json)
+    with open_storage(storage_path):  # which says where to look, if it is missing
+        episodes([storage_path], filter_text, sort, columns, limit, as_json)
 
 
 def compact(
@@ -123,11 +126,10 @@ def compact(
 
     with open_storage(storage_path) as storage:
         recordings = compactable(storage_path)
-        left = [str(path) for path in left_below(storage_path)]
+        left = list(left_below(storage_path))
         freed = 0 if dry_run else storage.compact()
     if as_json:
-        told = [item._asdict() for item in recordings]
-        print_json({"dry_run": dry_run, "recordings": told, "left_over": left, "bytes_freed": freed})
+        print_json({"dry_run": dry_run, "recordings": recordings, "left_over": left, "bytes_freed": freed})
         return
     if dry_run:
         columns = (Column("RECORDING", shrink="start"), Column("DELETED", "right"), Column("SIZE", "right"))
@@ -151,8 +153,8 @@ def reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) 
     """
     with open_storage(storage_path) as storage:
         storage.reindex()
-        episodes = storage.count_episodes()
+        count = storage.count_episodes()
     if as_json:
-        print_json({"storage": str(storage_path), "episodes": episodes})
+        print_json({"storage": storage_path, "episodes": count})
     else:
-        say(f"{storage_path}: {counted(episodes, 'episode')}")
+        say(f"{storage_path}: {counted(count, 'episode')}")
