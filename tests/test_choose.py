@@ -83,6 +83,16 @@ def test_deleted_episodes_are_not_there(file: Path) -> None:
         assert [e.number for e in choose_episodes(recording, "all", odd)] == [3, 5]
 
 
+@pytest.mark.parametrize(
+    ("text", "numbers"), [("1-3", [1, 2, 3]), ("4 - 9999999999,0-1", [4, 5, 0, 1]), ("2-2,3", [2, 3])]
+)
+def test_from_one_number_to_another(file: Path, text: str, numbers: list[int]) -> None:
+    with Recording(file) as recording:
+        assert [episode.number for episode in choose_episodes(recording, text)] == numbers
+        with pytest.raises(RecordingError, match="no episode 5-3; choose from 0 to 5"):
+            choose_episodes(recording, "5-3")
+
+
 def test_a_number_out_of_range_names_the_range(file: Path) -> None:
     with (
         Recording(file) as recording,
@@ -97,11 +107,13 @@ def test_a_number_out_of_range_names_the_range(file: Path) -> None:
         choose_episodes(recording, "all")
 
 
-@pytest.mark.parametrize("text", ["", "3,", "beste", "-1", "1.0", "0x1", "3-5", "9" * 5000, "²", "1;2"])
+@pytest.mark.parametrize(
+    "text", ["", "3,", "beste", "-1", "1.0", "0x1", "3-", "1-2-3", "9" * 5000, "²", "1;2"]
+)
 def test_other_words_are_refused(file: Path, text: str) -> None:
     with (
         Recording(file) as recording,
-        pytest.raises(FilterError, match=re.escape("'3,7,9', or best, worst, first, last or all, found")),
+        pytest.raises(FilterError, match=re.escape("'3,7-9', or best, worst, first, last or all, found")),
     ):
         choose_episodes(recording, text)
 

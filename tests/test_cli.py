@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 from mcap.writer import Writer
 from typer.core import TyperGroup
 from typer.main import get_command
@@ -58,8 +59,11 @@ class Result:
 
     @property
     def json(self) -> Any:
+        """The result in the one document that --json prints."""
         assert (self.code, self.err) == (0, "")
-        return json.loads(self.out)
+        document = json.loads(self.out)
+        assert list(document) == ["version", "command", "result"]
+        return document["result"]
 
 
 def run(*args: object) -> Result:
@@ -129,6 +133,10 @@ class Return(EpisodeMetadataCallback):
 
 class Wind(gym.Wrapper[Any, Any, Any, Any]):
     """In no registry: such an environment is pickled."""
+
+
+class Reach(CartPoleEnv):
+    """Of no registered id either: only its class has a name."""
 
 
 def fill(root: Path) -> tuple[str, str]:
@@ -238,7 +246,7 @@ class TestRecord:
         )
         args = ("-o", "a.mcap", "--steps", 300, "--num-envs", envs, "--policy", f"policy_of_{envs}:push")
         told = run("record", "CartPole-v1", *args, "--json").json
-        assert told["return_mean"] > 28  # random actions reach 22
+        assert told["return"] > 28  # random actions reach 22
         with Recording("a.mcap") as recording:
             columns = recording.read()
             np.testing.assert_array_equal(columns.actions, columns.states[:, 2] > 0)
@@ -437,7 +445,7 @@ class TestLook:
         assert rows[0].split()[1:6] == ["a", "CartPole-v1", *expected]
         assert rows[0].split()[-1] == "complete"
         (told,) = run("ls", "deep", "--json").json
-        assert told["path"] == "deep/b.mcap"
+        assert told["recording"] == "deep/b.mcap"
         assert (told["steps"], told["state"], told["error"]) == (200, "complete", None)
 
     def test_ls_of_nothing(self, here: Path) -> None:
@@ -455,7 +463,7 @@ class TestLook:
         assert second == "error: gone.mcap does not exist; give a recording (.mcap) or a directory of them"
         as_json = run("ls", "bad.mcap", "--json")
         assert as_json.code == 1
-        assert json.loads(as_json.out)[0]["error"].startswith("bad.mcap: expected an MCAP file")
+        assert json.loads(as_json.out)["result"][0]["error"].startswith("bad.mcap: expected an MCAP file")
 
     def test_ls_leaves_out_deleted_episodes(self, lab: tuple[Path, str, str]) -> None:
         with FileStorage(lab[0]) as storage:
@@ -528,7 +536,7 @@ class TestLook:
                 [math.nan, math.nan],
                 "return NaN in every episode",
                 "2 2 {} complete NaN in every episode",
-                {"$float": "nan"},
+                None,
             ),
             ([2.0, 4.0], "mean return 3", "2 2 3 {} complete", 3),
         ],
@@ -566,7 +574,73 @@ class TestLook:
         assert ok("ls", "r.mcap").splitlines()[1].startswith("r.mcap ")  # the note is what is cut
         (listed,) = run("ls", "r.mcap", "--json").json
         for facts in (as_json, listed):
-            assert (facts["return_mean"], facts["return_nan"]) == (mean, sum(map(math.isnan, returns)))
+            assert (facts["return"], facts["return_nan"]) == (mean, sum(map(math.isnan, returns)))
+
+    def test_info_of_some_episodes(self, cartpole: Path, here: Path) -> None:
+        with Recording(cartpole) as recording:
+            lengths = recording.index["length"]
+        chosen = lengths[lengths > 20]
+        told = run("info", cartpole, "--filter", "steps > 20", "--json").json
+        assert (told["episodes"], told["steps"]) == (len(chosen), chosen.sum())
+        assert told["returns"]["min"] == told["lengths"]["min"] == chosen.min()
+        assert sum(told["ends"].values()) == len(chosen)
+        whole = run("info", cartpole, "--json").json
+        assert (told["size"], told["channels"]) == (whole["size"], whole["channels"])
+        assert told["started"] >= whole["started"]
+        out = ok("info", cartpole, "--episodes", "1-2,best")
+        assert re.search(rf"^steps +{lengths[[1, 2, lengths.argmax()]].sum()},", out, re.MULTILINE)
+        shutil.copy(cartpole, "a.mcap")
+        for options in (["--episodes", "0-2"], ["--filter", "episode < 3"]):
+            assert run("info", ".", *options, "--json").json["steps"] == lengths[:3].sum()
+        assert "has no episode that" in fails("info", cartpole, "--filter", "steps > 999")
+
+    def test_the_least_and_the_most_are_in_one_form(self, here: Path) -> None:
+        ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 100, "--seed", 3)
+        steps = ok("info", "a.mcap").split("\n\n")[2].splitlines()[1:]
+        for column in (-1, -2):
+            assert {len(line.split()[column].partition(".")[2]) for line in steps} == {3}
+
+    def test_the_environment_has_one_name(self, here: Path) -> None:
+        with RecordEpisodes(Reach(), "a.mcap") as env:
+            env.reset(seed=1)
+            env.step(0)
+        (name,) = run("info", ".", "--json").json["environments"]
+        assert run("info", "a.mcap", "--json").json["environment"] == name
+        assert run("ls", "a.mcap", "--json").json[0]["environment"] == name
+
+    def test_the_columns_of_ls_as_json(self, cartpole: Path, here: Path) -> None:
+        (told,) = run("ls", cartpole, "--columns", "Steps,return", "--json").json
+        assert list(told) == ["steps", "return"]
+        listed = re.search(r"Columns are (.*?)\.", ok("ls", "--help"), re.DOTALL)
+        assert listed is not None
+        names = ",".join(re.findall(r"\w+", listed[1]))
+        assert ",".join(run("ls", cartpole, "--columns", names, "--json").json[0]) == names
+        assert told["steps"] == 200
+
+    def test_doctor_of_some_episodes(self, cartpole: Path, here: Path) -> None:
+        with Recording(cartpole) as recording:
+            lengths = recording.index["length"]
+        for which, steps in (("best", lengths.max()), ("1,3-4", lengths[[1, 3, 4]].sum())):
+            assert run("doctor", cartpole, "--episodes", which, "--json").json["steps"] == steps
+        assert "no episode 999" in fails("doctor", cartpole, "--episodes", "999")
+        assert "found 'x'" in fails("doctor", cartpole, "--episodes", "x", code=2)
+
+    def test_verify_of_some_episodes(self, cartpole: Path, here: Path) -> None:
+        with Recording(cartpole) as recording:
+            lengths = recording.index["length"]
+        args = ("verify", cartpole, "--rerun", "--filter", "steps > 20")
+        (replay,) = run(*args, "--json").json["replays"]
+        assert replay["certificate"]["chosen"]["episodes"] == (lengths > 20).sum()
+        (replay,) = run("verify", cartpole, "--rerun", "--episodes", "best,0-2", "--json").json["replays"]
+        assert replay["certificate"]["chosen"]["episodes"] in (3, 4)
+        shutil.copy(cartpole, "a.mcap")
+        ok("record", "CartPole-v1", "-o", "b.mcap", "--steps", 5)
+        told = run("verify", ".", "--rerun", "--filter", "steps > 20", "--json").json
+        assert [item["path"] for item in told["replays"]] == ["a.mcap"]
+        none = run("verify", cartpole, "--rerun", "--filter", "steps > 999")
+        assert (none.code, none.err.count("\n")) == (1, 1)
+        assert "nothing was replayed" in none.err
+        assert "go with --rerun" in fails("verify", cartpole, "--filter", "steps > 20", code=2)
 
     def test_info_of_an_empty_recording(self, here: Path) -> None:
         spaces = gym.make("CartPole-v1")
@@ -650,7 +724,7 @@ class TestLook:
             env.reset()
             env.step(0)
         (told,) = run("episodes", "a.mcap", "--json").json
-        assert told["metadata"] == {"score": {"$float": "nan"}, "at": 0.5, "name": "a\nb\x1b[31m"}
+        assert told["metadata"] == {"score": None, "at": 0.5, "name": "a\nb\x1b[31m"}
         out = ok("episodes", "a.mcap")
         assert r"score=nan, at=0.5, name=a\nb\x1b[31m" in out  # nothing in a file moves the cursor
 
@@ -716,7 +790,7 @@ def test_a_file_cut_off_later_is_read_up_to_there(here: Path, cartpole: Path) ->
         "warning: cut.mcap was not finished and has no journal cut.mcap.journal beside it"
     )
     assert result.err.count("\n") == 1
-    (told,) = json.loads(result.out)
+    (told,) = json.loads(result.out)["result"]
     assert (told["state"], told["error"]) == ("recovered", None)
 
 
@@ -847,11 +921,18 @@ class TestStorages:
         assert ok("reindex", "--storage", "lab") == "lab: 5 episodes\n"
         assert run("reindex", "--storage", "lab", "--json").json == {"storage": "lab", "episodes": 5}
 
+    def test_episodes_in_order(self, lab: tuple[Path, str, str]) -> None:
+        args = ("list-episodes", "--storage", "lab", "--sort", "-steps", "--limit", 3)
+        told = run(*args, "--columns", "steps,id", "--json").json
+        steps = [episode["steps"] for episode in run("list-episodes", "--storage", "lab", "--json").json]
+        assert [episode["steps"] for episode in told] == sorted(steps, reverse=True)[:3]
+        assert list(told[0]) == ["steps", "id"]
+
     def test_a_damaged_recording_is_a_warning(self, lab: tuple[Path, str, str]) -> None:
         Path("lab/bad.mcap").write_bytes(b"nonsense")
         result = run("list-episodes", "--storage", "lab", "--json")
         assert result.code == 0
-        assert len(json.loads(result.out)) == 5
+        assert len(json.loads(result.out)["result"]) == 5
         assert result.err.count("\n") == 1
         bad = Path("lab/bad.mcap").absolute()
         assert result.err.startswith(f"warning: skipped a recording: {bad}: expected an MCAP file")
@@ -1025,7 +1106,9 @@ class TestSharing:
         assert ok("trust", "--list") == f"environment  {digest}\n"
         for what in (path, digest, digest[:8]):
             ok("trust", path)
-            assert run("untrust", what, "--json").json == {"digest": digest, "was_trusted": True}
+            assert run("untrust", what, "--json").json == {
+                "digest": digest, "fingerprint": None, "was_trusted": True,
+            }  # fmt: skip
         assert ok("untrust", path) == f"{digest} was not trusted\n"
         assert run("trust", "--list", "--json").json["digests"] == []
         assert fails("untrust", digest[:8]).startswith("no trusted environments have a digest that starts")

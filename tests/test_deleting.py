@@ -51,9 +51,11 @@ def test_of_a_file_and_back(runs: Path) -> None:
     assert seeds(runs) == [0, 2, 0, 1, 2, 3]
     run("delete", str(file), "--episodes", "1", code=1)  # it is not there any more
     assert "would restore 2 episodes" in run("restore", str(runs), "--dry-run")
-    assert "restored 1 episode" in run("restore", str(file), "--episodes", "3")
+    assert "restored 1 episode" in run("restore", str(file), "--episodes", "2-3")
     assert seeds(file) == [0, 2, 3]
-    assert json.loads(run("restore", str(runs), "--json"))["episodes"] == [f"{Recording(file).uuid}-1"]
+    assert json.loads(run("restore", str(runs), "--json"))["result"]["episodes"] == [
+        f"{Recording(file).uuid}-1"
+    ]
     assert seeds(file) == [0, 1, 2, 3]
     assert sorted(path.name for path in runs.rglob("[!.]*")) == ["a.mcap", "b.mcap", "deep"]
 

@@ -782,9 +782,9 @@ def test_command_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert out.endswith(": 3 recordings, 6 episodes, 60 steps\n")
     assert "duplicate" in out and "duplicate" not in run("--level", "error")[1]
     code, text = run("--json")
-    document = json.loads(text)
-    assert code == 1 and document == examine(".").to_dict()
-    assert list(document) == ["version", "healthy", "worst", "files", "episodes", "steps", "findings"]
+    document = json.loads(text)["result"]
+    assert code == 1 and {"version": 1, **document} == examine(".").to_dict()
+    assert list(document) == ["healthy", "worst", "files", "episodes", "steps", "findings"]
     assert document["findings"][0] == {
         "check": "nan",
         "severity": "error",
@@ -798,6 +798,6 @@ def test_command_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         "places": [{"path": "a.mcap", "episode": i, "step": 4} for i in range(3)],
     }
     assert run("--list")[1].count("\n") == len(CHECKS) + 1
-    listed = json.loads(run("--list", "--json")[1])
+    listed = json.loads(run("--list", "--json")[1])["result"]
     assert [check["id"] for check in listed] == list(CHECKS)
     assert {"frames": 30} in [check["thresholds"] for check in listed]

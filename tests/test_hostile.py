@@ -625,8 +625,10 @@ def test_memory_that_runs_out_is_told(place: str, tmp_path: Path, monkeypatch: p
 def test_the_command_line_tells_that_memory_ran_out(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert _report(MemoryError("Unable to allocate 18.3 GiB")) == 1
-    assert "error: there is not enough memory" in capsys.readouterr().err
+    assert _report(MemoryError("Unable to allocate 18.3 GiB"), as_json=True) == 1
+    out, err = capsys.readouterr()
+    assert "error: there is not enough memory" in err
+    assert json.loads(out)["error"]["type"] == "MemoryError"
 
 
 def test_a_chunk_whose_rows_are_not_consecutive_ends_what_is_read(tmp_path: Path) -> None:

@@ -538,18 +538,20 @@ def test_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert done.exit_code == code, done.output
         return done.output
 
-    said = json.loads(run("merge", "0.mcap", "1.mcap", "-o", "all.mcap", "--dry-run", "--json"))
+    said = json.loads(run("merge", "0.mcap", "1.mcap", "-o", "all.mcap", "--dry-run", "--json"))["result"]
     assert (said["dry_run"], said["recordings"], said["steps"], said["size"]) == (True, 2, 300, 0)
     assert not Path("all.mcap").exists()
     assert "300 steps" in run("merge", "0.mcap", "1.mcap", "-o", "all.mcap")
     assert "exists" in run("merge", "0.mcap", "1.mcap", "-o", "all.mcap", code=1)
     run("merge", "0.mcap", "1.mcap", "-o", "all.mcap", "--force")
-    dry = json.loads(run("split", "all.mcap", "-o", "part.mcap", "--episodes", "30", "--dry-run", "--json"))
+    dry = json.loads(run("split", "all.mcap", "-o", "part.mcap", "--episodes", "30", "--dry-run", "--json"))[
+        "result"
+    ]
     assert not Path("part.mcap").exists()
     assert "part_0001.mcap" in run("split", "all.mcap", "-o", "part.mcap", "--episodes", "30")
     assert [Path(part["path"]).exists() for part in dry["recordings"]] == [True] * len(dry["recordings"])
     assert "either --episodes or --max-bytes" in run("split", "all.mcap", "-o", "x.mcap", code=2)
-    kept = json.loads(run("filter", "all.mcap", "n_tuples > 3", "-o", "some.mcap", "--json"))
+    kept = json.loads(run("filter", "all.mcap", "n_tuples > 3", "-o", "some.mcap", "--json"))["result"]
     assert (kept["path"], kept["episodes"]) == ("some.mcap", len(Recording("some.mcap")))
     assert "would write" in run("filter", "all.mcap", "n_tuples > 3", "-o", "none.mcap", "--dry-run")
     assert not Path("none.mcap").exists()

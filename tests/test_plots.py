@@ -906,7 +906,7 @@ def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         "time",
         "--json",
     )
-    told = json.loads(out)
+    told = json.loads(out)["result"]
     assert code == 0 and told["path"] == "two.pdf" and told["notes"] == []
     with Recording(tiny) as recording:
         assert told["episodes"] == int((recording.index["length"] > 9).sum())
@@ -928,7 +928,7 @@ def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         ),
         (["cartpole.mcap", "-o", "no/x.png"], 1, "there is no directory 'no'; make it first"),
         (["cartpole.mcap", "--episode", "999"], 1, "cartpole.mcap has no episode 999; choose from 0 to"),
-        (["cartpole.mcap", "--episode", "finest"], 2, "expected numbers of episodes such as '3,7,9'"),
+        (["cartpole.mcap", "--episode", "finest"], 2, "expected numbers of episodes such as '3,7-9'"),
         (["cartpole.mcap", "--episode", "all"], 1, "expected at most 4 episodes to show in full, found"),
         (
             ["cartpole.mcap", "--filter", "n_tuples > 99999"],

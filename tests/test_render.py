@@ -427,7 +427,7 @@ class TestCommandLine:
             "render", path, "-o", tmp_path / "best.gif", "--episodes", "0,2", "--force", "--json"
         )
         assert code == 0
-        assert [episode["episode"] for episode in json.loads(out)["episodes"]] == [0, 2]
+        assert [episode["episode"] for episode in json.loads(out)["result"]["episodes"]] == [0, 2]
 
     def test_the_best_episode_of_a_storage(self, tmp_path: Path) -> None:
         lengths = {"one": 5, "two": 9}

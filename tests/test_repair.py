@@ -615,7 +615,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert "nothing was written" in dry.output
     result = CliRunner().invoke(app, ["recover", str(path), "--json"])
     assert result.exit_code == 0
-    report = json.loads(result.output)
+    report = json.loads(result.output)["result"]
     assert report["target"] == str(tmp_path / "a.recovered.mcap")
     assert report["steps"] + report["steps_lost"] == 300
     shown = CliRunner().invoke(app, ["recover", str(path), "--force"])

@@ -437,7 +437,7 @@ def test_success_is_understood(key: str, record_info: bool, tmp_path: Path) -> N
     found = [episode.metadata for episode in Recording(path).episodes]
     assert found == [{"success": True}, {"success": False}, {"success": True}, {"success": True}]
     assert verify_recording(path).ok
-    (listed,) = json.loads(command("ls", str(path), "--json"))
+    (listed,) = json.loads(command("ls", str(path), "--json"))["result"]
     assert listed["success"] == 0.75
     assert "75%" in command("ls", str(path))
     assert "75%" in command("info", str(path))
@@ -481,8 +481,8 @@ class TestCommands:
         ]  # fmt: skip
         found = json.loads(
             command("ls", str(tmp_path), "--filter", "run.metadata.lr < 0.5 and seed = 0", "--json")
-        )
-        assert [(one["name"], one["episodes"]) for one in found] == [("run-1", 1), ("run-2", 1)]
+        )["result"]
+        assert [(one["run"], one["episodes"]) for one in found] == [("run-1", 1), ("run-2", 1)]
         wrong = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "retrn"])
         assert wrong.exit_code == 2
         assert "did you mean 'return'" in wrong.output
@@ -545,13 +545,15 @@ class TestCommands:
         text = command("info", str(tmp_path))
         for expected in ("run-0, run-1", "CartPole-v1", "6 (6 terminal)", "50%", "3 different", "k, success"):
             assert expected in text
-        found = json.loads(command("info", str(tmp_path), "--json"))
+        found = json.loads(command("info", str(tmp_path), "--json"))["result"]
         assert (found["recordings"], found["episodes"], found["success"]) == (2, 6, 0.5)
 
     def test_episodes_of_several_files_in_order(self, tmp_path: Path) -> None:
         paths = [str(record(tmp_path / f"{i}.mcap", name=f"run-{i}")) for i in range(2)]
-        found = json.loads(command("episodes", *paths, "--sort", "-return", "--limit", "3", "--json"))
-        returns = [one["episode_return"] for one in found]
+        found = json.loads(command("episodes", *paths, "--sort", "-return", "--limit", "3", "--json"))[
+            "result"
+        ]
+        returns = [one["return"] for one in found]
         assert len(returns) == 3
         assert returns == sorted(returns, reverse=True)
         assert found[0]["run"]["name"] in ("run-0", "run-1")
@@ -559,7 +561,7 @@ class TestCommands:
     def test_episodes_shows_the_columns_that_are_asked_for(self, tmp_path: Path) -> None:
         path = record(tmp_path / "r.mcap", name="a run", metadata={"lr": 0.001})
         keys = "episode,steps,run.metadata.lr"
-        found = json.loads(command("episodes", str(path), "--columns", keys, "--json"))
+        found = json.loads(command("episodes", str(path), "--columns", keys, "--json"))["result"]
         lengths = tupli_mcap.open(path).lengths.tolist()
         assert found == [
             {"episode": i, "steps": steps, "run.metadata.lr": 0.001} for i, steps in enumerate(lengths)

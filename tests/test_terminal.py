@@ -185,7 +185,7 @@ def test_names_and_texts_of_a_recording(recording: Path, tmp_path: Path) -> None
     ):
         run(*args)
     assert "[red]r[/red]" in run("episodes", recording)  # no markup: it is shown as it is
-    (told, *_) = json.loads(run("episodes", recording, "--json"))
+    (told, *_) = json.loads(run("episodes", recording, "--json"))["result"]
     assert told["metadata"] == {HOSTILE: HOSTILE, "list": [HOSTILE]}
 
 
@@ -322,7 +322,9 @@ def test_comments_of_keys(tmp_path: Path) -> None:
         run(*args, "--json")
     trust.trust_key(bytes(range(32)).hex(), HOSTILE)
     assert "pwned" in run("trust", "--list")
-    assert json.loads(run("trust", "--list", "--json"))["keys"][0]["name"].startswith("x\x1b]0;pwned\x07")
+    assert json.loads(run("trust", "--list", "--json"))["result"]["keys"][0]["name"].startswith(
+        "x\x1b]0;pwned\x07"
+    )
 
 
 def test_errors_of_other_peoples_code(tmp_path: Path) -> None:
@@ -388,7 +390,7 @@ def test_an_episode_that_cannot_be_printed_is_no_end_of_a_listing(
     print_episodes(headers, as_json=False)
     assert "a=7" in capsys.readouterr().out
     print_episodes(headers, as_json=True)
-    first, second = json.loads(capsys.readouterr().out)
+    first, second = json.loads(capsys.readouterr().out)["result"]
     assert (first["episode"], second["metadata"]) == (0, {"a": 7})
 
 
@@ -405,7 +407,7 @@ def test_json_stays_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
     value = {HOSTILE: [HOSTILE, "é日🙂", "\x7f\x80\u2029"]}
     print_json(value)
     printed = capsys.readouterr().out
-    assert json.loads(printed) == value
+    assert json.loads(printed)["result"] == value
     assert hidden(printed) == set()
     assert "é日🙂" in printed
     say_json('"\\ud800"')

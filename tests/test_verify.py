@@ -430,7 +430,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert f"{other}: ok" in both.output
     assert "2 verified, 1 damaged" in both.output
     assert "save what is good with tupli-mcap recover" in both.output
-    report = json.loads(CliRunner().invoke(app, ["verify", str(path), "--json"]).output)
+    report = json.loads(CliRunner().invoke(app, ["verify", str(path), "--json"]).output)["result"]
     assert (report["ok"], report["damaged"]) == (False, 1)
     assert report["reports"][0]["problems"][0]["kind"] == "chunk"
     assert CliRunner().invoke(app, ["verify"]).exit_code == 2
@@ -466,7 +466,9 @@ def test_one_bad_chunk_is_one_problem_in_the_text(topic: str, tmp_path: Path) ->
     )  # its CRC differs, or it cannot be decompressed
     assert shown.output.count("tupli-mcap recover") == 1
     assert "follow from that; see --json" in shown.output
-    problems = json.loads(CliRunner().invoke(app, ["verify", str(path), "--json"]).output)["reports"][0]
+    problems = json.loads(CliRunner().invoke(app, ["verify", str(path), "--json"]).output)["result"][
+        "reports"
+    ][0]
     assert [problem["follows"] for problem in problems["problems"]].count(False) == 1
     assert len(problems["problems"]) > 3
 

@@ -16,7 +16,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from tupli_mcap import errors
 from tupli_mcap.cli import bundle, doctor, edit, info, lists, record, render, replay, storage, trust, verify
+from tupli_mcap.cli.output import begin_json, print_json_error
 from tupli_mcap.cli.terminal import (
     fail,
     flush,
@@ -47,8 +49,9 @@ class _Group(TyperGroup):
     ) -> Any:
         words = list(sys.argv[1:] if args is None else args)
         given = words[: words.index("--")] if "--" in words else words
-        debug = "--debug" in given
+        debug, as_json = "--debug" in given, "--json" in given
         words = [word for word in given if word != "--debug"] + words[len(given) :]
+        begin_json(next((word for word in given if word in _NAMES), None))
         try:
             with warnings_in_one_line():
                 code = super().main(words, prog_name, complete_var, False, windows_expand_args, **extra)
@@ -56,7 +59,7 @@ class _Group(TyperGroup):
         except BaseException as err:  # noqa: BLE001 - what is no error of ours is raised again
             if debug and not isinstance(err, SystemExit):
                 print_traceback(err)
-            code = _report(err)
+            code = _report(err, as_json=as_json)
         if not standalone_mode:
             return code
         sys.exit(code if isinstance(code, int) else 0)
@@ -108,16 +111,19 @@ def _before_typer() -> Iterator[None]:
         raise _InterruptedError(*err.args) from err
 
 
-def _report(err: BaseException) -> int:
-    """Print the line of an error; returns the exit code. What is no error of a user's is raised again."""
+def _report(err: BaseException, *, as_json: bool) -> int:
+    """Print the line of an error, and its JSON; returns the exit code. What is no error of a user's is raised again."""
     message = str(err)
-    code = FAILED
+    code, kind = FAILED, _kind_of(err)
     if isinstance(err, OSError) and err.errno == errno.EPIPE:
         # The reader of our output has seen enough. Nothing may be written to it at exit either.
         stop_writing()
         return FAILED
     if isinstance(err, _InterruptedError | KeyboardInterrupt):
-        say_interrupted("; ".join(filter(None, ("interrupted", message))))
+        message = "; ".join(filter(None, ("interrupted", message)))
+        say_interrupted(message)
+        if as_json:
+            print_json_error("Interrupted", message, INTERRUPTED)
         return INTERRUPTED
     if isinstance(err, FilterError):
         code = USAGE  # filters come from the command line only
@@ -131,14 +137,24 @@ def _report(err: BaseException) -> int:
         name = "" if err.filename is None else f"{os.fsdecode(err.filename)}: "
         message = f"{name}{err.strerror or err}"
     elif hasattr(err, "format_message"):  # typer's own, wherever it has its classes from
-        message, code = err.format_message(), getattr(err, "exit_code", USAGE)
+        message, code, kind = err.format_message(), getattr(err, "exit_code", USAGE), "UsageError"
         context = getattr(err, "ctx", None)
         if context is not None:
             message = f"{message.rstrip('.')}; see {context.command_path} --help"
     elif not isinstance(err, TupliError):
+        if as_json and isinstance(err, Exception):
+            print_json_error(kind, message, FAILED)
         raise err
     fail(message)
+    if as_json:
+        print_json_error(kind, message, code)
     return code
+
+
+def _kind_of(err: BaseException) -> str:
+    """The name of an error's class that users know: one of `tupli_mcap.errors`, else OSError, else its own."""
+    known = [kind.__name__ for kind in type(err).__mro__ if kind.__name__ in (*errors.__all__, "OSError")]
+    return known[0] if known else type(err).__name__
 
 
 app = typer.Typer(
@@ -169,7 +185,7 @@ def _root(
 ) -> None:
     """Record reinforcement-learning episodes as MCAP files, look at them, share them.
 
-    Commands that print tables print JSON with --json. Exit codes: 0, 1 (it failed, or found
+    Commands print JSON with --json, errors too. Exit codes: 0, 1 (it failed, or found
     something), 2 (usage), 130 (Ctrl-C).
     """
     if context.invoked_subcommand is None:
@@ -253,7 +269,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
         "tag run.mcap --undo",
     ),
     "edit": ("edit run.mcap --name ppo-seed3 --set lr=0.0003 --tag baseline", "edit run.mcap --undo"),
-    "info": ("info run.mcap", "info runs/"),
+    "info": ("info run.mcap", "info runs/", "info run.mcap --filter 'return > 100'"),
     "episodes": (
         "episodes run.mcap --filter 'return > 100'",
         "episodes a.mcap b.mcap --sort -return --limit 10",
@@ -262,7 +278,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "view": ("view run.mcap", "view run.mcap --episodes best,worst --compare", "view lab/ --web"),
     "plot": ("plot run.mcap -o report.html", "plot runs/ --x steps -o compared.pdf"),
     "render": ("render run.mcap -o best.mp4", "render run.mcap -o first.gif --episodes first --rerun"),
-    "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning"),
+    "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning", "doctor run.mcap --episodes best,worst"),
     "verify": ("verify run.mcap", "verify run.mcap --rerun --episodes 0,4,10-19"),
     "filter": ("filter run.mcap 'return > 100 and metadata.success' -o good.mcap",),
     "delete": ("delete run.mcap --episodes 3,7", "delete lab/ --filter 'return < 10' --dry-run"),

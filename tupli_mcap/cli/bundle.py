@@ -156,7 +156,8 @@ def _print_written(path: Path, as_json: bool) -> None:
 
     (item,) = list_recordings([path])
     if as_json:
-        print_json(item._asdict())
+        facts = {"path": path, "benchmark_id": item.benchmark_id}
+        print_json({**facts, "episodes": item.episodes, "steps": item.steps, "size": item.size})
     else:
         say(
             f"{path}: {counted(item.episodes, 'episode')}, {counted(item.steps, 'step')}, {bytes_of(item.size)}"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import FilterText, Json, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
 from tupli_mcap.cli.output import Column, counted, number, print_json, print_table, print_wrapped, short_ids
 from tupli_mcap.cli.terminal import say, say_styled, status
 
@@ -39,6 +40,7 @@ def doctor(
         list[str] | None,
         typer.Argument(metavar="PATH", help="Recordings, directories, storages, URLs; here by default."),
     ] = None,
+    episodes: Episodes = None,
     filter_text: FilterText = None,
     fail_on: Annotated[
         _FailOn, typer.Option(help="Exit with 1 if there is a finding as bad as this.")
@@ -65,23 +67,28 @@ def doctor(
     An error is wrong data, a warning is probably wrong, info is worth knowing. Exit code 1 if there is an
     error (see --fail-on) or a file that cannot be read; the others are examined all the same.
     """
+    from tupli_mcap.dataset.which import chosen_from
     from tupli_mcap.doctor import Severity, examine
 
     if list_checks:
         _print_checks(as_json)
         return
     checks, skipped, thresholds = _checked(check), _checked(skip), _thresholds(settings or ())
-    with status("examining") as progress:
+    wanted, sources = filter_of(filter_text), paths or ["."]
+    with (
+        nullcontext(sources) if episodes is None else chosen_from(sources, episodes, wanted) as chosen,
+        status("examining") as progress,
+    ):
         diagnosis = examine(
-            paths or ["."],
+            chosen,
             checks=checks,
             skip=skipped or (),
             thresholds=thresholds,
-            episode_filter=filter_of(filter_text),
+            episode_filter=wanted,
             progress=progress,
         )
     if as_json:
-        print_json(diagnosis.to_dict())
+        print_json({key: value for key, value in diagnosis.to_dict().items() if key != "version"})
     else:
         _print(diagnosis, Severity[level.name.upper()])
     failing = () if fail_on is _FailOn.never else diagnosis.at_least(Severity[fail_on.name.upper()])

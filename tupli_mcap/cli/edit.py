@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import FilterText, Json, filter_of, pair_of
+from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of, pair_of
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
@@ -57,7 +57,7 @@ def merge(
 
     report = merge_recordings(files, output, overwrite=force, dry_run=dry_run)
     if as_json:
-        print_json({"dry_run": dry_run, **_plain(report)})
+        print_json({"dry_run": dry_run, **report._asdict()})
         return
     _print_made(report, dry_run)
 
@@ -82,7 +82,7 @@ def split(
 
     parts = split_recording(file, output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
     if as_json:
-        print_json({"dry_run": dry_run, "recordings": [_plain(part) for part in parts]})
+        print_json({"dry_run": dry_run, "recordings": parts})
         return
     columns = (Column("RECORDING", shrink="start"), Column("EPISODES", "right"), Column("STEPS", "right"))
     rows = [(str(part.path), number(part.episodes), number(part.steps)) for part in parts]
@@ -93,10 +93,7 @@ def tag(
     files: Annotated[
         list[str], typer.Argument(metavar="FILE|KEY=VALUE", help="Recordings, and what to say.")
     ],
-    episodes: Annotated[
-        str | None,
-        typer.Option("--episodes", "--episode", metavar="3,7", help="Numbers, best, last, …; all else."),
-    ] = None,
+    episodes: Episodes = None,
     filter_text: FilterText = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take back what was said last.")] = False,
     dry_run: _DryRun = False,
@@ -118,23 +115,25 @@ def tag(
         raise typer.BadParameter(
             "give recordings, and KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 success=true"
         )
-    wanted, done = filter_of(filter_text), list[dict[str, Any]]()
+    wanted = filter_of(filter_text)
+    done: list[dict[str, Any]] = []
     for path in paths:
         if undo:
             last = undo_annotation(path, dry_run=dry_run)
-            done.append({"path": str(path), "episodes": last.episodes, "undone": last.values})
+            done.append({"path": path, "episodes": last.episodes, "values": last.values})
             continue
         with Recording(path) as recording:
             chosen = [episode.number for episode in choose_episodes(recording, episodes or "all", wanted)]
         annotate_episodes(path, values, chosen, dry_run=dry_run)
-        done.append({"path": str(path), "episodes": chosen, "values": values})
+        done.append({"path": path, "episodes": chosen, "values": values})
     if as_json:
-        print_json([{"dry_run": dry_run, **one} for one in done])
+        print_json([{"dry_run": dry_run, "undone": undo, **one} for one in done])
         return
     for one in done:
         would = "would be " if dry_run else ""
-        said = one["undone" if undo else "values"]
-        shown = ", ".join(f"{key}={'' if value is None else dumps_any(value)}" for key, value in said.items())
+        shown = ", ".join(
+            f"{key}={'' if value is None else dumps_any(value)}" for key, value in one["values"].items()
+        )
         count = counted(len(one["episodes"]), "episode")
         say(f"{one['path']}: {count} {would}{'undone' if undo else 'annotated'}: {shown}")
 
@@ -169,7 +168,7 @@ def edit(
     else:
         run = edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry_run)
     if as_json:
-        print_json({"dry_run": dry_run, "path": str(file), "run": run.as_dict()})
+        print_json({"dry_run": dry_run, "path": file, "run": run.as_dict()})
         return
     from tupli_mcap.jsonvalue import shown
 
@@ -196,7 +195,7 @@ def filter_(
 
     report = filter_recording(file, output, filter_text, overwrite=force, dry_run=dry_run)
     if as_json:
-        print_json({"dry_run": dry_run, **_plain(report)})
+        print_json({"dry_run": dry_run, **report._asdict()})
         return
     _print_made(report, dry_run)
 
@@ -207,10 +206,7 @@ def trim(
         str, typer.Option("--steps", metavar="10:-5", help="The steps that stay: first, and where to stop.")
     ],
     output: _Output,
-    episodes: Annotated[
-        str | None,
-        typer.Option("--episodes", "--episode", metavar="3,7", help="Numbers, best, last, …; all else."),
-    ] = None,
+    episodes: Episodes = None,
     filter_text: FilterText = None,
     force: _Force = False,
     dry_run: _DryRun = False,
@@ -237,13 +233,9 @@ def trim(
         wanted = {episode.number: kept for episode in chosen}
         report = trim_recording(recording, output, wanted, overwrite=force, dry_run=dry_run)
     if as_json:
-        print_json({"dry_run": dry_run, **_plain(report)})
+        print_json({"dry_run": dry_run, **report._asdict()})
         return
     _print_made(report, dry_run)
-
-
-def _plain(report: Any) -> dict[str, Any]:
-    return {**report._asdict(), "path": str(report.path)}
 
 
 def _print_made(report: Any, dry_run: bool) -> None:

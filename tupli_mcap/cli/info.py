@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import Json
+from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
     counted,
     number,
+    numbers,
     print_facts,
     print_json,
     print_table,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording import Recording
     from tupli_mcap.recording.description import RecordingDescription, Spread
     from tupli_mcap.recording.series import Series
+    from tupli_mcap.schema import BaseFilter
 
 __all__ = ["info", "sparkline"]
 
@@ -42,9 +44,10 @@ _OTHERS = 44  # columns of a line beside its blocks
 _LONGEST_NAME = 24
 
 
-def _print_directory(path: Path, *, as_json: bool) -> None:
-    """Facts about all recordings of a directory."""
+def _print_directory(path: Path, episodes: str | None, wanted: BaseFilter | None, *, as_json: bool) -> None:
+    """Facts about all recordings of a directory, or of some of their episodes."""
     from tupli_mcap import open as open_dataset
+    from tupli_mcap.dataset.which import chosen_from
     from tupli_mcap.recording.about.success import success_of
     from tupli_mcap.recording.description import spread_of
     from tupli_mcap.storage.listing import find_recordings
@@ -52,6 +55,12 @@ def _print_directory(path: Path, *, as_json: bool) -> None:
     if not find_recordings(path):
         raise RecordingError(f"{path} is a directory; it holds no recording (.mcap)")
     dataset = open_dataset(path)
+    if episodes is not None:
+        with chosen_from(path, episodes, wanted) as chosen:
+            ids = {found.recording.episodes[at].id for found in chosen for at in found.positions}
+        dataset = dataset[[header.id in ids for header in dataset.headers]]
+    elif wanted is not None:
+        dataset = dataset.filter(wanted)
     headers = dataset.headers
     said = [found for header in headers if (found := success_of(header.metadata)) is not None]
     ends: dict[str, int] = {}
@@ -69,11 +78,9 @@ def _print_directory(path: Path, *, as_json: bool) -> None:
     if as_json:
         print_json(
             {
-                "directory": str(path), "recordings": recordings, "runs": runs, "environments": environments,
-                "episodes": len(headers), "ends": ends, "steps": dataset.n_steps,
-                "lengths": None if lengths is None else lengths._asdict(),
-                "returns": None if returns is None else returns._asdict(),
-                "success": rate, "seeds": len(seeds), "metadata": keys,
+                "path": path, "recordings": recordings, "runs": runs, "environments": environments,
+                "episodes": len(headers), "ends": ends, "steps": dataset.n_steps, "lengths": lengths,
+                "returns": returns, "success": rate, "seeds": len(seeds), "metadata_keys": keys,
             }
         )  # fmt: skip
         return
@@ -101,6 +108,8 @@ def info(
     file: Annotated[
         str, typer.Argument(metavar="FILE|DIR", help="A recording (a path or a URL), or a directory of them.")
     ],
+    episodes: Episodes = None,
+    filter_text: FilterText = None,
     as_json: Json = False,
 ) -> None:
     """Show what is in a recording, or in all of a directory.
@@ -108,23 +117,30 @@ def info(
     Spaces, benchmark, statistics, returns and lengths of episodes, how rewards, actions and states are
     distributed, channels and attachments. Of long recordings, only some steps are read; of URLs, none.
     Of a directory: its runs, environments and episodes, and the keys of their metadata.
+    --episodes and --filter say of which episodes; channels, attachments and size are those of the whole file.
     """
-    from dataclasses import asdict
-
     from tupli_mcap.recording import Recording
     from tupli_mcap.recording.description import describe
 
+    wanted = filter_of(filter_text)
     if "://" not in file and Path(file).is_dir():
-        _print_directory(Path(file), as_json=as_json)
+        _print_directory(Path(file), episodes, wanted, as_json=as_json)
         return
     with Recording(file) as recording:
-        description = describe(recording)
+        positions = None
+        if episodes is not None or wanted is not None:
+            import numpy as np
+
+            from tupli_mcap.dataset.which import candidates, named_positions
+
+            among = candidates(recording, wanted)
+            positions = np.array(sorted(named_positions(recording, among, episodes or "all", wanted)))
+        description = describe(recording, positions)
         if not as_json:
             print_facts(_facts(description))
-            _print_series(recording)
+            _print_series(recording, positions, description.steps)
     if as_json:
-        channels = [channel._asdict() for channel in description.channels]
-        print_json({**asdict(description), "channels": channels, **_spreads(description)})
+        print_json(_json_of(description))
         return
     if description.channels:
         say("")
@@ -138,9 +154,15 @@ def info(
         )
 
 
-def _spreads(description: RecordingDescription) -> dict[str, dict[str, float] | None]:
-    named = {"lengths": description.lengths, "returns": description.returns}
-    return {name: None if spread is None else spread._asdict() for name, spread in named.items()}
+def _json_of(description: RecordingDescription) -> dict[str, Any]:
+    from tupli_mcap.schema.times import iso_utc
+
+    facts = {"path": description.name, **vars(description)}
+    del facts["name"]
+    for name, key in (("created_ns", "created_at"), ("start_ns", "started"), ("end_ns", "ended")):
+        time_ns = facts.pop(name)
+        facts[key] = iso_utc(time_ns) if time_ns else None
+    return facts
 
 
 def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
@@ -253,12 +275,12 @@ def sparkline(values: Sequence[float], *, zero_based: bool = False, blocks: str 
     return line
 
 
-def _print_series(recording: Recording) -> None:
+def _print_series(recording: Recording, positions: Any, steps: int) -> None:
     """Returns and lengths over episodes, and how rewards, actions and states are distributed."""
     from tupli_mcap.recording.series import sketch
 
     room = (terminal_width() or _WIDEST + _OTHERS) - _OTHERS
-    summary = sketch(recording, max(_NARROWEST, min(_WIDEST, room)))
+    summary = sketch(recording, max(_NARROWEST, min(_WIDEST, room)), positions)
     if not summary.courses:
         return
     say("")
@@ -268,7 +290,7 @@ def _print_series(recording: Recording) -> None:
     if summary.distributions:
         say("")
         _print_sparklines("STEPS", "LEAST TO MOST", summary.distributions, zero_based=True)
-        told = "" if summary.sampled == recording.num_steps else f"{number(summary.sampled)} steps sampled"
+        told = "" if summary.sampled == steps else f"{number(summary.sampled)} steps sampled"
         hidden = f"{number(summary.hidden)} more dimensions" if summary.hidden else ""
         if told or hidden:
             say(", ".join(filter(None, (hidden, told))))
@@ -282,12 +304,12 @@ def _print_series(recording: Recording) -> None:
 def _print_sparklines(title: str, spark: str, series: Sequence[Series], *, zero_based: bool) -> None:
     blocks = BLOCKS if can_print(BLOCKS) else PLAIN
     columns = (Column(title, shrink="end"), Column(spark), Column("LEAST", "right"), Column("MOST", "right"))
-    rows = [
-        (
-            one.name if len(one.name) <= _LONGEST_NAME else f"{one.name[:8]}...{one.name[-13:]}",
-            sparkline(one.values, zero_based=zero_based, blocks=blocks),
-            *("" if math.isnan(end) else number(end, 3) for end in (one.least, one.most)),
-        )
-        for one in series
+    names = [
+        one.name if len(one.name) <= _LONGEST_NAME else f"{one.name[:8]}...{one.name[-13:]}" for one in series
     ]
-    print_table(columns, rows, empty="")
+    lines = [sparkline(one.values, zero_based=zero_based, blocks=blocks) for one in series]
+    least, most = (
+        numbers([None if math.isnan(end) else end for end in ends], 3)
+        for ends in ([one.least for one in series], [one.most for one in series])
+    )
+    print_table(columns, list(zip(names, lines, least, most, strict=True)), empty="")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from tupli_mcap.cli.options import FilterText, Json, Limit, filter_of, open_storage
+from tupli_mcap.cli.options import ColumnNames, FilterText, Json, Limit, Sort, filter_of, open_storage
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
@@ -77,16 +77,13 @@ def ls(
         typer.Argument(metavar="PATH", help="Files, directories, storages; here by default.", readable=False),
     ] = None,
     filter_text: FilterText = None,
-    sort: Annotated[
-        str | None, typer.Option(metavar="COLUMN", help="Order by a column; -COLUMN puts the largest first.")
-    ] = None,
-    columns: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help=f"Which columns, of {', '.join(_COLUMNS)}.")
-    ] = None,
+    sort: Sort = None,
+    columns: ColumnNames = None,
     as_json: Json = False,
 ) -> None:
     """List recordings in files and directories: their runs.
 
+    Columns are recording, run, environment, episodes, steps, return, success, started, size, state.
     RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; or recovered:
     its writer was killed or failed, and all steps that were finished are there, if its journal is.
     Deleted episodes of a storage are not counted; with --filter, only episodes that it is true of are.
@@ -104,7 +101,7 @@ def ls(
         listed = _sorted(listed, _column(sort.removeprefix("-")).field, descending=sort.startswith("-"))
     good = [item for item in listed if item.error is None]
     if as_json:
-        print_json([item._asdict() for item in listed])
+        print_json(_json_of_runs(listed, columns))
     elif good or not listed:
         _print_runs(good, _chosen_columns(columns, good))
     bad = [item for item in listed if item.error is not None]
@@ -142,6 +139,26 @@ def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[
     return [_COLUMNS[name] for name in [*names, *(["started"] * roomy), "size", "state"]]
 
 
+def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list[dict[str, Any]]:
+    """The chosen columns of recordings, or all there is to say."""
+    from tupli_mcap.schema.times import iso_utc
+
+    if columns is not None:
+        names = [name.strip().lower() for name in columns.split(",")]
+        fields = [_column(name).field for name in names]
+        return [dict(zip(names, (getattr(item, field) for field in fields), strict=True)) for item in items]
+    return [
+        {
+            **{name: getattr(item, listed.field) for name, listed in _COLUMNS.items()},
+            "return_nan": item.return_nan,
+            "created_at": iso_utc(item.created_ns) if item.created_ns else None,
+            "benchmark_id": item.benchmark_id,
+            "error": item.error,
+        }
+        for item in items
+    ]
+
+
 def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed]) -> None:
     from tupli_mcap.recording.description import nan_text
 
@@ -158,13 +175,8 @@ def episodes(
         list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", readable=False)
     ],
     filter_text: FilterText = None,
-    sort: Annotated[
-        str | None,
-        typer.Option(metavar="KEY", help="Order by return, steps, …; -KEY puts the largest first."),
-    ] = None,
-    columns: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help="Which keys, such as steps,return,metadata.score.")
-    ] = None,
+    sort: Sort = None,
+    columns: ColumnNames = None,
     limit: Limit = None,
     as_json: Json = False,
 ) -> None:
@@ -172,7 +184,7 @@ def episodes(
 
     Filters compare keys of episodes (steps, return, end, seed, env, ended, metadata.<name>, run.<name>, ...) with
     = != > >= < <= in, and join with and, or, not. Times are "2026-11-23", "2026-11-23 03:31:07", "yesterday",
-    "last tuesday", "7d ago", ...: a text means all of the time that it names.
+    "last tuesday", "7d ago", ...: a text means all of the time that it names. --sort and --columns take the same keys.
     """
     wanted = filter_of(filter_text)
     headers: Sequence[EpisodeHeader]
@@ -220,7 +232,11 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
 def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
     """Print episodes as a table or as JSON."""
     if as_json:
-        print_json([header.model_dump() for header in headers])
+        from tupli_mcap.schema import EpisodeHeader
+        from tupli_mcap.schema.facts import filter_keys, path_in
+
+        fields = {key: path_in(key, EpisodeHeader)[0] for key in filter_keys(EpisodeHeader)}
+        print_json([{key: getattr(header, field) for key, field in fields.items()} for header in headers])
         return
     several = len({header.recording for header in headers}) > 1
     roomy = (terminal_width() or _ROOMY) >= _ROOMY

@@ -14,10 +14,29 @@ if TYPE_CHECKING:
     from tupli_mcap.storage import FileStorage
 
 __all__ = [
-    "FilterText", "Json", "Limit", "StoragePath", "filter_of", "full_id", "open_storage", "pair_of"
+    "ColumnNames", "Episodes", "FilterText", "Json", "Limit", "Sort", "StoragePath", "filter_of", "full_id",
+    "open_storage", "pair_of"
 ]  # fmt: skip
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead.")]
+Episodes = Annotated[
+    str | None,
+    typer.Option(
+        "--episodes",
+        "--episode",
+        "-e",
+        metavar="WHICH",
+        help="Numbers such as 3,7-9, or best, worst, first, last, all.",
+    ),
+]
+Sort = Annotated[
+    str | None,
+    typer.Option(metavar="KEY", help="Order by a column, such as return; -KEY puts the largest first."),
+]
+ColumnNames = Annotated[
+    str | None,
+    typer.Option("--columns", metavar="A,B,…", help="Which columns, such as steps,return."),
+]
 Limit = Annotated[int | None, typer.Option(min=0, help="Print at most so many.")]
 FilterText = Annotated[
     str | None,

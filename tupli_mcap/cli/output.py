@@ -6,18 +6,23 @@ import math
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any, Final, Literal, NamedTuple
 
 from tupli_mcap.cli.terminal import say, say_json, say_styled, terminal_width, visible
 
 __all__ = [
+    "JSON_VERSION",
     "Column",
+    "begin_json",
     "bytes_of",
     "counted",
     "number",
     "numbers",
     "print_facts",
     "print_json",
+    "print_json_error",
     "print_table",
     "print_wrapped",
     "short_ids",
@@ -26,6 +31,10 @@ __all__ = [
     "when",
 ]
 
+JSON_VERSION: Final = 1
+"""Of what --json prints: another one where a key goes away, or means something else. New keys may come at any time."""
+
+_OWN_LEVELS: Final = 6  # of lists and records in a result; what lies deeper is a user's
 _GAP = "  "
 _WIDEST = 100  # columns of running text
 _LONG_ID = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{20,52}\b")
@@ -92,18 +101,66 @@ def print_wrapped(text: str, first: str, others: str) -> None:
     say(*(lines or [""]))
 
 
-def print_json(value: Any) -> None:
-    """Print a value as one JSON document: NumPy values as numbers and lists, NaN as `{"$float": "nan"}`."""
+# --- JSON, as docs/json.md describes it ---
+
+
+@dataclass
+class _Document:
+    """The one document of this call of the program."""
+
+    command: str | None = None
+    printed: bool = False
+
+
+_document = _Document()
+
+
+def begin_json(command: str | None) -> None:
+    """Name the command whose result, or error, will be printed; None where there is none of that name."""
+    _document.command, _document.printed = command, False
+
+
+def print_json(result: Any) -> None:
+    """Print what a command found out as one JSON document: `{"version", "command", "result"}`.
+
+    NamedTuples become objects, paths texts, NumPy values numbers and lists, NaN and infinities null.
+    """
+    _print_document({"result": _plain(result, _OWN_LEVELS)})
+
+
+def print_json_error(kind: str, message: str, exit_code: int) -> None:
+    """Print an error as one JSON document: `{"version", "command", "error"}`, unless there is one already."""
+    if not _document.printed:
+        _print_document({"error": {"type": kind, "message": message, "exit_code": exit_code}})
+
+
+def _print_document(content: dict[str, Any]) -> None:
     import json
 
     from tupli_mcap.jsonvalue import MAX_DEPTH, dumps_plain
 
+    value = {"version": JSON_VERSION, "command": _document.command, **content}
     most = 2 * MAX_DEPTH  # of what was read, and of the lists and objects it is printed in
     try:
         text = dumps_plain(value, max_depth=most)
     except (TypeError, ValueError):
         text = dumps_plain(_printable(value, MAX_DEPTH // 2))
-    say_json(json.dumps(json.loads(text), indent=2, ensure_ascii=False))
+    finite = json.loads(text, object_hook=lambda found: None if found.keys() == {"$float"} else found)
+    _document.printed = True
+    say_json(json.dumps(finite, indent=2, ensure_ascii=False))
+
+
+def _plain(value: Any, levels: int) -> Any:
+    """NamedTuples as dicts, and paths as texts, `levels` deep; what lies deeper stays as it is."""
+    if isinstance(value, PurePath):
+        return str(value)
+    if levels and hasattr(value, "_asdict"):
+        value = value._asdict()
+    if levels and isinstance(value, dict):
+        return {key: _plain(item, levels - 1) for key, item in value.items()}
+    if levels and isinstance(value, list | tuple):
+        return [_plain(item, levels - 1) for item in value]
+    return value
 
 
 def _printable(value: Any, levels: int) -> Any:

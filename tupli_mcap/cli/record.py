@@ -179,8 +179,9 @@ def record(
 
 def _print_rollout(summary: RolloutSummary, *, as_json: bool) -> None:
     if as_json:
-        paths = [str(path) for path in summary.paths]
-        print_json({**summary._asdict(), "path": str(summary.path), "paths": paths})
+        told = {**summary._asdict(), "return": summary.return_mean}
+        del told["return_mean"]
+        print_json(told)
         return
     last = "" if len(summary.paths) == 1 else f" to {summary.path.name}"
     facts = [

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import FilterText, Json, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
 from tupli_mcap.cli.output import bytes_of, counted, number, print_json
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError
@@ -44,9 +44,6 @@ _Source = Annotated[
     ),
 ]
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
-_Episodes = Annotated[
-    str, typer.Option(metavar="WHICH", help="Numbers such as 3,7, or best, worst, first, last, all.")
-]
 _Every = Annotated[int, typer.Option(min=1, help="A frame of every so many steps, and the last.")]
 _Width = Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Of the frames (pixels).")]
 _FrameFormat = Annotated[_Format, typer.Option("--format", help="Of the frames in a .mcap: png is exact.")]
@@ -59,7 +56,7 @@ _Force = Annotated[bool, typer.Option("--force", help="Replace the output if it 
 def render(
     source: _Source,
     output: _Output,
-    episodes: _Episodes = "best",
+    episodes: Episodes = "best",
     filter_text: FilterText = None,
     every: _Every = 1,
     width: _Width = None,
@@ -89,13 +86,13 @@ def render(
     # no window is opened: pygame need not look for a screen
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     with (
-        _chosen(source, episodes, filter_of(filter_text)) as (recording, chosen),
+        _chosen(source, episodes or "best", filter_of(filter_text)) as (recording, chosen),
         step_progress(sum(map(len, chosen)), "rendering") as progress,
     ):
         if output.suffix.lower() != ".mcap" and not rerun and all(map(has_pictures, chosen)):
             count = film(chosen, output, overwrite=force)
             if as_json:
-                print_json({"path": str(output), "pictures": count, "recorded": True})
+                print_json({"path": output, "frames": count, "recorded": True, "ok": True})
             else:
                 say(f"{output}: {counted(count, 'recorded picture')}")
             return
@@ -146,11 +143,10 @@ def _plain(report: RenderReport) -> dict[str, object]:
     divergence = report.divergence
     return {
         **report._asdict(),
-        "path": None if report.path is None else str(report.path),
-        "episodes": [episode._asdict() for episode in report.episodes],
         "divergence": None if divergence is None else divergence.model_dump(),
         "skipped": [skipped.model_dump() for skipped in report.skipped],
         "frames": report.frames,
+        "recorded": False,
         "ok": report.ok,
     }
 
@@ -238,7 +234,7 @@ def plot(
         sum(counts) for counts in zip(*((len(m.rows), m.steps) for m in made.measured), strict=True)
     )
     if as_json:
-        told = {"path": str(goal), "size": size, "recordings": len(made.measured), "episodes": episodes}
+        told = {"path": goal, "size": size, "recordings": len(made.measured), "episodes": episodes}
         print_json({**told, "steps": steps, "notes": made.notes})
     else:
         say(f"{goal}: {counted(episodes, 'episode')}, {counted(steps, 'step')}, {bytes_of(size)}")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tupli_mcap.cli.options import FilterText, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, filter_of
 from tupli_mcap.cli.output import bytes_of
 from tupli_mcap.cli.terminal import flush, say
 
@@ -15,16 +15,6 @@ __all__ = ["replay"]
 
 _Sources = Annotated[
     list[str], typer.Argument(metavar="PATH", help="Recordings, URLs, directories of a storage.")
-]
-_Episode = Annotated[
-    str | None,
-    typer.Option(
-        "--episodes",
-        "--episode",
-        "-e",
-        metavar="WHICH",
-        help="Such as 3,7,9, best, worst, first, last, all; of many, by default last,best,worst.",
-    ),
 ]
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Split = Annotated[
@@ -54,7 +44,7 @@ _Layout = Annotated[
 
 def replay(
     sources: _Sources,
-    episode: _Episode = None,
+    episode: Episodes = None,
     filter_text: FilterText = None,
     compare: _Compare = False,
     split: _Split = False,

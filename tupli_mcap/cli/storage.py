@@ -7,12 +7,15 @@ from typing import Annotated
 
 import typer
 
-from tupli_mcap.cli.lists import print_episodes
+from tupli_mcap.cli.lists import episodes
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
+    ColumnNames,
+    Episodes,
     FilterText,
     Json,
     Limit,
+    Sort,
     StoragePath,
     filter_of,
     open_storage,
@@ -95,6 +98,8 @@ def list_artifacts(
 def list_episodes(
     storage_path: StoragePath = DEFAULT_STORAGE,
     filter_text: FilterText = None,
+    sort: Sort = None,
+    columns: ColumnNames = None,
     limit: Limit = None,
     as_json: Json = False,
 ) -> None:
@@ -104,23 +109,19 @@ def list_episodes(
     metadata.<name>, ... with = != > >= < <= in, and join with and, or, not. Times are "2026-11-23",
     "2026-11-23 03:31:07", "yesterday", "7d ago", ...: a text means all of the time that it names.
     """
-    with open_storage(storage_path) as storage:
-        headers = storage.list_episodes(filter_of(filter_text), limit=limit)
-    print_episodes(headers, as_json=as_json)
+    with open_storage(storage_path):  # which says where to look, if it is missing
+        episodes([storage_path], filter_text, sort, columns, limit, as_json)
 
 
 _Paths = Annotated[
     list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", readable=False)
-]
-_Chosen = Annotated[
-    str | None, typer.Option("--episodes", "--episode", metavar="3,7", help="Numbers, best, last, …")
 ]
 _DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say how many there are.")]
 
 
 def delete(
     paths: _Paths,
-    episodes: _Chosen = None,
+    episodes: Episodes = None,
     filter_text: FilterText = None,
     force: Annotated[
         bool, typer.Option("--force", help="Remove a recording of which nothing is left.")
@@ -165,16 +166,19 @@ def delete(
     say(f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}")
 
 
-def restore(paths: _Paths, episodes: _Chosen = None, dry_run: _DryRun = False, as_json: Json = False) -> None:
+def restore(
+    paths: _Paths, episodes: Episodes = None, dry_run: _DryRun = False, as_json: Json = False
+) -> None:
     """Bring deleted episodes back, by default all.
 
     Those that compact has freed the space of are gone.
     """
+    from tupli_mcap.dataset.which import bounds_of
     from tupli_mcap.recording.recover.prefix import metadata_at
     from tupli_mcap.storage.listing import find_recordings
     from tupli_mcap.storage.sidecar import storage_of
 
-    numbers = None if episodes is None else {word.strip() for word in episodes.split(",")}
+    wanted = [bounds_of(item.strip(), episodes) for item in episodes.split(",")] if episodes else None
     restored: list[str] = []
     by_root: dict[Path, set[str]] = {}
     for file in (file for given in paths for file in find_recordings(given)):
@@ -184,7 +188,8 @@ def restore(paths: _Paths, episodes: _Chosen = None, dry_run: _DryRun = False, a
             chosen = []
             for one in storage.deleted_episodes():
                 uuid, _, found = one.partition("-")
-                if uuid in uuids and (numbers is None or found in numbers):
+                named = wanted is None or any(first <= int(found) <= last for first, last in wanted)
+                if uuid in uuids and named:
                     chosen.append(one)
             if not dry_run:
                 storage.restore_episodes(chosen)
@@ -211,11 +216,10 @@ def compact(
 
     with open_storage(storage_path) as storage:
         recordings = compactable(storage_path)
-        left = [str(path) for path in left_below(storage_path)]
+        left = list(left_below(storage_path))
         freed = 0 if dry_run else storage.compact()
     if as_json:
-        told = [item._asdict() for item in recordings]
-        print_json({"dry_run": dry_run, "recordings": told, "left_over": left, "bytes_freed": freed})
+        print_json({"dry_run": dry_run, "recordings": recordings, "left_over": left, "bytes_freed": freed})
         return
     if dry_run:
         columns = (Column("RECORDING", shrink="start"), Column("DELETED", "right"), Column("SIZE", "right"))
@@ -239,8 +243,8 @@ def reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) 
     """
     with open_storage(storage_path) as storage:
         storage.reindex()
-        episodes = storage.count_episodes()
+        count = storage.count_episodes()
     if as_json:
-        print_json({"storage": str(storage_path), "episodes": episodes})
+        print_json({"storage": storage_path, "episodes": count})
     else:
-        say(f"{storage_path}: {counted(episodes, 'episode')}")
+        say(f"{storage_path}: {counted(count, 'episode')}")

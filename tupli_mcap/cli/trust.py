@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -58,7 +58,7 @@ def trust(
         return
     code = carried_code(file) if show else set_trust(file, trusted=not remove)
     if as_json:
-        print_json(_json_of(code))
+        print_json(code)
     else:
         print_facts(_facts_of_code(code))
 
@@ -96,17 +96,17 @@ def untrust(
 
     if (what is None) == (key is None):
         raise typer.BadParameter("expected either a FILE or DIGEST, or --key")
+    digest = signer = None
     if key is not None:
         trusted_key = find_key(key)
-        label, shown = "fingerprint", fingerprint(trusted_key.public_key)
+        signer = fingerprint(trusted_key.public_key)
         was_trusted = trust.untrust_key(trusted_key.public_key)
     else:
-        label = "digest"
-        shown, was_trusted = untrust(what or "")
+        digest, was_trusted = untrust(what or "")
     if as_json:
-        print_json({label: shown, "was_trusted": was_trusted})
+        print_json({"digest": digest, "fingerprint": signer, "was_trusted": was_trusted})
     else:
-        say(f"{shown} {'is trusted no longer' if was_trusted else 'was not trusted'}")
+        say(f"{digest or signer} {'is trusted no longer' if was_trusted else 'was not trusted'}")
 
 
 def _list(*, as_json: bool) -> None:
@@ -116,17 +116,11 @@ def _list(*, as_json: bool) -> None:
     digests = trust.trusted_digests()
     keys = [{"fingerprint": fingerprint(key.public_key), "name": key.name} for key in trust.trusted_keys()]
     if as_json:
-        print_json({"config_dir": str(trust.config_dir()), "digests": digests, "keys": keys})
+        print_json({"config_dir": trust.config_dir(), "digests": digests, "keys": keys})
         return
     lines = [f"environment  {digest}" for digest in digests]
     lines += [f"key          {key['fingerprint']} {key['name']}" for key in keys]
     say(*(lines or ["nothing is trusted"]))
-
-
-def _json_of(code: CarriedCode) -> dict[str, Any]:
-    imports = None if code.imports is None else code.imports._asdict()
-    entry_points = [one._asdict() for one in code.entry_points]
-    return {**code._asdict(), "entry_points": entry_points, "imports": imports}
 
 
 def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:

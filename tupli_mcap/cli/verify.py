@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Json
+from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
 from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
 from tupli_mcap.cli.terminal import fail, say, step_progress
-from tupli_mcap.errors import TupliError
+from tupli_mcap.errors import RecordingError, TupliError
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording import VerifyReport
+    from tupli_mcap.recording import Recording, VerifyReport
     from tupli_mcap.replay import Certificate
+    from tupli_mcap.schema import BaseFilter
 
 __all__ = ["verify"]
 
@@ -25,7 +25,6 @@ _STATES = {"unfinished": "not finished", "recording": "being recorded"}
 _NOTHING = "nothing to be done"
 _PROBLEMS = 20  # of a file that are shown; what is beyond is in --json
 _DIVERGING = 5  # episodes beside the first that are shown; what is beyond is in --json
-_MAX_NUMBERS = 10_000_000
 
 
 def verify(
@@ -41,9 +40,8 @@ def verify(
         bool,
         typer.Option("--trust", help="With --rerun: run the code that the files carry, with all options."),
     ] = False,
-    episodes: Annotated[
-        str | None, typer.Option(metavar="NUMBERS", help="With --rerun: only these, such as 0,4,10-19.")
-    ] = None,
+    episodes: Episodes = None,
+    filter_text: FilterText = None,
     as_json: Json = False,
 ) -> None:
     """Check files for damage.
@@ -54,10 +52,11 @@ def verify(
 
     --rerun rebuilds the environment of each recording, takes every episode again with its seed, options and
     actions, and says where something differs. Exit code 1 if something does, or nothing could be checked.
+    --episodes and --filter choose those that are taken again; what they depend on is, too.
     """
-    replays = _Replays(trust, _episode_numbers(episodes)) if replay else None
-    if replays is None and (trust or episodes is not None):
-        raise typer.BadParameter("--trust and --episodes go with --rerun")
+    replays = _Replays(trust, episodes, filter_of(filter_text)) if replay else None
+    if replays is None and (trust or episodes is not None or filter_text is not None):
+        raise typer.BadParameter("--trust, --episodes and --filter go with --rerun")
     from tupli_mcap.storage.verify import StorageReport, verify_paths
 
     storage_report = StorageReport()
@@ -67,17 +66,14 @@ def verify(
             _print_verified(report)
         if replays is not None and report.kind == "recording" and report.ok:
             replays.add(Path(report.path), quiet=as_json)
+    if not storage_report.files:
+        raise RecordingError("there is nothing to verify; give recordings (.mcap) or directories of them")
     if as_json:
-        print_json(
-            {**storage_report.to_json(), **({} if replays is None else {"replays": replays.to_json()})}
-        )
-    elif not storage_report.files:
-        fail("there is nothing to verify; give recordings (.mcap) or directories of them")
-        raise typer.Exit(1)
+        print_json({**storage_report.to_json(), "replays": None if replays is None else replays.to_json()})
     elif len(storage_report.files) > 1:
         say(f"{number(len(storage_report.files))} verified, {number(len(storage_report.damaged))} damaged")
     if replays is not None and not replays.tried and not as_json:
-        fail("nothing was replayed: there is no undamaged recording; recover one first")
+        fail("nothing was replayed: there is no undamaged recording with such an episode")
     if not storage_report.ok or (replays is not None and not replays.ok):
         raise typer.Exit(1)
 
@@ -119,28 +115,17 @@ def _print_verified(report: VerifyReport) -> None:
 # --- with --rerun ---
 
 
-def _episode_numbers(text: str | None) -> list[int] | None:
-    """Numbers such as "0,4,10-19"; None for all."""
-    if text is None:
-        return None
-    numbers: list[int] = []
-    for part in text.split(","):
-        first, dash, last = (word.strip() for word in part.partition("-"))
-        if not first.isdecimal() or (dash and not last.isdecimal()) or len(first + last) > 20:
-            raise typer.BadParameter(f"expected episodes such as 0,4,10-19, found {text[:80]!r}")
-        stop = int(last or first) + 1
-        if stop - int(first) + len(numbers) > _MAX_NUMBERS:
-            raise typer.BadParameter(f"expected at most {number(_MAX_NUMBERS)} episodes, found {text[:80]!r}")
-        numbers += range(int(first), stop)
-    return numbers
-
-
 class _Replays:
     """Recordings replayed one after another; one that cannot be stops nothing."""
 
-    def __init__(self, trust: bool, episodes: Sequence[int] | None) -> None:
+    def __init__(self, trust: bool, episodes: str | None, wanted: BaseFilter | None) -> None:
+        if episodes is not None or wanted is not None:  # the choice takes a while to import
+            from tupli_mcap.dataset.which import check_choice
+
+            check_choice(episodes or "all", wanted)
         self._trust = trust
         self._episodes = episodes
+        self._wanted = wanted
         self._found: list[tuple[Path, Certificate | None, str]] = []
 
     @property
@@ -162,9 +147,10 @@ class _Replays:
         began = time.perf_counter()
         try:
             with Recording(path) as recording, step_progress(recording.num_steps, "replaying") as progress:
-                certificate = certify(
-                    recording, trust=self._trust, episodes=self._episodes, progress=progress
-                )
+                numbers = self._numbers(recording)
+                if numbers == []:
+                    return
+                certificate = certify(recording, trust=self._trust, episodes=numbers, progress=progress)
             seconds = time.perf_counter() - began
         except TupliError as err:
             self._found.append((path, None, str(err)))
@@ -177,10 +163,26 @@ class _Replays:
             for line in _lines(certificate, seconds):
                 print_wrapped(line, "  ", "    ")
 
+    def _numbers(self, recording: Recording) -> list[int] | None:
+        """The chosen episodes; None for all, none if the filter leaves all out."""
+        from tupli_mcap.dataset.which import candidates, named_positions
+
+        if self._episodes is None and self._wanted is None:
+            return None
+        among = candidates(recording, self._wanted)
+        if self._wanted is not None and not len(among):
+            return []
+        positions = named_positions(recording, among, self._episodes or "all", self._wanted)
+        return [int(number) for number in recording.index["episode"][positions]]
+
     def to_json(self) -> list[dict[str, Any]]:
         return [
-            {"path": str(path)}
-            | ({"error": error} if found is None else {"agrees": found.agrees, **found.model_dump()})
+            {
+                "path": path,
+                "agrees": found is not None and found.agrees,
+                "error": error or None,
+                "certificate": None if found is None else found.model_dump(),
+            }
             for path, found, error in self._found
         ]
 

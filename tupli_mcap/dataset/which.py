@@ -31,7 +31,9 @@ __all__ = [
     "Examinable",
     "Source",
     "Subject",
+    "bounds_of",
     "candidates",
+    "check_choice",
     "choose_episodes",
     "chosen_from",
     "extremes",
@@ -64,10 +66,10 @@ class Listed(Protocol):
 def choose_episodes(
     recording: Recording, text: str = "all", filter: BaseFilter | None = None
 ) -> list[Episode]:
-    """The episodes that a text such as "3,7,9", "best" or "first,last" names, in its order, each once.
+    """The episodes that a text such as "3,7-9", "best" or "first,last" names, in its order, each once.
 
     Args:
-        text: numbers of episodes and `WORDS`, with commas between them.
+        text: numbers of episodes, from one to another (those that there are of them) and `WORDS`, with commas between.
         filter: the choice is among the episodes it is true of; a number it leaves out is an error.
 
     Episodes that the recording's storage has deleted are not there.
@@ -78,6 +80,17 @@ def choose_episodes(
     """
     among = candidates(recording, filter)
     return [recording.episodes[position] for position in named_positions(recording, among, text, filter)]
+
+
+def check_choice(text: str, filter: BaseFilter | None = None) -> None:
+    """Raises FilterError where `choose_episodes` would, of any recording."""
+    for item in text.split(","):
+        if item.strip().lower() not in WORDS:
+            bounds_of(item.strip(), text)
+    if filter is not None:
+        from tupli_mcap.schema import EpisodeHeader, check_keys
+
+        check_keys(filter, EpisodeHeader)
 
 
 def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positions:
@@ -138,16 +151,23 @@ def _named(recording: Recording, among: Positions, item: str, text: str, why: st
         return [int(among[0 if item == "first" else -1])]
     if item in ("best", "worst"):
         return [int(among[_extreme(item, recording.index["return"][among])])]
-    if not item.isdecimal() or len(item) > _MAX_DIGITS:
-        raise FilterError(
-            f"expected numbers of episodes such as '3,7,9', or {', '.join(WORDS[:-1])} or {WORDS[-1]}, "
-            f"found {item[:40]!r} in {text[:80]!r}"
-        )
+    first, last = bounds_of(item, text)
     numbers = recording.index["episode"][among]
-    matching = among[numbers == int(item)]
+    matching = among[(numbers >= first) & (numbers <= last)]
     if not len(matching):
         raise RecordingError(f"{recording.name} has no episode {item}{why}; choose from {_range(numbers)}")
-    return [int(matching[0])]
+    return [int(position) for position in matching]
+
+
+def bounds_of(item: str, text: str) -> tuple[int, int]:
+    """The first and the last number that `3` or `7-9` in a text names."""
+    first, dash, last = (part.strip() for part in item.partition("-"))
+    if not all(part.isdecimal() and len(part) <= _MAX_DIGITS for part in (first, last if dash else first)):
+        raise FilterError(
+            f"expected numbers of episodes such as '3,7-9', or {', '.join(WORDS[:-1])} or {WORDS[-1]}, "
+            f"found {item[:40]!r} in {text[:80]!r}"
+        )
+    return int(first), int(last or first)
 
 
 def _extreme(word: str, returns: Any) -> int:
@@ -182,9 +202,11 @@ class Subject:
 
 
 def subjects_of(
-    source: Examinable | Iterable[Examinable], episode_filter: BaseFilter | None
+    source: Examinable | Chosen | Iterable[Examinable | Chosen], episode_filter: BaseFilter | None
 ) -> Iterator[Subject]:
     """The recordings of a path, a directory, a recording, a dataset (each once), a storage, or several of those.
+
+    The filter is for all but `Chosen`, which are chosen already.
 
     Raises:
         RecordingError: it is none of those.
@@ -205,6 +227,11 @@ def subjects_of(
         yield from _of_headers(*source._episodes(episode_filter))
     elif isinstance(source, TupliStorage):
         yield from subjects_of(TupliDataset(source), episode_filter)
+    elif isinstance(source, Chosen):  # a tuple too: it comes before other iterables
+        recording, positions = source
+        yield Subject(
+            recording.name, lambda: nullcontext(recording), lambda _: np.asarray(positions, np.int64)
+        )
     elif isinstance(source, Iterable):
         for item in source:
             yield from subjects_of(item, episode_filter)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from tupli_mcap.dataset.which import Examinable, Subject, subjects_of
+from tupli_mcap.dataset.which import Chosen, Examinable, Subject, subjects_of
 from tupli_mcap.doctor.checks import CHECKS, Check
 from tupli_mcap.doctor.findings import Diagnosis, Finding, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic
@@ -18,7 +18,7 @@ UNREADABLE = "unreadable"
 
 
 def examine(
-    source: Examinable | Iterable[Examinable],
+    source: Examinable | Iterable[Examinable | Chosen],
     *,
     checks: Collection[str] | None = None,
     skip: Collection[str] = (),
@@ -34,7 +34,8 @@ def examine(
     Args:
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
             `TupliDataset` (its episodes, whole: tuple filters are for steps), a storage, or several of those.
-            Episodes that a storage has deleted are left out, except of an open `Recording`.
+            Episodes that a storage has deleted are left out, except of an open `Recording`. What
+            `dataset.which.chosen_from` has chosen is examined as it is.
         checks: ids of the checks to run (see `CHECKS`); all by default. skip: those to leave out.
         thresholds: for the id of a check, values of its thresholds (see `CHECKS[id].thresholds`).
         episode_filter: examine only episodes that it is true of.

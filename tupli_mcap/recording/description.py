@@ -72,7 +72,7 @@ class RecordingDescription:
     size: bytes of the file. created_ns, start_ns, end_ns: wall clock; the latter two are 0 without
         an episode.
     compression: bytes of messages for one byte of chunks in the file; None without a chunk.
-    ends: episodes by how they ended. environment: the name its benchmark says, None if it carries none.
+    ends: episodes by how they ended. environment: the name that its run says, else its benchmark; None if none does.
     run: what is known of the run. made_of: of which recordings it was made; None if it was recorded.
     metadata_keys: those that episodes have. success: see `success_rate`.
     observation, action: their spaces in lines for people, see `space_lines`; empty where there is no step.
@@ -109,18 +109,23 @@ class RecordingDescription:
     attachments: list[dict[str, Any]]
 
 
-def describe(recording: Recording) -> RecordingDescription:
+def describe(recording: Recording, positions: Array | None = None) -> RecordingDescription:
     """The facts; only the summary, the episode index and attachments such as `benchmark.json` are read.
+
+    Args:
+        positions: of the episodes that count for times, ends, steps, lengths, returns, success and metadata keys; all
+            by default. Other facts are those of the whole file.
 
     Raises:
         FormatError: the environment that the recording carries is damaged, or its labels are.
     """
-    rows = recording.index
+    positions = np.arange(len(recording.index)) if positions is None else positions
+    rows, run = recording.index[positions], recording.readable_runs[0]
     contents = recording.file.contents
     table = contents.table
     chunks = table[table["offset"] < IN_MEMORY]
     stored = int(chunks["length"].sum())
-    carried = "benchmark.json" in recording.attachments
+    named = recording.benchmark.record.name if "benchmark.json" in recording.attachments else None
     layout = recording.layout if recording.num_envs else None
     return RecordingDescription(
         name=recording.name,
@@ -132,15 +137,15 @@ def describe(recording: Recording) -> RecordingDescription:
         start_ns=int(rows["start_time"].min()) if len(rows) else 0,
         end_ns=int(rows["end_time"].max()) if len(rows) else 0,
         benchmark_id=recording.benchmark_id,
-        environment=recording.benchmark.record.name if carried else None,
+        environment=run.environment or named,
         signed_by=claimed_signer(recording),
-        run={key: value for key, value in vars(recording.readable_runs[0]).items() if value},
+        run={key: value for key, value in vars(run).items() if value},
         made_of=made_of(recording),
-        metadata_keys=_metadata_keys(recording),
-        success=success_rate(recording, np.arange(len(rows))),
+        metadata_keys=_metadata_keys(recording, positions),
+        success=success_rate(recording, positions),
         num_envs=recording.num_envs,
         episodes=len(rows),
-        steps=recording.num_steps,
+        steps=int(rows["length"].sum()),
         ends={name: int((rows["end"] == i).sum()) for i, name in enumerate(END_NAMES)},
         lengths=spread_of(rows["length"]),
         returns=spread_of(rows["return"]),
@@ -161,8 +166,9 @@ def state_of(recording: Recording) -> str:
     return "recording" if recording.path is not None and is_locked(recording.path) else "recovered"
 
 
-def _metadata_keys(recording: Recording) -> list[str]:
-    texts = set(recording.all_metadata()) - {"{}"}
+def _metadata_keys(recording: Recording, positions: Array) -> list[str]:
+    every = recording.all_metadata()
+    texts = {every[i] for i in positions.tolist()} - {"{}"}
     found: dict[str, None] = {}
     for text in texts:
         found.update(dict.fromkeys(jsonvalue.loads(text)))

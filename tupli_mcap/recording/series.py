@@ -58,18 +58,22 @@ class Sketch(NamedTuple):
     error: str = ""
 
 
-def sketch(recording: Recording, points: int) -> Sketch:
-    """Series of at most `points` numbers. A few steps are read, if the recording is a local file; no image."""
-    rows = recording.index
+def sketch(recording: Recording, points: int, positions: Array | None = None) -> Sketch:
+    """Series of at most `points` numbers, of the episodes at some positions (all by default).
+
+    A few steps are read, if the recording is a local file; no image.
+    """
+    positions = np.arange(len(recording.index)) if positions is None else positions
+    rows = recording.index[positions]
     courses = tuple(
         found
         for name, column in (("return", "return"), ("length", "length"))
         if (found := _course(name, rows[column].astype(np.float64), points)) is not None
     )
-    if not recording.num_envs or recording.path is None or not recording.num_steps:
+    if not recording.num_envs or recording.path is None or not rows["length"].sum():
         return Sketch(courses, (), 0, 0)
     try:
-        pieces = list(_pieces(recording))
+        pieces = list(_pieces(recording, positions))
     except TupliError as err:  # a damaged chunk hides nothing else
         return Sketch(courses, (), 0, 0, str(err))
     layout = recording.layout
@@ -100,35 +104,35 @@ def _course(name: str, values: Array, points: int) -> Series | None:
     return Series(name, tuple(means.tolist()), least, most, odd, each)
 
 
-def _pieces(recording: Recording) -> Iterator[Columns]:
-    """Steps of the whole recording, or some at even distances."""
-    total = recording.num_steps
+def _pieces(recording: Recording, positions: Array) -> Iterator[Columns]:
+    """Steps of all these episodes, or some at even distances."""
+    total = int(recording.index["length"][positions].sum())
     constant = recording.layout.constant
     most = READ_BYTES // step_bytes(recording.layout, images=False)
     if total <= most and constant:
-        yield recording.read(fields=_FIELDS, images=False)
+        yield recording.read(positions, fields=_FIELDS, images=False)
         return
     places, each = (_PLACES, _AT_EACH) if constant else (_VARIABLE_PLACES, _VARIABLE_AT_EACH)
     each = max(1, min(each, most // places))
     if total <= places * each:
         places, each = 1, total
     for begin in np.linspace(0, total - each, places).astype(np.int64).tolist():
-        yield from _consecutive(recording, begin, begin + each)
+        yield from _consecutive(recording, positions, begin, begin + each)
 
 
-def _consecutive(recording: Recording, begin: int, stop: int) -> Iterator[Columns]:
-    """The steps `begin:stop` of the recording, counted from one episode to the next."""
-    lengths = recording.index["length"].astype(np.int64)
+def _consecutive(recording: Recording, positions: Array, begin: int, stop: int) -> Iterator[Columns]:
+    """The steps `begin:stop` of these episodes, counted from one to the next."""
+    lengths = recording.index["length"][positions].astype(np.int64)
     ends = np.cumsum(lengths)
     first, last = np.searchsorted(ends, [begin, stop - 1], side="right").tolist()
     start, end = begin - int(ends[first] - lengths[first]), stop - int(ends[last] - lengths[last])
     if first == last:
-        yield recording.read_steps(first, start, end, _FIELDS, images=False)
+        yield recording.read_steps(int(positions[first]), start, end, _FIELDS, images=False)
         return
-    yield recording.read_steps(first, start, int(lengths[first]), _FIELDS, images=False)
+    yield recording.read_steps(int(positions[first]), start, int(lengths[first]), _FIELDS, images=False)
     if last > first + 1:
-        yield recording.read(np.arange(first + 1, last), fields=_FIELDS, images=False)
-    yield recording.read_steps(last, 0, end, _FIELDS, images=False)
+        yield recording.read(positions[first + 1 : last], fields=_FIELDS, images=False)
+    yield recording.read_steps(int(positions[last]), 0, end, _FIELDS, images=False)
 
 
 def _distributions(
