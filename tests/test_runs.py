@@ -171,8 +171,9 @@ class TestRun:
     def test_in_filters_of_files_and_of_a_storage(self, tmp_path: Path) -> None:
         storage = FileStorage(tmp_path / "lab")
         for i, rate in enumerate((1e-4, 1e-2)):
-            record(tmp_path / f"{i}.mcap", name=f"ppo-{i}", metadata={"lr": rate})
-            env = TupliEnvWrapper(gym.make("CartPole-v1"), storage, name=f"ppo-{i}", metadata={"lr": rate})
+            told: dict[str, Any] = {"name": f"ppo-{i}", "metadata": {"lr": rate}, "tags": ["ppo", f"try-{i}"]}
+            record(tmp_path / f"{i}.mcap", **told)
+            env = TupliEnvWrapper(gym.make("CartPole-v1"), storage, **told)
             env.store("cart")
             for seed in range(3):
                 env.reset(seed=seed)
@@ -187,6 +188,14 @@ class TestRun:
                 == 3
             )
             assert len(ds.filter(f"run.started < '{LONG_AGO}'")) == 0
+            for text in (
+                "run.tags = 'try-1'",
+                "'try-1' in run.tags",
+                "run.tags in ['try-1', 'x']",
+                "run.tags != 'try-0'",
+            ):
+                assert {episode.run.name for episode in ds.filter(text)} == {"ppo-1"}
+            assert len(ds.filter("run.tags = 'ppo'")) == 6
             assert {"run.name", "run.metadata.lr", "run.started"} <= set(ds.keys)
             sides = ds.split(0.5, by="run")
             for side in sides:
