@@ -449,6 +449,17 @@ class TestCommands:
             command("ls", str(tmp_path), "--filter", "run.metadata.lr < 0.5 and seed = 0", "--json")
         )
         assert [(one["name"], one["episodes"]) for one in found] == [("run-1", 1), ("run-2", 1)]
+        for text, meant in (
+            ("name = 'x'", "run.name"),
+            ("run.metadata.lrr = 3", "lr"),
+            ("run.nam = 3", "name"),
+        ):
+            for listing in ("ls", "episodes"):
+                wrong = CliRunner().invoke(app, [listing, str(tmp_path), "--filter", text])
+                assert wrong.exit_code != 0
+                assert wrong.output.count(f"did you mean {meant!r}") == 1
+        (tmp_path / "empty").mkdir()
+        assert command("ls", str(tmp_path / "empty"), "--filter", "return > 3") == "no recordings\n"
         wrong = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "retrn"])
         assert wrong.exit_code == 2
         assert "did you mean 'return'" in wrong.output

@@ -26,7 +26,7 @@ from tupli_mcap.cli.terminal import fail, terminal_width
 from tupli_mcap.errors import did_you_mean
 
 if TYPE_CHECKING:
-    from tupli_mcap.schema import EpisodeHeader
+    from tupli_mcap.schema import BaseFilter, EpisodeHeader
     from tupli_mcap.storage.listing import ListedRecording
 
 __all__ = ["episodes", "ls", "print_episodes"]
@@ -97,9 +97,13 @@ def ls(
     choose = None
     if wanted is not None:
         from tupli_mcap.dataset.which import candidates
+        from tupli_mcap.schema import EpisodeHeader, check_keys
 
+        check_keys(wanted, EpisodeHeader)
         choose = partial(candidates, filter=wanted)
     listed = list(list_recordings(paths or [Path()], choose))
+    if wanted is not None and not listed:
+        _check_there(paths or [Path()], wanted)
     if sort is not None:
         listed = _sorted(listed, _column(sort.removeprefix("-")).field, descending=sort.startswith("-"))
     good = [item for item in listed if item.error is None]
@@ -112,6 +116,16 @@ def ls(
         fail(item.error or "")
     if bad:
         raise typer.Exit(1)
+
+
+def _check_there(paths: Sequence[Path], wanted: BaseFilter) -> None:
+    """Raises FilterError if a filter that is true of no episode names metadata or facts of runs that none has."""
+    from tupli_mcap import open as open_dataset
+    from tupli_mcap.storage.listing import find_recordings
+
+    files = [file for path in paths for file in find_recordings(path)]
+    if files:
+        len(open_dataset(files).filter(wanted))
 
 
 def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -> list[ListedRecording]:
@@ -179,6 +193,8 @@ def episodes(
     if sort is None and len(paths) == 1 and paths[0].is_dir():  # which looks up so many only
         with open_storage(paths[0]) as storage:
             headers = storage.list_episodes(wanted, limit=limit)
+        if wanted is not None and not headers and limit != 0:
+            _check_there(paths, wanted)
     else:
         from tupli_mcap import open as open_dataset
 
