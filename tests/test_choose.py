@@ -97,6 +97,14 @@ def test_a_number_out_of_range_names_the_range(file: Path) -> None:
         choose_episodes(recording, "all")
 
 
+def test_a_directory_without_recordings_is_said_to_hold_none(tmp_path: Path) -> None:
+    with (
+        pytest.raises(RecordingError, match=r"holds no recording \(\.mcap\)$"),
+        chosen_from(tmp_path, None, None),
+    ):
+        pass
+
+
 @pytest.mark.parametrize("text", ["", "3,", "beste", "-1", "1.0", "0x1", "3-5", "9" * 5000, "²", "1;2"])
 def test_other_words_are_refused(file: Path, text: str) -> None:
     with (
