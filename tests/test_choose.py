@@ -50,6 +50,8 @@ def file(tmp_path: Path) -> Path:
         ("worst", [2]),
         ("3", [3]),
         (" 5, 0,5 ", [5, 0]),
+        ("3-5", [3, 4, 5]),
+        ("2-2,4-99,1", [2, 4, 5, 1]),
         ("Best,first,1,worst", [1, 0, 2]),
     ],
 )
@@ -79,6 +81,9 @@ def test_deleted_episodes_are_not_there(file: Path) -> None:
         assert [e.number for e in choose_episodes(recording, "first,best,all")] == [2, 3, 5]
         with pytest.raises(RecordingError, match="has no episode 1; choose from 3 episodes between 2 and 5"):
             choose_episodes(recording, "1")
+        assert [e.number for e in choose_episodes(recording, "1-4")] == [2, 3]
+        with pytest.raises(RecordingError, match="has no episode 0-1; choose from"):
+            choose_episodes(recording, "0-1")
         odd = F("metadata.odd") == True  # noqa: E712 - the filter's own equality
         assert [e.number for e in choose_episodes(recording, "all", odd)] == [3, 5]
 
@@ -105,11 +110,16 @@ def test_a_directory_without_recordings_is_said_to_hold_none(tmp_path: Path) -> 
         pass
 
 
-@pytest.mark.parametrize("text", ["", "3,", "beste", "-1", "1.0", "0x1", "3-5", "9" * 5000, "²", "1;2"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "3,", "beste", "-1", "1.0", "0x1", "5-3", "3-", "3-4-5", "1-" + "9" * 11, "9" * 5000, "²", "1;2"],
+)
 def test_other_words_are_refused(file: Path, text: str) -> None:
     with (
         Recording(file) as recording,
-        pytest.raises(FilterError, match=re.escape("'3,7,9', or best, worst, first, last or all, found")),
+        pytest.raises(
+            FilterError, match=re.escape("'3,7,9' or '3-9', or best, worst, first, last or all, found")
+        ),
     ):
         choose_episodes(recording, text)
 

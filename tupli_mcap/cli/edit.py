@@ -95,7 +95,7 @@ def tag(
     ],
     episodes: Annotated[
         str | None,
-        typer.Option("--episodes", "--episode", metavar="3,7", help="Numbers, best, last, …; all else."),
+        typer.Option("--episodes", "--episode", metavar="3,7-9", help="Numbers, best, last, …; all else."),
     ] = None,
     filter_text: FilterText = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take back what was said last.")] = False,
@@ -203,7 +203,7 @@ def trim(
     output: _Output,
     episodes: Annotated[
         str | None,
-        typer.Option("--episodes", "--episode", metavar="3,7", help="Numbers, best, last, …; all else."),
+        typer.Option("--episodes", "--episode", metavar="3,7-9", help="Numbers, best, last, …; all else."),
     ] = None,
     filter_text: FilterText = None,
     force: _Force = False,

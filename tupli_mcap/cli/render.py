@@ -45,7 +45,7 @@ _Source = Annotated[
 ]
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
 _Episodes = Annotated[
-    str, typer.Option(metavar="WHICH", help="Numbers such as 3,7, or best, worst, first, last, all.")
+    str, typer.Option(metavar="WHICH", help="Numbers such as 3,7-9, or best, worst, first, last, all.")
 ]
 _Every = Annotated[int, typer.Option(min=1, help="A frame of every so many steps, and the last.")]
 _Width = Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Of the frames (pixels).")]

@@ -23,7 +23,7 @@ _Episode = Annotated[
         "--episode",
         "-e",
         metavar="WHICH",
-        help="Such as 3,7,9, best, worst, first, last, all; of many, by default last,best,worst.",
+        help="Such as 3,7-9, best, worst, first, last, all; of many, by default last,best,worst.",
     ),
 ]
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]

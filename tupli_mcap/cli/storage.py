@@ -113,7 +113,7 @@ _Paths = Annotated[
     list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", readable=False)
 ]
 _Chosen = Annotated[
-    str | None, typer.Option("--episodes", "--episode", metavar="3,7", help="Numbers, best, last, …")
+    str | None, typer.Option("--episodes", "--episode", metavar="3,7-9", help="Numbers, best, last, …")
 ]
 _DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say how many there are.")]
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
@@ -42,7 +43,7 @@ __all__ = [
 WORDS: Final = ("best", "worst", "first", "last", "all")
 """What may stand in place of an episode's number; best and worst are by return, the first of equals."""
 
-_MAX_DIGITS: Final = 10  # an episode's number has 32 bits
+_SPAN: Final = re.compile("([0-9]{1,10})(?:-([0-9]{1,10}))?")  # an episode's number has 32 bits
 _CACHE_BYTES = 64 << 20  # each chunk is read once or twice
 _MOST_OPEN = 200
 Positions = np.ndarray[Any, np.dtype[np.int64]]
@@ -67,7 +68,8 @@ def choose_episodes(
     """The episodes that a text such as "3,7,9", "best" or "first,last" names, in its order, each once.
 
     Args:
-        text: numbers of episodes and `WORDS`, with commas between them.
+        text: numbers of episodes, ranges ("3-9", of those that are there, both ends included) and `WORDS`, with commas
+            between them.
         filter: the choice is among the episodes it is true of; a number it leaves out is an error.
 
     Episodes that the recording's storage has deleted are not there.
@@ -138,16 +140,17 @@ def _named(recording: Recording, among: Positions, item: str, text: str, why: st
         return [int(among[0 if item == "first" else -1])]
     if item in ("best", "worst"):
         return [int(among[_extreme(item, recording.index["return"][among])])]
-    if not item.isdecimal() or len(item) > _MAX_DIGITS:
+    span = _SPAN.fullmatch(item)
+    if span is None or int(span[1]) > int(span[2] or span[1]):
         raise FilterError(
-            f"expected numbers of episodes such as '3,7,9', or {', '.join(WORDS[:-1])} or {WORDS[-1]}, "
+            f"expected numbers of episodes such as '3,7,9' or '3-9', or {', '.join(WORDS[:-1])} or {WORDS[-1]}, "
             f"found {item[:40]!r} in {text[:80]!r}"
         )
     numbers = recording.index["episode"][among]
-    matching = among[numbers == int(item)]
+    matching = among[(numbers >= int(span[1])) & (numbers <= int(span[2] or span[1]))]
     if not len(matching):
         raise RecordingError(f"{recording.name} has no episode {item}{why}; choose from {_range(numbers)}")
-    return [int(matching[0])]
+    return [int(position) for position in matching]
 
 
 def _extreme(word: str, returns: Any) -> int:
