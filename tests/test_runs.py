@@ -458,6 +458,15 @@ class TestCommands:
                 wrong = CliRunner().invoke(app, [listing, str(tmp_path), "--filter", text])
                 assert wrong.exit_code != 0
                 assert wrong.output.count(f"did you mean {meant!r}") == 1
+        for numbers, text in (("0", "100% of 1"), ("1-2", "33%")):
+            command(
+                "tag",
+                str(tmp_path / "2.mcap"),
+                "--episodes",
+                numbers,
+                f"success={json.dumps(numbers == '0')}",
+            )
+            assert text in command("ls", str(tmp_path / "2.mcap"), "--columns", "success").splitlines()
         (tmp_path / "empty").mkdir()
         assert command("ls", str(tmp_path / "empty"), "--filter", "return > 3") == "no recordings\n"
         wrong = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "retrn"])

@@ -51,6 +51,14 @@ def _means(items: Sequence[ListedRecording]) -> list[str]:
     return numbers([None if r.return_nan == r.episodes else r.return_mean for r in items])
 
 
+def _success(item: ListedRecording) -> str:
+    """The share, and of how many episodes where not all say it."""
+    if item.success is None:
+        return ""
+    known = "" if item.success_known == item.episodes else f" of {number(item.success_known)}"
+    return f"{item.success:.0%}{known}"
+
+
 _COLUMNS = {
     "recording": _Listed("path", Column("RECORDING", shrink="start"), _each(lambda r: short_ids(r.path))),
     "run": _Listed("name", Column("RUN", shrink="end"), _each(lambda r: r.name)),
@@ -63,7 +71,7 @@ _COLUMNS = {
     "success": _Listed(
         "success",
         Column("SUCCESS", "right"),
-        _each(lambda r: "" if r.success is None else f"{r.success:.0%}"),
+        _each(_success),
     ),
     "started": _Listed("started", Column("STARTED"), _each(lambda r: when(r.started))),
     "size": _Listed("size", Column("SIZE", "right"), _each(lambda r: bytes_of(r.size))),
