@@ -218,7 +218,7 @@ BAD_STATES = [
     (
         spaces.Dict({"a": BOX}),
         {"b": np.zeros(2, np.float32)},
-        r"state: expected an entry for each of \['a'\], found",
+        r"state: expected an entry for each of \['a'\], found \['b'\]",
     ),
     (spaces.Tuple((BOX, BOX)), (np.zeros(2, np.float32),), r"state: expected a tuple of 2 entries"),
     (spaces.Tuple((BOX,)), [np.zeros(2, np.float32)], r"state: expected a tuple of 1 entries, found \["),
@@ -421,7 +421,7 @@ def test_data_is_written_before_the_environment_is_closed(tmp_path: Path) -> Non
     env.close()
     env.close()
     assert inner.found == 1
-    with pytest.raises(RecordingError, match="is closed; wrap the environment again"):
+    with pytest.raises(RecordingError, match="is closed; make another recorder"):
         env.step(0)
 
 

@@ -466,7 +466,11 @@ class TestCommands:
                 numbers,
                 f"success={json.dumps(numbers == '0')}",
             )
-            assert text in command("ls", str(tmp_path / "2.mcap"), "--columns", "success").splitlines()
+            assert text in command("ls", str(tmp_path / "2.mcap"), "--columns", "success")
+        with pytest.raises(RecordingError, match="is a directory; give one file"):
+            edit_run(tmp_path, name="x")
+        dated = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "date"])
+        assert "did you mean 'started'" in dated.output
         (tmp_path / "empty").mkdir()
         assert command("ls", str(tmp_path / "empty"), "--filter", "return > 3") == "no recordings\n"
         wrong = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "retrn"])

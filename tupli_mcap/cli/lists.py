@@ -79,6 +79,10 @@ _COLUMNS = {
 }
 
 
+_MEANT = {"date": "started", "time": "started", "created": "started", "length": "steps", "name": "run"}
+"""What columns may be called."""
+
+
 def ls(
     paths: Annotated[
         list[Path] | None,
@@ -149,9 +153,8 @@ def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -
 
 def _column(name: str) -> _Listed:
     if name.lower() not in _COLUMNS:
-        raise typer.BadParameter(
-            f"there is no column {name!r}{did_you_mean(name, list(_COLUMNS))}; there are {', '.join(_COLUMNS)}"
-        )
+        similar = did_you_mean(_MEANT.get(name, name), list(_COLUMNS))
+        raise typer.BadParameter(f"there is no column {name!r}{similar}; there are {', '.join(_COLUMNS)}")
     return _COLUMNS[name.lower()]
 
 

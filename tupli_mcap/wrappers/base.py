@@ -224,7 +224,8 @@ def wrong_kind(env: object, expected: str) -> RecordingError:
     elif "pettingzoo" in libraries:
         found = f"the PettingZoo environment {name}; EpisodeWriter records it by hand, an agent a stream"
     elif isinstance(env, str):
-        found = f"{env!r:.60}; make it: gymnasium.make({env!r:.60})"
+        make = "make_vec" if "vector" in expected else "make"
+        found = f"{env!r:.60}; make it: gymnasium.{make}({env!r:.60})"
     else:
         found = f"{name}, which is no gymnasium.Env"
     return RecordingError(f"expected {expected}, found {found}")
