@@ -207,6 +207,24 @@ def test_values_outside_the_bounds_and_nan_are_kept(tmp_path: Path) -> None:
     assert len(taken) == len(episode)
 
 
+def test_columns_are_shown_in_short(tmp_path: Path) -> None:
+    space = spaces.Dict({"x": BOX, "t": spaces.Tuple((spaces.Discrete(3), spaces.Text(5)))})
+    state = {"x": BOX.low, "t": (np.int64(1), "a")}
+    info = {f"key{i}": "v" * 100 for i in range(25)}
+    with RecordEpisodes(
+        Scripted(lambda n: state, space, info=lambda n: info), tmp_path / "r.mcap", record_info=True
+    ) as env:
+        roll(env, 30, 1)
+    with Recording(tmp_path / "r.mcap") as recording:
+        shown = repr(recording.read(fields=["observations", "rewards", "infos"]))
+    assert shown.startswith("<Columns of 30 steps of ")
+    assert "'x': float32 (30, 2)" in shown and "'t': (int64 (30,), 30 values)" in shown
+    assert (
+        "; rewards: float64 (30,); infos: 30 dicts of key0, key1, " in shown and "key19 and 5 more>" in shown
+    )
+    assert len(shown) < 400
+
+
 BAD_STATES = [
     (BOX, np.zeros(3, np.float32), r"state: expected shape \(2,\), found shape \(3,\)"),
     (BOX, np.zeros((1, 2), np.float32), r"state: expected shape \(2,\), found shape \(1, 2\)"),
