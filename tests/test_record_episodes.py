@@ -225,6 +225,21 @@ def test_columns_are_shown_in_short(tmp_path: Path) -> None:
     assert len(shown) < 400
 
 
+def test_names_that_no_info_has_are_warned_of_once(tmp_path: Path) -> None:
+    env = RecordEpisodes(
+        Scripted(lambda n: BOX.low, BOX, info=lambda n: {"force": 1.0}),
+        tmp_path / "r.mcap",
+        record_info=["forc", "force"],
+    )
+    env.reset()
+    env.step(env.action_space.sample())
+    with pytest.warns(UserWarning, match=r"no step's info had 'forc' \(did you mean 'force'\?\)$") as told:
+        env.close()
+        env.close()
+    assert len(told) == 1
+    RecordEpisodes(Scripted(lambda n: BOX.low, BOX), tmp_path / "none.mcap", record_info=["x"]).close()
+
+
 BAD_STATES = [
     (BOX, np.zeros(3, np.float32), r"state: expected shape \(2,\), found shape \(3,\)"),
     (BOX, np.zeros((1, 2), np.float32), r"state: expected shape \(2,\), found shape \(1, 2\)"),

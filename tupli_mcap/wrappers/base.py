@@ -169,6 +169,8 @@ class EpisodeWrapper:
             _close_recordings(self._work, self._live)
             self._finalizer.detach()
             self._when_closed()
+            if self._infos is not None:
+                self._infos.warn_of_unseen(self.path)
         finally:
             self.env.close(**kwargs)
 
