@@ -274,6 +274,8 @@ def test_recording_to_an_unknown_benchmark_is_refused(storage: FileStorage) -> N
             TupliEnvWrapper.load(storage, uri)
     with pytest.raises(NotFoundError, match="pass benchmark_id"):
         TupliEnvWrapper.load(storage)
+    with pytest.raises(StorageError, match="the other way round"):
+        TupliEnvWrapper.load("0" * 64, storage)  # type: ignore[arg-type]
 
 
 def test_episodes_are_recorded_with_their_metadata(storage: FileStorage) -> None:

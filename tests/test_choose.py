@@ -50,6 +50,8 @@ def file(tmp_path: Path) -> Path:
         ("worst", [2]),
         ("3", [3]),
         (" 5, 0,5 ", [5, 0]),
+        ("3-5", [3, 4, 5]),
+        ("2-2,4-99,1", [2, 4, 5, 1]),
         ("Best,first,1,worst", [1, 0, 2]),
     ],
 )
@@ -79,6 +81,9 @@ def test_deleted_episodes_are_not_there(file: Path) -> None:
         assert [e.number for e in choose_episodes(recording, "first,best,all")] == [2, 3, 5]
         with pytest.raises(RecordingError, match="has no episode 1; choose from 3 episodes between 2 and 5"):
             choose_episodes(recording, "1")
+        assert [e.number for e in choose_episodes(recording, "1-4")] == [2, 3]
+        with pytest.raises(RecordingError, match="has no episode 0-1; choose from"):
+            choose_episodes(recording, "0-1")
         odd = F("metadata.odd") == True  # noqa: E712 - the filter's own equality
         assert [e.number for e in choose_episodes(recording, "all", odd)] == [3, 5]
 
@@ -105,6 +110,14 @@ def test_a_number_out_of_range_names_the_range(file: Path) -> None:
     Sidecar(deleted=set(range(6))).write(file)
     with Recording(file) as recording, pytest.raises(RecordingError, match="has no episode$"):
         choose_episodes(recording, "all")
+
+
+def test_a_directory_without_recordings_is_said_to_hold_none(tmp_path: Path) -> None:
+    with (
+        pytest.raises(RecordingError, match=r"holds no recording \(\.mcap\)$"),
+        chosen_from(tmp_path, None, None),
+    ):
+        pass
 
 
 @pytest.mark.parametrize(

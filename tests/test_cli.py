@@ -479,7 +479,11 @@ class TestLook:
             shutil.copy(name, f"b{name[1:]}")
         (told,) = run("ls", "b.mcap", "--json").json
         assert (told["state"], told["episodes"], told["steps"]) == ("recovered", 1, 1)
-        assert "its writer did not finish it" in ok("info", "b.mcap")
+        assert "did not finish it, what its chunks and its journal hold is here" in ok("info", "b.mcap")
+        Path("b.mcap.journal").unlink()
+        assert "did not finish it, its journal is missing; what its chunks hold is here" in ok(
+            "info", "b.mcap"
+        )
         env.close()
 
     def test_info(self, cartpole: Path, here: Path) -> None:
@@ -1180,7 +1184,8 @@ class TestProgram:
         assert ok("replay", "--help").replace("replay", "view") == ok("view", "--help")
 
     def test_usage_errors(self, here: Path) -> None:
-        assert fails("lss", code=2).startswith("No such command 'lss'")
+        assert fails("lss", code=2).startswith("No such command 'lss' (did you mean 'ls'?)")
+        assert fails("relabel", code=2) == "No such command 'relabel'; see tupli-mcap --help"
         assert fails("ls", "--no-such-option", code=2).startswith("No such option")
         assert fails("info", code=2) == "Missing argument 'FILE|DIR'; see tupli-mcap info --help"
 

@@ -551,6 +551,8 @@ ITEM = {
         "untagged": {"$float": "inf", "x": 1},
         "huge": 2**1024 - 1,
         "l": [1],
+        "tags": ["a", "b", ["c"]],
+        "empty": [],
         "d": {"x": 1},
     }
 }
@@ -589,8 +591,17 @@ class TestMeaning:
             (F("metadata.t") > 1, False),
             (F("metadata.t") < 1, False),
             (F("metadata.n") != "1", True),
-            (F("metadata.l") == 1, False),
-            (F("metadata.l") != 1, True),
+            (F("metadata.l") == 1, True),
+            (F("metadata.l") != 1, False),
+            (F("metadata.l") == True, False),  # noqa: E712
+            (F("metadata.l") != 2, True),
+            (F("metadata.l").isin([2, 1]), True),
+            (F("metadata.l").isin([2, None]), False),
+            (F("metadata.l") >= 1, False),
+            (F("metadata.tags") == "b", True),
+            (F("metadata.tags") == "c", False),
+            (F("metadata.empty") == None, False),  # noqa: E711
+            (F("metadata.empty") != None, True),  # noqa: E711
             (F("metadata.l.0") == 1, False),
             (F("metadata.d") != 1, True),
             (F("metadata.d.x") == 1, True),
@@ -619,9 +630,12 @@ class TestMeaning:
     def test_each_rule(self, filter: BaseFilter, expected: bool) -> None:
         assert compile_predicate(filter)(ITEM) is expected
         row = header_of(0, base_row(ITEM["metadata"], 0))
-        with Catalog(None) as catalog:
-            fill(catalog, [row])
-            assert catalog.count(filter) == expected
+        with Catalog(None) as plain, Catalog(None) as declared:
+            for key in ("metadata.l", "metadata.tags", "metadata.empty"):
+                declared.declare_key(key)
+            for catalog in (plain, declared):
+                fill(catalog, [row])
+                assert catalog.count(filter) == expected
 
     def test_no_filter_is_true_of_everything(self) -> None:
         assert compile_predicate(None)({})
@@ -743,6 +757,7 @@ class TestParser:
             ("a=1 AND (b=2 Or c=TRUE)", (F("a") == 1) & ((F("b") == 2) | (F("c") == True))),  # noqa: E712
             ("n_tuples in [1, 2.0, 'x', null,]", F("n_tuples").isin([1, 2.0, "x", None])),
             ("a not in []", ~F("a").isin([])),
+            ("'x' in run.tags and 3 not in b", (F("run.tags") == "x") & ~(F("b") == 3)),
             ('metadata."a.b".c >= 1e-3', F("metadata", "a.b", "c") >= 1e-3),
             ("metadata.größe.run-1.0 < inf", F("metadata.größe.run-1.0") < math.inf),
             (r"""a = 'it\'s' and b = "\u00e9" """, (F("a") == "it's") & (F("b") == "é")),
@@ -766,6 +781,9 @@ class TestParser:
             ("(a > 3 b", r"needs and, or, or '\)' at character 7, found 'b'"),
             ("a > 3)", r"needs and, or, or the end at character 5, found '\)'"),
             ("a in (1)", r"needs '\[' at character 5"),
+            ("'x' = run.tags", "needs in and a key, .* at character 4, found '='"),
+            ("'x' not run.tags", "needs 'in' at character 8, found 'run.tags'"),
+            ("'x' in ['x']", r"needs a key such as run.tags at character 7, found '\['"),
             ("a in [1 2]", "needs ',' at character 8"),
             ("a ; drop", "at character 2, found ';'"),
             ("a > true", r"orders numbers or text, found True \(at character 0"),

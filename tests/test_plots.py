@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -687,6 +688,23 @@ def test_huge_numbers_of_infos_are_left_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(measured(path).numbers["info: k"], [5, 5])
 
 
+def test_infos_of_float32_are_drawn_without_warning(tmp_path: Path) -> None:
+    env = Scripted(lambda n: UNIT.low, UNIT, info=lambda n: {"k": np.float32(n)}, length=4)
+    path = record(tmp_path / "r.mcap", env, 8, record_info=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(measured(path).numbers["info: k"]) == 2
+
+
+def test_runs_have_their_names_where_all_differ(tmp_path: Path) -> None:
+    for file, name in (("a", "slow"), ("b", "fast"), ("c", "fast")):
+        scored(tmp_path / f"{file}.mcap", [2, 3], name=name)
+    paths = [tmp_path / f"{file}.mcap" for file in "abc"]
+    assert [group.name for group in report(paths[:2]).groups] == ["slow", "fast"]
+    assert [group.name for group in report(paths).groups] == ["a", "b", "c"]
+    assert [one.name for one in report(paths[0]).measured] == ["a"]
+
+
 def test_runs_that_differ_by_their_seeds_are_one_line(tmp_path: Path) -> None:
     for algo in ("ppo", "sac"):
         for seed in range(3):
@@ -721,7 +739,7 @@ def test_runs_that_differ_by_their_seeds_are_one_line(tmp_path: Path) -> None:
             {"name": "Cart-v1__ppo__2__1700000999", "metadata": {"seed": 2}},
             ["Cart-v1__ppo"],
         ),
-        ({"name": "ppo-seed1"}, {"name": "ppo-seed2", "split": "eval"}, ["a", "b"]),
+        ({"name": "ppo-seed1"}, {"name": "ppo-seed2", "split": "eval"}, ["ppo-seed1", "ppo-seed2"]),
         ({"name": "ppo"}, {"name": "ppo"}, ["a", "b"]),
         ({}, {}, ["a", "b"]),
     ],

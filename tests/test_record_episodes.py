@@ -207,6 +207,39 @@ def test_values_outside_the_bounds_and_nan_are_kept(tmp_path: Path) -> None:
     assert len(taken) == len(episode)
 
 
+def test_columns_are_shown_in_short(tmp_path: Path) -> None:
+    space = spaces.Dict({"x": BOX, "t": spaces.Tuple((spaces.Discrete(3), spaces.Text(5)))})
+    state = {"x": BOX.low, "t": (np.int64(1), "a")}
+    info = {f"key{i}": "v" * 100 for i in range(25)}
+    with RecordEpisodes(
+        Scripted(lambda n: state, space, info=lambda n: info), tmp_path / "r.mcap", record_info=True
+    ) as env:
+        roll(env, 30, 1)
+    with Recording(tmp_path / "r.mcap") as recording:
+        shown = repr(recording.read(fields=["observations", "rewards", "infos"]))
+    assert shown.startswith("<Columns of 30 steps of ")
+    assert "'x': float32 (30, 2)" in shown and "'t': (int64 (30,), 30 values)" in shown
+    assert (
+        "; rewards: float64 (30,); infos: 30 dicts of key0, key1, " in shown and "key19 and 5 more>" in shown
+    )
+    assert len(shown) < 400
+
+
+def test_names_that_no_info_has_are_warned_of_once(tmp_path: Path) -> None:
+    env = RecordEpisodes(
+        Scripted(lambda n: BOX.low, BOX, info=lambda n: {"force": 1.0}),
+        tmp_path / "r.mcap",
+        record_info=["forc", "force"],
+    )
+    env.reset()
+    env.step(env.action_space.sample())
+    with pytest.warns(UserWarning, match=r"no step's info had 'forc' \(did you mean 'force'\?\)$") as told:
+        env.close()
+        env.close()
+    assert len(told) == 1
+    RecordEpisodes(Scripted(lambda n: BOX.low, BOX), tmp_path / "none.mcap", record_info=["x"]).close()
+
+
 BAD_STATES = [
     (BOX, np.zeros(3, np.float32), r"state: expected shape \(2,\), found shape \(3,\)"),
     (BOX, np.zeros((1, 2), np.float32), r"state: expected shape \(2,\), found shape \(1, 2\)"),
@@ -218,7 +251,7 @@ BAD_STATES = [
     (
         spaces.Dict({"a": BOX}),
         {"b": np.zeros(2, np.float32)},
-        r"state: expected an entry for each of \['a'\], found",
+        r"state: expected an entry for each of \['a'\], found \['b'\]",
     ),
     (spaces.Tuple((BOX, BOX)), (np.zeros(2, np.float32),), r"state: expected a tuple of 2 entries"),
     (spaces.Tuple((BOX,)), [np.zeros(2, np.float32)], r"state: expected a tuple of 1 entries, found \["),
@@ -421,7 +454,7 @@ def test_data_is_written_before_the_environment_is_closed(tmp_path: Path) -> Non
     env.close()
     env.close()
     assert inner.found == 1
-    with pytest.raises(RecordingError, match="is closed; wrap the environment again"):
+    with pytest.raises(RecordingError, match="is closed; make another recorder"):
         env.step(0)
 
 

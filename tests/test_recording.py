@@ -217,7 +217,7 @@ def foreign(path: Path) -> None:
 def test_other_files_get_one_clear_error(path: Path) -> None:
     with pytest.raises(RecordingError, match="does not exist; give the path of a recording"):
         Recording(path)
-    with pytest.raises(RecordingError, match="is a directory"):
+    with pytest.raises(RecordingError, match="is a directory; give one file"):
         Recording(path.parent)
     path.write_bytes(b"")
     with pytest.raises(FormatError, match="is empty; expected an MCAP recording"):

@@ -172,8 +172,9 @@ class TestRun:
     def test_in_filters_of_files_and_of_a_storage(self, tmp_path: Path) -> None:
         storage = FileStorage(tmp_path / "lab")
         for i, rate in enumerate((1e-4, 1e-2)):
-            record(tmp_path / f"{i}.mcap", name=f"ppo-{i}", metadata={"lr": rate})
-            env = TupliEnvWrapper(gym.make("CartPole-v1"), storage, name=f"ppo-{i}", metadata={"lr": rate})
+            told: dict[str, Any] = {"name": f"ppo-{i}", "metadata": {"lr": rate}, "tags": ["ppo", f"try-{i}"]}
+            record(tmp_path / f"{i}.mcap", **told)
+            env = TupliEnvWrapper(gym.make("CartPole-v1"), storage, **told)
             env.store("cart")
             for seed in range(3):
                 env.reset(seed=seed)
@@ -188,6 +189,14 @@ class TestRun:
                 == 3
             )
             assert len(ds.filter(f"run.started < '{LONG_AGO}'")) == 0
+            for text in (
+                "run.tags = 'try-1'",
+                "'try-1' in run.tags",
+                "run.tags in ['try-1', 'x']",
+                "run.tags != 'try-0'",
+            ):
+                assert {episode.run.name for episode in ds.filter(text)} == {"ppo-1"}
+            assert len(ds.filter("run.tags = 'ppo'")) == 6
             assert {"run.name", "run.metadata.lr", "run.started"} <= set(ds.keys)
             sides = ds.split(0.5, by="run")
             for side in sides:
@@ -483,6 +492,30 @@ class TestCommands:
             command("ls", str(tmp_path), "--filter", "run.metadata.lr < 0.5 and seed = 0", "--json")
         )["result"]
         assert [(one["run"], one["episodes"]) for one in found] == [("run-1", 1), ("run-2", 1)]
+        for text, meant in (
+            ("name = 'x'", "run.name"),
+            ("run.metadata.lrr = 3", "lr"),
+            ("run.nam = 3", "name"),
+        ):
+            for listing in ("ls", "episodes"):
+                wrong = CliRunner().invoke(app, [listing, str(tmp_path), "--filter", text])
+                assert wrong.exit_code != 0
+                assert wrong.output.count(f"did you mean {meant!r}") == 1
+        for numbers, text in (("0", "100% of 1"), ("1-2", "33%")):
+            command(
+                "tag",
+                str(tmp_path / "2.mcap"),
+                "--episodes",
+                numbers,
+                f"success={json.dumps(numbers == '0')}",
+            )
+            assert text in command("ls", str(tmp_path / "2.mcap"), "--columns", "success")
+        with pytest.raises(RecordingError, match="is a directory; give one file"):
+            edit_run(tmp_path, name="x")
+        dated = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "date"])
+        assert "did you mean 'started'" in dated.output
+        (tmp_path / "empty").mkdir()
+        assert command("ls", str(tmp_path / "empty"), "--filter", "return > 3") == "no recordings\n"
         wrong = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "retrn"])
         assert wrong.exit_code == 2
         assert "did you mean 'return'" in wrong.output

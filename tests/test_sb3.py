@@ -335,6 +335,7 @@ def test_wrong_pairings_name_the_right_one(tmp_path: Path) -> None:
             "the PettingZoo environment Parallel; EpisodeWriter records it by hand",
         ),
         (RecordEpisodes, "CartPole-v1", r"found 'CartPole-v1'; make it: gymnasium.make\('CartPole-v1'\)"),
+        (RecordVector, "CartPole-v1", r"make it: gymnasium.make_vec\('CartPole-v1'\)"),
         (RecordVector, None, "found NoneType, which is no gymnasium.Env"),
     ):
         with pytest.raises(RecordingError, match=message):

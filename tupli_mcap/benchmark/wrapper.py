@@ -331,6 +331,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             raise NotFoundError(
                 "which benchmark? pass benchmark_id; storage.list_benchmarks() names them all"
             )
+        if isinstance(benchmark_id, TupliStorage):
+            raise StorageError("expected a storage and then a benchmark_id, found them the other way round")
         opened = storage_at(storage)
         serialized = opened.load_benchmark(benchmark_id).serialized
         env = cls.deserialize_env(serialized, opened, trust=trust)

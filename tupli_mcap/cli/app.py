@@ -68,6 +68,13 @@ class _Group(TyperGroup):
         with _before_typer():
             return super().make_context(*args, **extra)
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if (
+            args and not args[0].startswith("-") and args[0] not in self.commands
+        ):  # Typer suggests hidden ones too
+            ctx.fail(f"No such command {args[0]!r}{did_you_mean(args[0], _NAMES)}")
+        return super().resolve_command(ctx, args)
+
     def invoke(self, ctx: Any) -> Any:
         with _before_typer():
             return super().invoke(ctx)

@@ -26,7 +26,7 @@ from tupli_mcap.cli.terminal import fail, terminal_width
 from tupli_mcap.errors import did_you_mean
 
 if TYPE_CHECKING:
-    from tupli_mcap.schema import EpisodeHeader
+    from tupli_mcap.schema import BaseFilter, EpisodeHeader
     from tupli_mcap.storage.listing import ListedRecording
 
 __all__ = ["episodes", "ls", "print_episodes"]
@@ -51,6 +51,14 @@ def _means(items: Sequence[ListedRecording]) -> list[str]:
     return numbers([None if r.return_nan == r.episodes else r.return_mean for r in items])
 
 
+def _success(item: ListedRecording) -> str:
+    """The share, and of how many episodes where not all say it."""
+    if item.success is None:
+        return ""
+    known = "" if item.success_known == item.episodes else f" of {number(item.success_known)}"
+    return f"{item.success:.0%}{known}"
+
+
 _COLUMNS = {
     "recording": _Listed("path", Column("RECORDING", shrink="start"), _each(lambda r: short_ids(r.path))),
     "run": _Listed("name", Column("RUN", shrink="end"), _each(lambda r: r.name)),
@@ -63,12 +71,16 @@ _COLUMNS = {
     "success": _Listed(
         "success",
         Column("SUCCESS", "right"),
-        _each(lambda r: "" if r.success is None else f"{r.success:.0%}"),
+        _each(_success),
     ),
     "started": _Listed("started", Column("STARTED"), _each(lambda r: when(r.started))),
     "size": _Listed("size", Column("SIZE", "right"), _each(lambda r: bytes_of(r.size))),
     "state": _Listed("state", Column("STATE"), _each(lambda r: r.state)),
 }
+
+
+_MEANT = {"date": "started", "time": "started", "created": "started", "length": "steps", "name": "run"}
+"""What columns may be called."""
 
 
 def ls(
@@ -94,9 +106,13 @@ def ls(
     choose = None
     if wanted is not None:
         from tupli_mcap.dataset.which import candidates
+        from tupli_mcap.schema import EpisodeHeader, check_keys
 
+        check_keys(wanted, EpisodeHeader)
         choose = partial(candidates, filter=wanted)
     listed = list(list_recordings(paths or [Path()], choose))
+    if wanted is not None and not listed:
+        _check_there(paths or [Path()], wanted)
     if sort is not None:
         listed = _sorted(listed, _column(sort.removeprefix("-")).field, descending=sort.startswith("-"))
     good = [item for item in listed if item.error is None]
@@ -109,6 +125,16 @@ def ls(
         fail(item.error or "")
     if bad:
         raise typer.Exit(1)
+
+
+def _check_there(paths: Sequence[Path], wanted: BaseFilter) -> None:
+    """Raises FilterError if a filter that is true of no episode names metadata or facts of runs that none has."""
+    from tupli_mcap import open as open_dataset
+    from tupli_mcap.storage.listing import find_recordings
+
+    files = [file for path in paths for file in find_recordings(path)]
+    if files:
+        len(open_dataset(files).filter(wanted))
 
 
 def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -> list[ListedRecording]:
@@ -124,9 +150,8 @@ def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -
 
 def _column(name: str) -> _Listed:
     if name.lower() not in _COLUMNS:
-        raise typer.BadParameter(
-            f"there is no column {name!r}{did_you_mean(name, list(_COLUMNS))}; there are {', '.join(_COLUMNS)}"
-        )
+        similar = did_you_mean(_MEANT.get(name, name), list(_COLUMNS))
+        raise typer.BadParameter(f"there is no column {name!r}{similar}; there are {', '.join(_COLUMNS)}")
     return _COLUMNS[name.lower()]
 
 
@@ -191,6 +216,8 @@ def episodes(
     if sort is None and len(paths) == 1 and paths[0].is_dir():  # which looks up so many only
         with open_storage(paths[0]) as storage:
             headers = storage.list_episodes(wanted, limit=limit)
+        if wanted is not None and not headers and limit != 0:
+            _check_there(paths, wanted)
     else:
         from tupli_mcap import open as open_dataset
 

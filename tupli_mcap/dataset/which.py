@@ -355,7 +355,10 @@ def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: Exi
 
     items = list(dict.fromkeys(item.strip().lower() for item in text.split(",")))
     named: dict[str, dict[str, tuple[float, list[int]]]] = {item: {} for item in items}  # by item and file
-    for path in find_recordings(folder):
+    paths = find_recordings(folder)
+    if not paths:
+        raise RecordingError(f"{folder} holds no recording (.mcap)")
+    for path in paths:
         try:
             with Recording(path, cache_bytes=_CACHE_BYTES) as recording:
                 among = candidates(recording, filter)

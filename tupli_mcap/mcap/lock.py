@@ -242,6 +242,8 @@ def _open_locked(path: Path, *, mode: str = "r+", hint: str) -> io.FileIO:
             file = _open_file(path, mode)
         except FileNotFoundError as err:
             raise RecordingError(f"{path} cannot be recorded to: it does not exist; {hint}") from err
+        except IsADirectoryError as err:
+            raise RecordingError(f"{path} is a directory; give one file, a recording (.mcap)") from err
         except OSError as err:
             raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
         try:

@@ -86,7 +86,7 @@ class PathSource:
             self._fd = open_regular(path)
         except IsADirectoryError as err:
             raise RecordingError(
-                f"{path} is a directory; give a recording (.mcap), or open it as a FileStorage"
+                f"{path} is a directory; give one file, a recording (.mcap); tupli_mcap.open takes directories"
             ) from err
         except FileNotFoundError as err:
             raise RecordingError(f"{path} does not exist; give the path of a recording (.mcap)") from err
@@ -156,7 +156,7 @@ class PathSource:
             raise RecordingError(f"{self.name} cannot be read: {os_reason(err)}") from err
         if stat.S_ISDIR(status.st_mode):
             raise RecordingError(
-                f"{self.name} is a directory; give a recording (.mcap), or open it as a FileStorage"
+                f"{self.name} is a directory; give one file, a recording (.mcap); tupli_mcap.open takes directories"
             )
         self.size = status.st_size
 

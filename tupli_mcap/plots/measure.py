@@ -162,6 +162,8 @@ def _numeric(said: Any) -> Iterator[tuple[str, float]]:
     """The entries of an info or of metadata that are numbers, but for those that say success."""
     for key, value in said.items() if isinstance(said, Mapping) else ():
         if isinstance(key, str) and key not in KEYS and isinstance(value, int | float | np.number | np.bool_):
+            if isinstance(value, np.floating):
+                value = float(value)  # a float32 cannot be compared with LARGEST
             number = (
                 float(value) if -LARGEST <= value <= LARGEST else np.nan
             )  # an integer may be too large for a float

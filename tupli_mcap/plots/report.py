@@ -26,6 +26,7 @@ from tupli_mcap.storage.atomic import write_bytes
 __all__ = ["FORMATS", "Report", "check_goal", "report"]
 
 FORMATS = (".png", ".svg", ".pdf", ".html")
+_LONGEST_NAME = 200  # characters of a run's name that are shown
 _MOST_TRACES = 4
 
 Traces = Sequence[tuple[Measured, Trace]]
@@ -202,7 +203,13 @@ def _saved(figure: Any, format: str) -> bytes:
 
 
 def _shorten_names(measured: Sequence[Measured]) -> None:
-    """File names without directories and extension; longer where two would be the same."""
+    """The names of several runs where all differ; else file names without directories and extension, longer where two
+    would be the same."""
+    names = [one.run.name[:_LONGEST_NAME] for one in measured]
+    if len(measured) > 1 and all(names) and len(set(names)) == len(names):
+        for one, name in zip(measured, names, strict=True):
+            one.name = name
+        return
     parts = [Path(one.name).with_suffix("").parts for one in measured]
     for depth in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-depth:]) for part in parts]

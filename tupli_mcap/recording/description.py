@@ -36,6 +36,7 @@ __all__ = [
     "spread_of",
     "state_of",
     "success_rate",
+    "successes",
 ]
 
 _MOST_BOUNDS = 16  # dimensions of a leaf whose bounds get a line each
@@ -178,6 +179,12 @@ def _metadata_keys(recording: Recording, positions: Array) -> list[str]:
 def success_rate(recording: Recording, positions: Array) -> float | None:
     """The share of some episodes that succeeded, among those whose metadata say `success` or `is_success`; None if none
     do."""
+    said = successes(recording, positions)
+    return sum(said) / len(said) if said else None
+
+
+def successes(recording: Recording, positions: Array) -> list[bool]:
+    """Whether episodes succeeded: those of some whose metadata say `success` or `is_success`."""
     texts = recording.all_metadata()
     said = []
     for i in positions.tolist():
@@ -186,7 +193,7 @@ def success_rate(recording: Recording, positions: Array) -> float | None:
         found = success_of(recording.episode_metadata(i))
         if found is not None:
             said.append(found)
-    return sum(said) / len(said) if said else None
+    return said
 
 
 def describe_space(space: gym.Space[Any]) -> str:

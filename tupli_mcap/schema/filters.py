@@ -11,7 +11,10 @@ A filter is true or false of an item (nested mappings of JSON values), never unk
 - **GT, GEQ, LT, LEQ** compare numbers with numbers and texts with texts (by code point); every other pair is
   false.
 - **null** (None) is a value: EQ None is true of a key that is there and null.
-- A list or a mapping is EQ to nothing (and so NE to everything); a filter cannot ask for one.
+- A **list** is EQ to each of its elements: `run.tags = "x"` is true where "x" is one of the tags, and NE where it is
+  none of them. GT, GEQ, LT and LEQ are false of lists.
+- A mapping, also one in a list, is EQ to nothing (and so NE to everything); a filter cannot ask for one, nor for a
+  list.
 - **IN** is true where EQ is true of any of its values. An empty **AND** is true; an empty **OR** or IN is
   false.
 

@@ -5,11 +5,12 @@
     negation    = "not" negation | "(" filter ")" | comparison
     comparison  = key ( "=" | "==" | "!=" | ">" | ">=" | "<" | "<=" ) value
                 | key [ "not" ] "in" "[" [ value { "," value } ] "]"
+                | value [ "not" ] "in" key
                 | key
     value       = number | "text" | 'text' | true | false | null | nan | inf | -inf
 
-A key alone stands for `key = true`. Words are case-insensitive (`none` is `null`), keys are not; a name in a key that
-is no word is quoted: `metadata."a b"`.
+A key alone stands for `key = true`, and `"x" in key` for `key = "x"`, which is true of lists that hold "x". Words are
+case-insensitive (`none` is `null`), keys are not; a name in a key that is no word is quoted: `metadata."a b"`.
 
 The order of and, or, not and parentheses is Python's, so Python's parser finds it. It sees a key as `k`, a value as `0`
 and a sign as `<`, nothing else of the text, and nothing is evaluated.
@@ -80,6 +81,9 @@ _EXPECTED: Final[Mapping[str, str]] = {
     "key": "a key such as metadata.score",
     "sign": f"one of {' '.join(_COMPARISON)} in, and, or, or the end",
     "in": "'in'",
+    "held": 'in and a key, as a value comes first only in a comparison such as "x" in run.tags',
+    "not held": "'in'",
+    "holder": "a key such as run.tags",
     "list": "'['",
     "item": _A_VALUE,
     "comma": "','",
@@ -87,7 +91,10 @@ _EXPECTED: Final[Mapping[str, str]] = {
     "more": "and, or, or the end",
 }
 _NEXT: Final[Mapping[str, Mapping[str, str]]] = {
-    "key": {"not": "key", "(": "key", "key": "sign"},
+    "key": {"not": "key", "(": "key", "key": "sign", "value": "held"},
+    "held": {"in": "holder", "not": "not held"},
+    "not held": {"in": "holder"},
+    "holder": {"key": "more"},
     "sign": {
         "sign": "value",
         "in": "list",
@@ -197,10 +204,15 @@ def _filter(node: ast.expr, tokens: Sequence[_Token]) -> BaseFilter:
     compared = node.left if isinstance(node, ast.Compare) else node
     first = compared.col_offset // _WIDTH
     key, sign = tokens[first], tokens[first + 1]
+    if isinstance(node, ast.Compare) and key.kind == "value":
+        key = tokens[node.comparators[0].col_offset // _WIDTH]
     try:
         if not isinstance(node, ast.Compare):
             return FilterEQ(key=key.text, value=True)
         right = node.comparators[0]
+        if isinstance(right, ast.Name):
+            held = FilterEQ(key=key.text, value=tokens[first].value)
+            return FilterNOT(filters=[held]) if sign.kind == "not" else held
         if isinstance(right, ast.List):
             values = [tokens[item.col_offset // _WIDTH].value for item in right.elts]
             chosen = FilterIN(key=key.text, value=values)

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.facts import TIME_PATHS, bound
-from tupli_mcap.schema.filters import BaseFilter, FilterType, path_of
+from tupli_mcap.schema.filters import ORDERING, BaseFilter, FilterType, path_of
 from tupli_mcap.schema.keys import join_key
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.schema.values import Scalar, against_floats, classify, compare, untag_float
@@ -57,19 +57,36 @@ def _predicate(filter: BaseFilter, *, timed: bool) -> Predicate:
         case FilterType.NOT:
             inner = _predicate(filter.filters[0], timed=timed)
             return lambda item: not inner(item)
-    path, test = path_of(filter), scalar_test(filter)
+    path = path_of(filter)
     if timed and path in TIME_PATHS:
-        return lambda item: (ns := time_ns(look_up(item, path))) is not None and test(Scalar("number", ns))
+        of_time = scalar_test(filter)
+        return lambda item: (ns := time_ns(look_up(item, path))) is not None and of_time(Scalar("number", ns))
+    test = _value_test(filter)
 
     def comparison(item: Item) -> bool:
         found = look_up(item, path)
-        return found is not MISSING and test(classify(found))
+        return found is not MISSING and test(found)
+
+    return comparison
+
+
+def _value_test(filter: BaseFilter) -> Callable[[object], bool]:
+    """What a comparison says of a value that is there: of a list, what it says of its elements."""
+    test = scalar_test(filter)
+    if filter.type in ORDERING:
+        return lambda found: test(classify(found))
+    joined = all if filter.type is FilterType.NE else any
+
+    def comparison(found: object) -> bool:
+        if isinstance(found, list | tuple):
+            return joined(test(classify(element)) for element in found)
+        return test(classify(found))
 
     return comparison
 
 
 def scalar_test(filter: BaseFilter) -> Callable[[Scalar], bool]:
-    """What a comparison says of a value that is there."""
+    """What a comparison says of a scalar that is there."""
     if filter.type is FilterType.IN:
         # Equal scalars of one kind hash alike, 1 and 1.0 too; only NaN is not equal to itself.
         choices = {scalar for value in filter.value if (scalar := classify(value)).kind != "nan"}
@@ -128,8 +145,8 @@ def _mask(filter: BaseFilter, columns: Mapping[str, Any], length: int) -> Mask:
             parts = [_compare_array("EQ", leaf, classify(value)) for value in filter.value]
             return np.logical_or.reduce(parts) if parts else np.zeros(length, np.bool_)
         return _compare_array(filter.type.value, leaf, classify(filter.value))
-    test = scalar_test(filter)
-    matches = (value is not MISSING and test(classify(value)) for value in leaf)
+    test = _value_test(filter)
+    matches = (value is not MISSING and test(value) for value in leaf)
     return np.fromiter(matches, np.bool_, count=len(leaf))
 
 

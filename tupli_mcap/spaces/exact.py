@@ -146,7 +146,7 @@ def check_structure(space: gym.Space[Any], value: Any, path: str) -> None:
     if type(space) is spaces.Dict:
         keys = list(space.spaces)
         if not isinstance(value, Mapping) or set(value) != set(keys):
-            found = sorted(map(repr, value)) if isinstance(value, Mapping) else shorten(value)
+            found = sorted(value, key=repr) if isinstance(value, Mapping) else shorten(value)
             raise StepError(f"{path}: expected an entry for each of {shorten(keys)}, found {shorten(found)}")
         for key, sub in space.spaces.items():
             check_structure(sub, value[key], f"{path}[{key!r}]")

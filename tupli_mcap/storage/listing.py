@@ -18,7 +18,7 @@ from tupli_mcap.errors import NotFoundError, RecordingError, TupliError, os_reas
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.description import spread_of, state_of, success_rate
+from tupli_mcap.recording.description import spread_of, state_of, successes
 from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
@@ -72,7 +72,7 @@ class ListedRecording(NamedTuple):
         NaN, and NaN itself where that is so of all. size: bytes of the file.
     state: "complete", "recording" (a writer is at work) or "recovered" (a writer did not finish).
     name, environment, started (ISO 8601 in UTC): of its run. success: the share of the episodes that succeeded, among
-        those whose metadata say it; None if none do.
+        the `success_known` whose metadata say it; None if none do.
     """
 
     path: str
@@ -89,6 +89,7 @@ class ListedRecording(NamedTuple):
     environment: str = ""
     started: str = ""
     success: float | None = None
+    success_known: int = 0
 
 
 class Compactable(NamedTuple):
@@ -223,6 +224,7 @@ def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] 
                 kept = np.flatnonzero(~np.isin(numbers, list(deleted)))
             rows = recording.index[kept]
             returns = spread_of(rows["return"])
+            said = successes(recording, kept)
             return ListedRecording(
                 path=str(path),
                 episodes=len(rows),
@@ -236,7 +238,8 @@ def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] 
                 name=", ".join(dict.fromkeys(run.name for run in recording.readable_runs)),
                 environment=recording.readable_runs[0].environment,
                 started=recording.readable_runs[0].started,
-                success=success_rate(recording, kept),
+                success=sum(said) / len(said) if said else None,
+                success_known=len(said),
             )
     except (TupliError, OSError) as err:
         return ListedRecording(str(path), error=str(err))

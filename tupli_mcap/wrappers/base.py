@@ -169,6 +169,8 @@ class EpisodeWrapper:
             _close_recordings(self._work, self._live)
             self._finalizer.detach()
             self._when_closed()
+            if self._infos is not None:
+                self._infos.warn_of_unseen(self.path)
         finally:
             self.env.close(**kwargs)
 
@@ -224,7 +226,8 @@ def wrong_kind(env: object, expected: str) -> RecordingError:
     elif "pettingzoo" in libraries:
         found = f"the PettingZoo environment {name}; EpisodeWriter records it by hand, an agent a stream"
     elif isinstance(env, str):
-        found = f"{env!r:.60}; make it: gymnasium.make({env!r:.60})"
+        make = "make_vec" if "vector" in expected else "make"
+        found = f"{env!r:.60}; make it: gymnasium.{make}({env!r:.60})"
     else:
         found = f"{name}, which is no gymnasium.Env"
     return RecordingError(f"expected {expected}, found {found}")

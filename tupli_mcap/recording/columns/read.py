@@ -14,15 +14,17 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.columns.fields import GymnasiumNames
+from tupli_mcap.recording.columns.fields import FIELDS, GymnasiumNames
 from tupli_mcap.recording.columns.gather import EPISODE, Files, Plan, Rows, final_rows, image_rows, step_rows
 from tupli_mcap.recording.columns.runs import Runs, final_runs, parts_of
 from tupli_mcap.recording.columns.threads import do_all
 
 __all__ = ["ColumnReader", "Columns", "StoredSteps"]
 
+_MOST_KEYS = 20  # of infos that are shown
 
-@dataclass
+
+@dataclass(repr=False)
 class Columns(GymnasiumNames):
     """Columns of the asked fields, None for the others.
 
@@ -43,6 +45,26 @@ class Columns(GymnasiumNames):
 
     def __len__(self) -> int:
         return int(self.episode_lengths.sum())
+
+    def __repr__(self) -> str:
+        columns = [(field, getattr(self, field)) for field in FIELDS]
+        told = [f"{field}: {_described(column)}" for field, column in columns if column is not None]
+        return f"<Columns of {len(self)} steps of {len(self.episode_lengths)} episodes: {'; '.join(told)}>"
+
+
+def _described(column: Any) -> str:
+    """A column in short: dtype and shape, or how many values; of dicts, their keys."""
+    if isinstance(column, np.ndarray):
+        return f"{column.dtype} {column.shape}"
+    if isinstance(column, dict):
+        return "{" + ", ".join(f"{key!r}: {_described(value)}" for key, value in column.items()) + "}"
+    if isinstance(column, tuple):
+        return f"({', '.join(map(_described, column))})"
+    if all(isinstance(value, dict) for value in column):
+        keys = list(dict.fromkeys(key for value in column for key in value))
+        more = f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
+        return f"{len(column)} dicts of {', '.join(map(str, keys[:_MOST_KEYS])) or 'nothing'}{more}"
+    return f"{len(column)} values"
 
 
 class ColumnReader:

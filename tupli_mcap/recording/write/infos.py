@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, did_you_mean
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.recording.write.options import RecordInfo
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -45,6 +47,8 @@ class InfoRecorder:
                 f"record_info: expected True, False, a list of names or a function, found {select!r:.80}"
             )
         self._names = [] if isinstance(select, bool) or callable(select) else list(dict.fromkeys(select))
+        self._unseen = set(self._names)
+        self._last: tuple[Any, ...] | None = None  # keys of the last info, while a name is unseen
         self._select = select
         self.codec = InfoCodec(self._names)
 
@@ -57,7 +61,18 @@ class InfoRecorder:
             return entries_of(self._select(info), "record_info: what the function returns")
         if self._select is True:
             return info
-        return {name: info[name] for name in self._names if name in info}
+        found = {name: info[name] for name in self._names if name in info}
+        if self._unseen:
+            self._unseen.difference_update(found)
+            self._last = tuple(info)
+        return found
+
+    def warn_of_unseen(self, path: Path) -> None:
+        """Warns once of names that no step's info had, if there were steps."""
+        unseen, self._unseen = sorted(self._unseen), set()
+        if unseen and self._last is not None:
+            said = ", ".join(f"{name!r}{did_you_mean(name, map(str, self._last))}" for name in unseen)
+            warnings.warn(f"{path}: record_info: no step's info had {said}", stacklevel=3)
 
     def put(self, writer: RecordingWriter, episode: int, step: int, info: Mapping[str, Any]) -> None:
         """Appends the entries of one step to the journal."""

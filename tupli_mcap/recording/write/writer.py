@@ -410,7 +410,9 @@ class RecordingWriter:
     def why_stopped(self) -> RecordingError:
         """Why nothing more can be recorded: it is closed, or has been broken off."""
         if self.closed and not self.failed:
-            return RecordingError(f"{self.path} is closed; wrap the environment again to record")
+            return RecordingError(
+                f'{self.path} is closed; make another recorder (mode="a" goes on in this file)'
+            )
         interrupted = self._broken_off("an interruption (or this call, from a signal handler, say)")
         return RecordingError(self.failed or interrupted)
 

@@ -192,9 +192,9 @@ def _near(
         return false() if text is None or not texts else _OPERATORS[filter.type](text, texts[0])
     parts = [_any_of(number, numbers)]
     if any(scalar.kind == "null" for scalar in wanted):
-        parts.append(number.is_(None) if text is None else and_(number.is_(None), text.is_(None)))
+        parts.append(number.is_(None))
     if text is not None:
-        parts.append(and_(number.is_(None), _any_of(text, texts)))
+        parts.append(and_(number.is_(None), or_(text.is_(None), _any_of(text, texts))))  # neither: a list
     return or_(*parts)
 
 
@@ -223,6 +223,8 @@ def _in_metadata(filter: BaseFilter) -> Condition:
             least = value >= low if filter.type not in (FilterType.LT, FilterType.LEQ) else true()
             most = value <= high if filter.type not in (FilterType.GT, FilterType.GEQ) else true()
             parts.append(and_(least, most))
+    if filter.type not in ORDERING:
+        parts.append(func.json_type(EPISODE.c.metadata, where) == "array")  # an element may be equal
     return or_(*parts)
 
 
