@@ -471,7 +471,10 @@ class TestLook:
             shutil.copy(name, f"b{name[1:]}")
         (told,) = run("ls", "b.mcap", "--json").json
         assert (told["state"], told["episodes"], told["steps"]) == ("recovered", 1, 1)
-        assert "its writer did not finish it" in ok("info", "b.mcap")
+        assert "did not finish it, what its chunks and its journal hold is here" in ok("info", "b.mcap")
+        Path("b.mcap.journal").unlink()
+        told = run("info", "b.mcap").out  # with a warning
+        assert "did not finish it, its journal is missing; what its chunks hold is here" in told
         env.close()
 
     def test_info(self, cartpole: Path, here: Path) -> None:

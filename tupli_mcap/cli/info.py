@@ -23,7 +23,7 @@ from tupli_mcap.cli.output import (
     time_of,
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import FormatError, RecordingError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -120,7 +120,7 @@ def info(
     with Recording(file) as recording:
         description = describe(recording)
         if not as_json:
-            print_facts(_facts(description))
+            print_facts(_facts(description, has_journal=_has_journal(recording)))
             _print_series(recording)
     if as_json:
         channels = [channel._asdict() for channel in description.channels]
@@ -143,11 +143,26 @@ def _spreads(description: RecordingDescription) -> dict[str, dict[str, float] | 
     return {name: None if spread is None else spread._asdict() for name, spread in named.items()}
 
 
-def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
+def _has_journal(recording: Recording) -> bool:
+    """Whether the journal of an unfinished recording is there."""
+    from tupli_mcap.journal.file import recorded_journal
+
+    try:
+        return recording.path is not None and recorded_journal(recording.path, recording.metadata).exists()
+    except FormatError:
+        return False
+
+
+def _facts(d: RecordingDescription, *, has_journal: bool) -> list[tuple[str, str]]:
+    held = (
+        "what its chunks and its journal hold"
+        if has_journal
+        else "its journal is missing; what its chunks hold"
+    )
     states = {
         "complete": "complete",
         "recording": "a writer is at work on it",
-        "recovered": "recovered: its writer did not finish it, what its chunks and its journal hold is here",
+        "recovered": f"recovered: its writer did not finish it, {held} is here",
     }
     environment = d.environment or "none attached"
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)
