@@ -119,6 +119,9 @@ def info(
     Of a directory: its runs, environments and episodes, and the keys of their metadata.
     --episodes and --filter say of which episodes; channels, attachments and size are those of the whole file.
     """
+    import numpy as np
+
+    from tupli_mcap.dataset.which import candidates, named_positions
     from tupli_mcap.recording import Recording
     from tupli_mcap.recording.description import describe
 
@@ -127,14 +130,9 @@ def info(
         _print_directory(Path(file), episodes, wanted, as_json=as_json)
         return
     with Recording(file) as recording:
-        positions = None
+        positions = candidates(recording, wanted)  # without those that are deleted
         if episodes is not None or wanted is not None:
-            import numpy as np
-
-            from tupli_mcap.dataset.which import candidates, named_positions
-
-            among = candidates(recording, wanted)
-            positions = np.array(sorted(named_positions(recording, among, episodes or "all", wanted)))
+            positions = np.array(sorted(named_positions(recording, positions, episodes or "all", wanted)))
         description = describe(recording, positions)
         if not as_json:
             print_facts(_facts(description, has_journal=_has_journal(recording)))
@@ -190,7 +188,7 @@ def _facts(d: RecordingDescription, *, has_journal: bool) -> list[tuple[str, str
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)
     return [
         ("recording", d.name),
-        *_run_facts(d.run),
+        *(_run_facts(d.run) if len(d.runs) == 1 else [("runs", _runs_text(d.runs))]),
         ("state", states[d.state]),
         ("uuid", d.uuid),
         ("made", f"{time_of(d.created_ns)} by {d.library}"),
@@ -208,6 +206,10 @@ def _facts(d: RecordingDescription, *, has_journal: bool) -> list[tuple[str, str
         *([("metadata", ", ".join(d.metadata_keys))] if d.metadata_keys else []),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
+
+
+def _runs_text(runs: Sequence[dict[str, Any]]) -> str:
+    return _some([f"{run['name']} ({counted(run['episodes'], 'episode')})" for run in runs])
 
 
 def _space_facts(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:

@@ -74,7 +74,8 @@ class RecordingDescription:
         an episode.
     compression: bytes of messages for one byte of chunks in the file; None without a chunk.
     ends: episodes by how they ended. environment: the name that its run says, else its benchmark; None if none does.
-    run: what is known of the run. made_of: of which recordings it was made; None if it was recorded.
+    run: what is known of the run, or of the first one. runs: `name` and number of `episodes` of each.
+    made_of: of which recordings it was made; None if it was recorded.
     metadata_keys: those that episodes have. success: see `success_rate`.
     observation, action: their spaces in lines for people, see `space_lines`; empty where there is no step.
     signed_by: the fingerprint of the key that its signature names, unchecked; None if it is not signed.
@@ -92,6 +93,7 @@ class RecordingDescription:
     environment: str | None
     signed_by: str | None
     run: dict[str, Any]
+    runs: list[dict[str, Any]]
     made_of: dict[str, Any] | None
     metadata_keys: list[str]
     success: float | None
@@ -141,6 +143,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         environment=run.environment or named,
         signed_by=claimed_signer(recording),
         run={key: value for key, value in vars(run).items() if value},
+        runs=_runs(recording, positions),
         made_of=made_of(recording),
         metadata_keys=_metadata_keys(recording, positions),
         success=success_rate(recording, positions),
@@ -165,6 +168,15 @@ def state_of(recording: Recording) -> str:
     if recording.complete:
         return "complete"
     return "recording" if recording.path is not None and is_locked(recording.path) else "recovered"
+
+
+def _runs(recording: Recording, positions: Array) -> list[dict[str, Any]]:
+    runs = recording.readable_runs
+    places = (
+        np.array(recording.run_places)[positions] if len(runs) > 1 else np.zeros(len(positions), np.int64)
+    )
+    counts = np.bincount(places, minlength=len(runs)).tolist()
+    return [{"name": run.name, "episodes": count} for run, count in zip(runs, counts, strict=True)]
 
 
 def _metadata_keys(recording: Recording, positions: Array) -> list[str]:
