@@ -307,6 +307,39 @@ class TestMerge:
         )
         assert_sound(again.path)
 
+    def test_a_vector_and_a_single_one_at_the_same_time(self, tmp_path: Path) -> None:
+        """One has infos, the other frames; final states of a vector environment are there before its steps."""
+        venv = SyncVectorEnv([lambda: Sampled("image")] * 2, autoreset_mode=AutoresetMode.SAME_STEP)
+        with (
+            RecordVector(venv, tmp_path / "v.mcap", attachments={}, record_info=True) as vector,
+            RecordEpisodes(
+                Sampled("image", "rgb_array"), tmp_path / "s.mcap", attachments={}, frames=2
+            ) as single,
+        ):
+            vector.reset(seed=1)
+            single.reset(seed=2)
+            for _ in range(40):
+                vector.step(vector.action_space.sample())
+                if any(single.step(0)[2:4]):
+                    single.reset()
+        report = merge_recordings([tmp_path / "v.mcap", tmp_path / "s.mcap"], tmp_path / "all.mcap")
+        assert report.held == 0
+        assert_sound(report.path)
+        with (
+            Recording(report.path) as merged,
+            Recording(tmp_path / "v.mcap") as v,
+            Recording(tmp_path / "s.mcap") as s,
+        ):
+            assert merged.num_envs == 3
+            wanted = facts(v) + [{**fact, "env": 2} for fact in facts(s)]
+            for fact in wanted:  # who has no infos has them empty beside others
+                fact["steps"] = [(*step[:5], step[5] or None) for step in fact["steps"]]
+            found = facts(merged)
+            for fact in found:
+                fact["steps"] = [(*step[:5], step[5] or None) for step in fact["steps"]]
+            assert same(found, wanted)
+            assert times_of(merged) == times_of(v) + times_of(s)
+
     def test_merged_again_appended_and_filtered(self, tmp_path: Path) -> None:
         paths = [record(tmp_path / f"{i}.mcap", seed=i) for i in range(3)]
         merge_recordings(paths[:2], tmp_path / "two.mcap")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,13 +31,13 @@ class CopiedEpisode(NamedTuple):
 
     starts: (log_time, start) of the resets without a step before it, and of its own.
     end: (log_time, end). end_row: the row of that in its source, which decides between ends of one time.
-    final: gives (log_time, body) of its final state; None where that is not known.
+    final: log_time of its final state, and what gives the body of that; None where it is not known.
     """
 
     starts: Sequence[tuple[int, EpisodeStart]]
     end: tuple[int, EpisodeEnd]
     end_row: int
-    final: Callable[[], tuple[int, bytes]] | None
+    final: tuple[int, Callable[[], bytes]] | None
 
 
 class Assembler:
@@ -157,9 +158,10 @@ class Assembler:
         ended = dict(zip(by_end, itertools.count(self.next_row(ids[EPISODE_END])), strict=False))
         end_times = {i: time_ns for i, (time_ns, _) in zip(by_end, ends, strict=True)}
         self.add_messages(ids[EPISODE_END], ends)
-        with_final = [i for i in by_end if episodes[i].final is not None]
-        finals = dict(zip(with_final, itertools.count(self.next_row(ids[FINAL_STATE])), strict=False))
-        self.add_messages(ids[FINAL_STATE], (found() for i in with_final if (found := episodes[i].final)))
+        with_final = [(found[0], i, found[1]) for i in by_end if (found := episodes[i].final) is not None]
+        with_final.sort(key=itemgetter(0))
+        finals = {i: self.next_row(ids[FINAL_STATE]) + row for row, (_, i, _) in enumerate(with_final)}
+        self.add_messages(ids[FINAL_STATE], ((time_ns, body()) for time_ns, _, body in with_final))
         for i, episode in enumerate(episodes):
             start, end = episode.starts[-1][1], episode.end[1]
             self.index.add(

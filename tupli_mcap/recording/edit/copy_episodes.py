@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -242,7 +242,7 @@ class EpisodeCopier:
             ((end_time, body),) = self._messages(self._topics[EPISODE_END], int(row["end_row"]), 1)
             end = EpisodeEnd.decode(memoryview(body))
             total = self._values.returns.get(number, end.episode_return)
-            final = partial(self._final, row, _NUMBERS.pack(new["episode"], new["env"]))
+            final = self._final(row, _NUMBERS.pack(new["episode"], new["env"]))
             if trim is not None:
                 total, end_time = trim.episode_return, int(row["end_time"])
                 end = end._replace(length=trim.stop - trim.start, end=int(row["end"]))
@@ -253,18 +253,22 @@ class EpisodeCopier:
                     [(time_ns, start._replace(**new)) for time_ns, start in starts],
                     (end_time, end._replace(**new, episode_return=total)),
                     int(row["end_row"]),
-                    final if row["final_row"] >= 0 else None,
+                    final,
                 )
             )
         return found
 
-    def _final(self, row: Any, numbers: bytes) -> tuple[int, bytes]:
-        """(log_time, body) of a final state, with its new numbers."""
+    def _final(self, row: Any, numbers: bytes) -> tuple[int, Callable[[], bytes]] | None:
+        """log_time of a final state, and what gives its body, with its new numbers; None where it is not known."""
         trim = self._trims.get(int(row["episode"]))
         if trim is not None and trim.final is not None:
-            return int(row["end_time"]), numbers + trim.final
-        ((time_ns, body),) = self._messages(self._topics[FINAL_STATE], int(row["final_row"]), 1)
-        return time_ns, numbers + body[8:]
+            return int(row["end_time"]), partial(bytes, numbers + trim.final)
+        channel, place = self._topics[FINAL_STATE], int(row["final_row"])
+        if place < 0:
+            return None
+        return self._time_of(
+            channel, place
+        ), lambda: numbers + next(body for _, body in self._messages(channel, place, 1))[8:]
 
     def _starts(self, rows: Array) -> list[list[tuple[int, EpisodeStart]]]:
         """(log_time, start) of the resets without a step before each episode, and of its own.
