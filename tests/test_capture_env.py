@@ -217,8 +217,9 @@ def test_an_unregistered_environment_is_named(tmp_path: Path) -> None:
         TupliError, match=r"found only the names of its classes .*Robot\); record with capture_env="
     ):
         build(record, trust=True)
-    for command in (["info", str(path)], ["trust", "--show", str(path)]):
-        assert f"{__name__}:Robot" in CliRunner().invoke(app, command).output
+    for command, shown in (("info", "environment  Robot"), ("trust", f"{__name__}:Robot")):
+        words = [command, str(path), *(["--show"] if command == "trust" else [])]
+        assert shown in CliRunner().invoke(app, words).output
     result = CliRunner().invoke(app, ["verify", "--replay", str(path)])
     assert result.exit_code == 1
 

@@ -28,6 +28,7 @@ from fuzzing.oracle import observe
 
 from tupli_mcap import RecordEpisodes
 from tupli_mcap.cli.app import _report, app
+from tupli_mcap.cli.output import begin_json
 from tupli_mcap.dataset import TupliDataset
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import RowArea, read_journal
@@ -625,6 +626,7 @@ def test_memory_that_runs_out_is_told(place: str, tmp_path: Path, monkeypatch: p
 def test_the_command_line_tells_that_memory_ran_out(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    begin_json("info")
     assert _report(MemoryError("Unable to allocate 18.3 GiB"), as_json=True) == 1
     out, err = capsys.readouterr()
     assert "error: there is not enough memory" in err

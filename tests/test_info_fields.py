@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,13 @@ def test_of_a_loader(dataset: tupli_mcap.Dataset, workers: int) -> None:
         # the info of a step tells how many steps were taken, and its state how many had been
         assert torch.equal(batch["infos"]["step"], batch["states"][..., 0].long() + 1)
         assert batch["infos"]["force"].shape[1:] == (3, 2)
+
+
+def test_a_copy_in_another_process_has_them(dataset: tupli_mcap.Dataset) -> None:
+    windows = dataset.windows(2, fields=["states", "infos"])
+    copied = pickle.loads(pickle.dumps(windows))
+    np.testing.assert_array_equal(copied[3].infos["step"], windows[3].infos["step"])
+    np.testing.assert_array_equal(copied[3].states, windows[3].states)
 
 
 def test_says_what_there_is(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None:

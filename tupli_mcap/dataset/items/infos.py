@@ -25,6 +25,9 @@ class StepsWithInfos:
         self.episode_lengths, self.breaks = rest.episode_lengths, rest.breaks
         self.open_ends, self.identity = rest.open_ends, rest.identity
 
+    def __reduce__(self) -> tuple[type[StepsWithInfos], tuple[Steps, dict[str, Any]]]:
+        return StepsWithInfos, (self._rest, self._columns)
+
     def __len__(self) -> int:
         return len(self._rest)
 
