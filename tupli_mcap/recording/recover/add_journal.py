@@ -206,6 +206,9 @@ class _Steps:
             if first_row is not None and first_row <= first:
                 same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
                 rows["step"][:same] = first - first_row + np.arange(same)
+            # rows of this episode behind a gap go on counting from its first row, also where its start is lost
+            first_row = int(rows["#sequence"][-1]) - int(rows["step"][-1])
+            self._starts.setdefault((env, int(rows["episode"][-1])), first_row)
         _take_tables(evidence, channel, tables)
         stop = evidence.stop(channel)
         finals = {(env, hole.row): hole for hole in committed.finals(layout.state_end) if hole.row <= stop}
