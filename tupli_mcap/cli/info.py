@@ -25,6 +25,7 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -126,7 +127,7 @@ def info(
     from tupli_mcap.recording.description import describe
 
     wanted = filter_of(filter_text)
-    if "://" not in file and Path(file).is_dir():
+    if not is_url(file) and Path(file).is_dir():
         _print_directory(Path(file), episodes, wanted, as_json=as_json)
         return
     with Recording(file) as recording:

@@ -15,6 +15,7 @@ from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
 from tupli_mcap.cli.output import bytes_of, counted, number, print_json
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Episode, Recording
@@ -123,7 +124,7 @@ def _chosen(
     from tupli_mcap.dataset.which import choose_episodes, chosen_from
     from tupli_mcap.recording import Recording
 
-    if "://" in source or not Path(source).is_dir():
+    if is_url(source) or not Path(source).is_dir():
         with Recording(source) as recording:
             yield recording, choose_episodes(recording, episodes, wanted)
         return

@@ -30,6 +30,7 @@ from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
 from tupli_mcap.recording.columns.read import Columns
+from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate, parse_filter
 from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
@@ -73,7 +74,7 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
         folder = Path(name).expanduser()
-        if "://" in name or not folder.is_dir():
+        if is_url(name) or not folder.is_dir():
             return Dataset(FilesSource(source))
         files = _files_in(folder)
         if is_storage(folder) or not files:
@@ -87,9 +88,9 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
 
 
 def _place_of(recording: Recording) -> str:
-    if recording.path is None and "://" not in recording.name:
+    if recording.address is None:
         raise DatasetError(f"{recording.name} was opened as a file object; open it by its path or URL")
-    return os.fspath(recording.path or recording.name)
+    return recording.address
 
 
 def _files_in(source: Openable) -> Sequence[str]:
@@ -98,7 +99,7 @@ def _files_in(source: Openable) -> Sequence[str]:
         return [_place_of(source)]
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
-        if "://" not in name and Path(name).expanduser().is_dir():
+        if not is_url(name) and Path(name).expanduser().is_dir():
             return [str(path) for path in find_recordings(Path(name).expanduser())]
         return FilesSource(source).names
     raise DatasetError(

@@ -18,6 +18,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError, TupliError
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
+from tupli_mcap.remote import is_url, matching, shown
 from tupli_mcap.schema import (
     BaseFilter,
     BenchmarkHeader,
@@ -141,6 +142,7 @@ class FilesSource:
                 "expected at least one recording, found an empty list; give paths or a pattern"
             )
         self.names = list(dict.fromkeys(names))
+        self._addresses = {shown(name): name for name in self.names if is_url(name)}
 
     def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
         matches = compile_predicate(filter, BenchmarkHeader)
@@ -165,7 +167,7 @@ class FilesSource:
             name = recording.name
             if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                 continue
-            notes = None if "://" in name else Notes.read(Path(name))
+            notes = None if is_url(name) else Notes.read(Path(name))
             deleted = set() if notes is None else notes.about(recording.metadata).deleted
             headers = list(episode_headers(recording, name, deleted))
             if seen is not None:
@@ -199,10 +201,10 @@ class FilesSource:
         return f"every episode: benchmark {benchmark_filter}, episode {episode_filter}"
 
     def open(self, recording: str) -> Recording:
-        return Recording(recording, cache_bytes=_CACHE_BYTES)
+        return Recording(self._addresses.get(recording, recording), cache_bytes=_CACHE_BYTES)
 
     def __repr__(self) -> str:
-        return repr(self.names[0]) if len(self.names) == 1 else f"{len(self.names)} files"
+        return repr(shown(self.names[0])) if len(self.names) == 1 else f"{len(self.names)} files"
 
 
 class JoinedSource:
@@ -252,8 +254,8 @@ def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
     if not isinstance(item, str | os.PathLike):
         raise RecordingError(f"expected the path of a recording or a pattern, found {item!r:.80}")
     name = os.fspath(item)
-    if "://" in name:
-        return [name]
+    if is_url(name):
+        return matching(name)
     path = Path(name).expanduser()
     if path.is_dir():
         raise RecordingError(

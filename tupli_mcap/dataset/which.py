@@ -19,6 +19,7 @@ import numpy as np
 
 from tupli_mcap.errors import FilterError, RecordingError, TupliError
 from tupli_mcap.recording import Episode, Recording
+from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.sources import Source as EpisodeSource
@@ -244,7 +245,7 @@ def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Su
 
     error: TupliError = RecordingError(f"{name} holds no recording (.mcap)")
     files = [name]
-    if "://" not in name:
+    if not is_url(name):
         try:
             files = [str(file) for file in find_recordings(Path(name))]
         except TupliError as err:
@@ -347,7 +348,7 @@ def _parsed(text: str) -> BaseFilter:
 
 
 def _is_directory(source: str | os.PathLike[str]) -> bool:
-    return "://" not in os.fspath(source) and Path(source).is_dir()
+    return not is_url(os.fspath(source)) and Path(source).is_dir()
 
 
 def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: ExitStack) -> list[Chosen]:

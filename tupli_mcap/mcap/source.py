@@ -13,7 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, TypeVar
 
-from tupli_mcap.errors import FormatError, RecordingError, missing_extra, os_reason
+from tupli_mcap.errors import FormatError, RecordingError, os_reason
+from tupli_mcap.remote import RemoteSource, is_url, open_url, shown
 
 __all__ = ["Source", "open_regular", "open_source"]
 
@@ -241,23 +242,12 @@ def _read_or_refused(name: str, offset: int, length: int, read: Callable[[], _T]
 
 
 def open_source(source: str | os.PathLike[str] | BinaryIO) -> Source:
-    """A Source for a path, a URL (`https://…`, `s3://…`, through fsspec) or an open binary file."""
-    if isinstance(source, str) and "://" in source:
-        return _open_url(source)
+    """A Source for a path, a URL (`https://…`, `s3://…`) or an open binary file."""
+    if isinstance(source, str) and is_url(source):
+        found = open_url(source)
+        return found if isinstance(found, RemoteSource) else FileSource(found, shown(source), owned=True)
     if isinstance(source, str | os.PathLike):
         return PathSource(Path(source))
     if not hasattr(source, "read") or not hasattr(source, "seek"):
         raise RecordingError(f"expected a path, a URL or a seekable binary file, found {source!r}")
     return FileSource(source, str(getattr(source, "name", "<file>")), owned=False)
-
-
-def _open_url(url: str) -> Source:
-    try:
-        import fsspec
-    except ImportError as err:
-        raise missing_extra(f"reading {url} needs fsspec", "remote") from err
-    try:
-        file: Any = fsspec.open(url, "rb", block_size=1 << 18, cache_type="readahead").open()
-    except Exception as err:  # each of fsspec's file systems raises errors of its own
-        raise RecordingError(f"{url} cannot be opened: {err}; check the address and your rights") from err
-    return FileSource(file, url, owned=True)

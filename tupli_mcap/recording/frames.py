@@ -106,6 +106,7 @@ class Cameras:
             pictures, pairs = self.channels(camera, env)
             # a writer that is at work may have moved one of them to the file, and not yet the other
             count = min(self._store.count(pictures), self._store.count(pairs))
+            self._store.fetch(span.chunk for span in self._store.spans(pairs, 0, count))
             parts = [
                 self._store.rows(span.chunk, FRAME_LAYOUT.dtype, keep=False)[span.begin : span.end]
                 for span in self._store.spans(pairs, 0, count)

@@ -26,6 +26,7 @@ from tupli_mcap.recording.frames import Cameras
 from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
 from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, voucher
+from tupli_mcap.remote import is_url
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.trust import TrustedKey, is_trusted
@@ -89,7 +90,7 @@ class OpenedRecording:
 
     def __init__(self, source: str | os.PathLike[str] | BinaryIO, *, cache_bytes: int = CACHE_BYTES) -> None:
         self._source = open_source(source)
-        self._reopen = None if not isinstance(source, str | os.PathLike) else _absolute(source)
+        self.address: str | None = None if not isinstance(source, str | os.PathLike) else _absolute(source)
         self._cache_bytes = cache_bytes
         self.name = self._source.name
         self.path: Path | None = self._source.path
@@ -315,4 +316,4 @@ def _spaces_of(channel: Channel) -> dict[str, str]:
 
 def _absolute(source: str | os.PathLike[str]) -> str:
     name = os.fspath(source)
-    return name if "://" in name else os.path.abspath(name)  # noqa: PTH100 - links stay
+    return name if is_url(name) else os.path.abspath(name)  # noqa: PTH100 - links stay

@@ -333,7 +333,7 @@ class Recording(DescribedRecording, DatasetVerbs):
     def stored(self) -> StoredSteps:
         """Where the steps lie; RecordingError if there is none yet."""
         finals = self._topics.get(FINAL_STATE)
-        where, source = self._reopen, self._source
+        where, source = self.address, self._source
         return StoredSteps(self.layout, self._store, self._step_channels, self._images, finals, where, source)
 
     def replay(
@@ -372,11 +372,11 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     def __reduce__(self) -> tuple[Callable[..., Recording], tuple[str, str, int]]:
         """A copy in another process opens the file itself."""
-        if self._reopen is None:
+        if self.address is None:
             raise RecordingError(
                 f"{self.name} was opened as a file object, which cannot be copied; give its path"
             )
-        return _opened_again, (self._reopen, self.uuid, self._cache_bytes)
+        return _opened_again, (self.address, self.uuid, self._cache_bytes)
 
     def __enter__(self) -> Recording:
         return self
@@ -388,7 +388,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         return len(self.index)
 
     def _repr_html_(self) -> str:
-        return html.escape(repr(self)) if self._reopen is None else self.dataset._repr_html_()
+        return html.escape(repr(self)) if self.address is None else self.dataset._repr_html_()
 
     def __repr__(self) -> str:
         state = "" if self.complete else ", recovered"

@@ -24,6 +24,7 @@ from pydantic import BaseModel, ValidationError
 
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording, write_recording
+from tupli_mcap.remote import is_url
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -354,7 +355,7 @@ def storage_at(place: TupliStorage | str | os.PathLike[str]) -> TupliStorage:
     if not isinstance(place, str | os.PathLike) or not os.fspath(place):
         raise StorageError(f"expected a storage, or the path of its directory, found {place!r:.80}")
     name = os.fspath(place)
-    if "://" in name or glob.has_magic(name) or name.endswith(".mcap"):
+    if is_url(name) or glob.has_magic(name) or name.endswith(".mcap"):
         raise StorageError(
             f"expected the directory of a storage, found {name!r:.80}; recordings are opened with tupli_mcap.open(...)"
         )

@@ -154,7 +154,7 @@ class _Builder:
     def add(self, recording: Recording, listed: ListedEpisodes) -> None:
         stored = recording.stored
         source = stored.source
-        if stored.where is not None:
+        if stored.where is not None and source.path is not None:
             source = FileOfMany(self._files, stored.where, source.size)
         rows = recording.index[positions_of(recording, listed)]
         self._layout_of.append(self._layout(recording.name, stored.layout))
@@ -250,7 +250,7 @@ class OpenFiles:
         self._process = os.getpid()
 
     def source(self, where: str) -> Source:
-        """The open file of a path or a URL. It closes when nobody holds it any more."""
+        """The open file of a path. It closes when nobody holds it any more."""
         if self._process != os.getpid():  # the lock may be held by a thread that is not here
             self._forget()
         with self._lock:
@@ -275,7 +275,7 @@ class FileOfMany:
     def __init__(self, files: OpenFiles, where: str, size: int) -> None:
         self._files = files
         self.name = where
-        self.path: Path | None = None if "://" in where else Path(where)
+        self.path: Path | None = Path(where)
         self.size = size
 
     def read(self, offset: int, length: int) -> bytes:

@@ -79,6 +79,7 @@ class NumberedRows:
         if len(parts) <= _FEW_CHUNKS and self._rows.bytes_of(parts) < len(parts) * _LARGE_CHUNK:
             threads = 1
         tasks = self._rows.tasks(held.columns, parts, keep=False)
+        self._rows.fetch(parts)
 
         def fill(unit: int, part: Part, task: Callable[[], None]) -> None:
             task()

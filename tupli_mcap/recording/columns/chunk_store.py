@@ -12,7 +12,7 @@ import os
 import struct
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from mmap import mmap
 from typing import Any, NamedTuple, Protocol
 
@@ -27,6 +27,7 @@ from tupli_mcap.mcap.crc import crc32
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAX_CHUNK
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.limits import StepClaims
+from tupli_mcap.remote import RemoteSource
 
 __all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Span"]
 
@@ -288,6 +289,20 @@ class ChunkStore:
         end = np.minimum(last[run], firsts[at] + self.table["rows"][chosen[at]])
         return run, chosen[at], start - firsts[at], end - start
 
+    def fetch(self, chunks: Iterable[int]) -> None:
+        """Chunks that will be read next: those of a file on a server begin to come, in few requests."""
+        if not isinstance(self._source, RemoteSource):
+            return
+        numbers = [
+            i
+            for i in dict.fromkeys(chunks)
+            if self._cache.get((self._number, i)) is None and self._cache.get((self._number, ~i)) is None
+        ]
+        table = self.table[numbers]
+        starts = table["offset"].tolist()
+        ends = (table["offset"] + table["length"]).tolist()
+        self._source.fetch([(a, b) for a, b in zip(starts, ends, strict=True) if a < IN_MEMORY])
+
     def load(self, i: int, *, keep: bool = True) -> Any:
         """The message records of chunk `i`; cached unless `keep` is False."""
         return self.chunk(i, keep=keep).data
@@ -419,6 +434,7 @@ class ChunkStore:
 
     def bodies(self, channel: int, first: int, count: int) -> Iterator[memoryview]:
         """The CDR bodies of messages of a channel of variable layout."""
+        self.fetch(span.chunk for span in self.spans(channel, first, count))
         for span in self.spans(channel, first, count):
             data, records = self.records(span.chunk)
             view = memoryview(data)

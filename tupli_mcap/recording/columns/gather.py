@@ -6,6 +6,7 @@ become columns, a `Rows` reads a kind of all files, and a `Plan` says which kind
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -167,9 +168,15 @@ class Rows:
                         f"{self._stores[part.file].name}: expected bools of 0 or 1 in {name!r}, found another byte"
                     )
 
+    def fetch(self, parts: Sequence[Part]) -> None:
+        """Chunks that will be read next."""
+        for file, some in itertools.groupby(parts, lambda part: part.file):
+            self._stores[file].fetch(part.chunk for part in some)
+
     def read(self, names: Sequence[str], parts: Sequence[Part], total: int, threads: int) -> dict[str, Any]:
         """Columns of `total` rows, by name."""
         columns = {name: self.columns[name].empty(total) for name in names}
+        self.fetch(parts)
         do_all(self.tasks(columns, parts), threads)
         self.check(columns, parts, whole=True)
         return columns

@@ -92,7 +92,7 @@ class ColumnReader:
         """
         plan = self._plans.get(tuple(fields)) or self._plan(fields)
         columns: dict[str, Any] = {}
-        tasks, checks = [], []
+        tasks, checks, chunks = [], [], []
         for i, names in plan.sources:
             rows, leaf, moved = self._kinds[i], self._leaves[i], runs
             if leaf is not None and not images:
@@ -106,7 +106,9 @@ class ColumnReader:
             )
             columns |= own
             tasks += rows.tasks(own, parts, keep)
+            chunks += [part.chunk for part in parts]
             checks.append(partial(rows.check, own, parts, whole=True))
+        self._store.fetch(chunks)
         do_all(tasks, threads)
         for check in checks:
             check()

@@ -157,6 +157,9 @@ class EpisodeCopier:
 
     def _copy(self, channel: int, spans: list[tuple[int, int]], dtype: np.dtype[Any] | None) -> None:
         """Rows `spans` of a channel of steps or images, renumbered, in chunks of the usual size."""
+        self._store.fetch(
+            span.chunk for first, count in spans for span in self._store.spans(channel, first, count)
+        )
         done = self._copy_first(channel, spans[0][1], dtype) if spans and spans[0][0] == 0 else 0
         if done:
             spans = [(done, spans[0][1] - done), *spans[1:]]

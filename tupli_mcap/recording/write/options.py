@@ -15,6 +15,7 @@ from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.journal.seals import Durability, check_durability
 from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
+from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -175,7 +176,7 @@ def check_place(path: str | os.PathLike[str]) -> None:
     longer looks like one."""
     if "\0" in os.fspath(path):
         raise RecordingError(f"expected a path to record to, found {os.fspath(path)!r}, which holds a NUL")
-    if "://" in os.fspath(path):
+    if is_url(os.fspath(path)):
         raise RecordingError(
             f"{path}: expected a local path to record to, found a URL; record to a path, and copy the file"
         )

@@ -1,0 +1,14 @@
+"""Files on web servers and in buckets, read in place.
+
+objects:  one object behind a URL: its size, its version, and ranges of its bytes (obstore, or fsspec).
+plan:     which ranges are asked for together.
+source:   what a reader reads from: it plans ahead, keeps what came, and stops if the object changes.
+patterns: the URLs that a pattern such as "s3://bucket/runs/*.mcap" matches.
+names:    URLs, and how they may be shown.
+"""
+
+from tupli_mcap.remote.names import is_url, shown
+from tupli_mcap.remote.patterns import matching
+from tupli_mcap.remote.source import RemoteSource, open_url
+
+__all__ = ["RemoteSource", "is_url", "matching", "open_url", "shown"]

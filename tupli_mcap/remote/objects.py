@@ -1,0 +1,241 @@
+"""One object behind a URL: its size, its version, and ranges of its bytes.
+
+Web servers, S3, Google Cloud Storage and Azure are read by obstore, which takes credentials from the environment as
+their own tools do; all other kinds of URL by fsspec.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from typing import Any, NamedTuple, Protocol, TypeVar
+from urllib.parse import urlsplit
+
+from tupli_mcap.errors import RecordingError, missing_extra
+from tupli_mcap.remote.names import is_web, shown
+
+__all__ = ["NoRangesError", "RemoteObject", "Tail", "find", "listed"]
+
+_T = TypeVar("_T")
+_BUCKETS = frozenset({"s3", "s3a", "gs", "az", "azure", "abfs", "abfss", "adl"})
+_RETRIES = {"max_retries": 5, "retry_timeout": timedelta(seconds=60)}
+_CLIENT = {"connect_timeout": "10s", "timeout": "120s", "allow_http": True}
+
+
+class NoRangesError(Exception):
+    """The server sends whole files only."""
+
+
+class Tail(NamedTuple):
+    """The last bytes of an object, and what was said of it: its size, and a text that differs when its content does."""
+
+    data: memoryview
+    size: int
+    version: str
+
+
+class RemoteObject(Protocol):
+    """An object that can be read from several threads."""
+
+    def tail(self, length: int) -> Tail:
+        """Its last `length` bytes, or all of them; NoRangesError."""
+        ...
+
+    def get(self, start: int, stop: int, version: str) -> memoryview:
+        """The bytes `start:stop` of the version; RecordingError if it is another one by now."""
+        ...
+
+    def pieces(self) -> Iterator[memoryview]:
+        """All of its bytes, from one request."""
+        ...
+
+
+_process: int | None = None  # which reads from servers
+
+
+def find(url: str) -> RemoteObject:
+    """What reads a URL; nothing is asked of the server yet.
+
+    Raises:
+        MissingExtraError: obstore or fsspec is not installed.
+        RecordingError: the URL is none, or this process is a fork of one that has read from a server.
+    """
+    global _process
+    _process = _process or os.getpid()
+    check_process(url)
+    return _StoredObject(url) if is_web(url) or _is_bucket(url) else _FsspecObject(url)
+
+
+def listed(folder: str) -> Iterator[str]:
+    """The URLs of all objects below a folder of a bucket, at any depth."""
+    if not _is_bucket(folder):
+        system, path = _fsspec(folder)
+        scheme = folder.partition("://")[0]
+        for name in _asked(folder, lambda: system.find(path)):
+            yield f"{scheme}://{name.lstrip('/') if not path.startswith('/') else name}"
+        return
+    store, path = _store(folder)
+    bucket = folder.removesuffix(path).rstrip("/")
+
+    def names() -> list[str]:
+        return [entry["path"] for page in store.list(path or None) for entry in page]
+
+    for name in _asked(folder, names):
+        yield f"{bucket}/{name}"
+
+
+def _is_bucket(url: str) -> bool:
+    return urlsplit(url).scheme.lower() in _BUCKETS
+
+
+def changed(url: str) -> RecordingError:
+    return RecordingError(f"{shown(url)} has been changed since it was opened; open it again")
+
+
+# ---- obstore
+
+
+def _store(url: str) -> tuple[Any, str]:
+    """The store of a URL, and the path in it."""
+    try:
+        from obstore.store import HTTPStore, from_url
+    except ImportError as err:
+        raise missing_extra(f"reading {shown(url)} needs obstore", "remote") from err
+    options: Any = {"client_options": _CLIENT, "retry_config": _RETRIES}
+    parts = urlsplit(url)
+    if is_web(url):
+        return _asked(url, lambda: HTTPStore.from_url(url, **options)), ""
+    if parts.scheme.lower() == "az":  # az://account/container/path
+        account, _, path = parts.path.lstrip("/").partition("/")
+        return _asked(url, lambda: from_url(f"az://{parts.netloc}/{account}", **options)), path
+    return _asked(url, lambda: from_url(f"{parts.scheme}://{parts.netloc}", **options)), parts.path.lstrip(
+        "/"
+    )
+
+
+def check_process(url: str) -> None:
+    """Raises RecordingError in a fork of the process that read first: threads that fetch are not in it."""
+    if _process is not None and _process != os.getpid():
+        raise RecordingError(
+            f"{shown(url)} cannot be read in a forked process, as its parent has read from a server; start the process "
+            'with "spawn" (DataLoader: multiprocessing_context="spawn")'
+        )
+
+
+class _StoredObject:
+    """An object that obstore reads."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._store, self._path = _store(url)
+
+    def tail(self, length: int) -> Tail:
+        from obstore.exceptions import NotSupportedError
+
+        try:
+            found = self._ask({"range": {"suffix": length}})
+        except (_RefusedError, NotSupportedError):
+            size = _asked(self._url, lambda: self._store.head(self._path))["size"]
+            if not size:
+                return Tail(memoryview(b""), 0, "")
+            try:
+                found = self._ask({"range": (max(0, size - length), size)})
+            except (_RefusedError, NotSupportedError) as err:
+                raise NoRangesError from err
+        return Tail(memoryview(found.bytes()), found.meta["size"], _version(found.meta))
+
+    def get(self, start: int, stop: int, version: str) -> memoryview:
+        options: dict[str, Any] = {"range": (start, stop)}
+        if version.startswith('"'):  # a weak tag matches nothing
+            options["if_match"] = version
+        try:
+            found = self._ask(options)
+        except _RefusedError as err:
+            raise changed(self._url) from err
+        if _version(found.meta) != version:
+            raise changed(self._url)
+        return memoryview(_asked(self._url, found.bytes))
+
+    def pieces(self) -> Iterator[memoryview]:
+        for piece in self._ask({}).stream():
+            yield memoryview(piece)
+
+    def _ask(self, options: Any) -> Any:
+        return _asked(self._url, lambda: self._store.get(self._path, options=options))
+
+
+def _version(meta: Any) -> str:
+    return meta["e_tag"] or f"{meta['last_modified']} {meta['size']}"
+
+
+class _RefusedError(Exception):
+    """The server refuses the range, or has another version."""
+
+
+def _asked(url: str, ask: Callable[[], _T]) -> _T:
+    """What a server answers; RecordingError, without anything secret, where it does not."""
+    from obstore import exceptions as told
+
+    try:
+        return ask()
+    except told.PreconditionError as err:
+        raise _RefusedError from err
+    except (told.NotFoundError, FileNotFoundError):
+        raise RecordingError(f"{shown(url)} does not exist; check the address") from None
+    except (told.PermissionDeniedError, told.UnauthenticatedError):
+        raise RecordingError(
+            f"{shown(url)} may not be read with the credentials found in the environment; check them, and your rights"
+        ) from None
+    except told.NotSupportedError:
+        raise
+    except (told.BaseError, OSError, ValueError) as err:
+        said = str(err).partition("\n")[0]
+        if any(f"status code: {code}" in said for code in (416, 400, 405, 501)):
+            raise _RefusedError from None
+        raise RecordingError(f"{shown(url)} cannot be read: {shown(said):.300}; try again later") from None
+
+
+# ---- fsspec
+
+
+def _fsspec(url: str) -> tuple[Any, str]:
+    try:
+        import fsspec
+    except ImportError as err:
+        raise missing_extra(f"reading {shown(url)} needs fsspec", "remote") from err
+    try:
+        system, path = fsspec.core.url_to_fs(url)
+    except Exception as err:  # noqa: BLE001 - each of its file systems raises errors of its own
+        raise RecordingError(f"{shown(url)} cannot be opened: {shown(str(err)):.300}") from None
+    return system, path
+
+
+class _FsspecObject:
+    """An object that fsspec reads. What changes without changing its size and tag is not noticed."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._system, self._path = _fsspec(url)
+
+    def tail(self, length: int) -> Tail:
+        info = self._asked(lambda: self._system.info(self._path))
+        size = int(info["size"])
+        if not size:
+            return Tail(memoryview(b""), 0, "")
+        data = self._asked(lambda: self._system.cat_file(self._path, start=max(0, size - length), end=size))
+        return Tail(memoryview(data), size, f"{info.get('ETag') or info.get('mtime') or ''} {size}")
+
+    def get(self, start: int, stop: int, version: str) -> memoryview:
+        return memoryview(self._asked(lambda: self._system.cat_file(self._path, start=start, end=stop)))
+
+    def pieces(self) -> Iterator[memoryview]:
+        yield memoryview(self._asked(lambda: self._system.cat_file(self._path)))
+
+    def _asked(self, ask: Callable[[], _T]) -> _T:
+        try:
+            return ask()
+        except FileNotFoundError:
+            raise RecordingError(f"{shown(self._url)} does not exist; check the address") from None
+        except Exception as err:  # noqa: BLE001 - each of its file systems raises errors of its own
+            raise RecordingError(f"{shown(self._url)} cannot be read: {shown(str(err)):.300}") from None

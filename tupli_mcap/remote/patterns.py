@@ -1,0 +1,59 @@
+"""The URLs that a pattern matches."""
+
+from __future__ import annotations
+
+import re
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.remote.names import is_web, shown
+from tupli_mcap.remote.objects import listed
+
+__all__ = ["matching"]
+
+_MAGIC = re.compile(r"[*?\[]")
+
+
+def matching(url: str) -> list[str]:
+    """The URLs that a pattern such as "s3://bucket/runs/*.mcap" matches, by name; a URL without one by itself.
+
+    "*" stays within a folder, "**" does not.
+
+    Raises:
+        RecordingError: nothing matches, or the server does not list what it has.
+    """
+    web = is_web(url)
+    path = url.partition("?")[0] if web else url
+    if not _MAGIC.search(path):
+        return [url]
+    if web:
+        raise RecordingError(f"{shown(url)}: a web server does not list its files; give the address of each")
+    folder = _MAGIC.split(path, maxsplit=1)[0].rpartition("/")[0]
+    wanted = re.compile(_expression(path))
+    found = sorted(name for name in listed(folder) if wanted.fullmatch(name))
+    if not found:
+        raise RecordingError(f"no file matches {shown(url)!r}; give the URL of a recording (.mcap)")
+    return found
+
+
+_TOKENS = re.compile(r"\*\*/|\*\*|\*|\?|\[!?\]?[^\]]*\]|.", re.DOTALL)
+_MEANT = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+
+
+def _expression(pattern: str) -> str:
+    """The regular expression of a pattern."""
+    return "".join(_MEANT.get(token) or _one(token) for token in _TOKENS.findall(pattern))
+
+
+def _one(token: str) -> str:
+    """A set of characters, or a character that means itself."""
+    if len(token) == 1:
+        return re.escape(token)
+    negated = token[1] == "!"
+    chosen = (
+        token[1 + negated : -1]
+        .replace("\\", r"\\")
+        .replace("^", r"\^")
+        .replace("]", r"\]")
+        .replace("[", r"\[")
+    )
+    return f"[{'^' if negated else ''}{chosen}]"

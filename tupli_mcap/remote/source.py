@@ -1,0 +1,214 @@
+"""A file on a server, as a reader sees it: ranges that are planned ahead, fetched side by side, and kept."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.remote.names import shown
+from tupli_mcap.remote.objects import NoRangesError, RemoteObject, Tail, changed, check_process, find
+from tupli_mcap.remote.plan import Range, pieces_of
+
+__all__ = ["BLOCK_BYTES", "RemoteSource", "open_url"]
+
+BLOCK_BYTES: Final = 256 << 20  # of all files of this process
+_TAIL = 128 << 10
+_AT_ONCE = 8
+
+
+class _Block:
+    """Bytes of a file that have come, or are on their way."""
+
+    __slots__ = ("coming", "start", "stop")
+
+    def __init__(self, start: int, stop: int, coming: Future[memoryview]) -> None:
+        self.start, self.stop, self.coming = start, stop, coming
+
+
+class _Blocks:
+    """The blocks that were used last, of all remote files of this process, by the version of the file."""
+
+    def __init__(self, budget: int) -> None:
+        self._budget = budget
+        self._kept: OrderedDict[tuple[str, int, int], _Block] = OrderedDict()
+        self._of: dict[str, dict[tuple[int, int], _Block]] = {}
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def find(self, file: str, start: int, stop: int) -> _Block | None:
+        """The block that holds a range."""
+        with self._lock:
+            for (first, last), block in self._of.get(file, {}).items():
+                if first <= start and stop <= last:
+                    self._kept.move_to_end((file, first, last))
+                    return block
+        return None
+
+    def put(self, file: str, block: _Block) -> None:
+        with self._lock:
+            key = (file, block.start, block.stop)
+            if key in self._kept:
+                self._drop(key)
+            self._kept[key] = block
+            self._of.setdefault(file, {})[key[1:]] = block
+            self._bytes += block.stop - block.start
+            while self._bytes > self._budget and len(self._kept) > 1:
+                self._drop(next(iter(self._kept)))
+
+    def forget(self, file: str, block: _Block) -> None:
+        with self._lock:
+            key = (file, block.start, block.stop)
+            if self._kept.get(key) is block:
+                self._drop(key)
+
+    def _drop(self, key: tuple[str, int, int]) -> None:
+        del self._kept[key]
+        blocks = self._of[key[0]]
+        del blocks[key[1:]]
+        if not blocks:
+            del self._of[key[0]]
+        self._bytes -= key[2] - key[1]
+
+
+_blocks = _Blocks(BLOCK_BYTES)
+_fetchers = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="tupli-remote")
+
+
+class RemoteSource:
+    """One version of a file on a server. Safe from several threads; a copy in another process fetches for itself.
+
+    It was opened with the tail of the file, which stays in memory. When the file on the server changes, reading raises
+    RecordingError: bytes of two versions are never mixed.
+    """
+
+    def __init__(self, url: str, remote: RemoteObject, tail: Tail) -> None:
+        self.path: Path | None = None
+        self.name = shown(url)
+        self.size = tail.size
+        self._url, self._remote, self._tail = url, remote, tail
+        self._file = f"{tail.version} {url}"
+        self._lock = threading.Lock()
+        self._planned: list[Range] = []  # not yet asked for, the next one last
+        self._unread: set[tuple[int, int]] = set()  # of the plan: asked for, and not yet read
+
+    def read(self, offset: int, length: int) -> bytes:
+        return bytes(self.view(offset, length))
+
+    def lend(self, offset: int, length: int) -> memoryview:
+        return self.view(offset, length)
+
+    def view(self, offset: int, length: int) -> memoryview:
+        stop = offset + length
+        if stop > self.size:
+            raise FormatError(
+                f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
+            )
+        first = self.size - len(self._tail.data)
+        if offset >= first:
+            return self._tail.data[offset - first : stop - first]
+        check_process(self._url)
+        block = _blocks.find(self._file, offset, stop) or self._ask_for(offset, stop)
+        try:
+            data = block.coming.result()
+        except BaseException:
+            _blocks.forget(self._file, block)
+            raise
+        self._go_on(block)
+        return data[offset - block.start : stop - block.start]
+
+    def fetch(self, ranges: Sequence[Range]) -> None:
+        """Begins to fetch what will be read next, and goes on while it is read."""
+        first = self.size - len(self._tail.data)
+        missing = [
+            (start, min(stop, self.size))
+            for start, stop in ranges
+            if start < first and not _blocks.find(self._file, start, stop)
+        ]
+        with self._lock:
+            self._planned = pieces_of(missing)[::-1]
+            self._unread = set()
+            self._fill()
+
+    def _ask_for(self, start: int, stop: int) -> _Block:
+        """Asks for a range now: for the piece of the plan that holds it, or for nothing more than the range."""
+        with self._lock:
+            for i, (first, last) in enumerate(self._planned):
+                if first <= start and stop <= last:
+                    del self._planned[i]
+                    return self._begin(first, last)
+            return self._begin(start, stop)
+
+    def _go_on(self, block: _Block) -> None:
+        """Asks for more of the plan: a block of it has been read."""
+        with self._lock:
+            self._unread.discard((block.start, block.stop))
+            self._fill()
+
+    def _fill(self) -> None:
+        while self._planned and len(self._unread) < _AT_ONCE:
+            piece = self._planned.pop()
+            self._begin(*piece)
+            self._unread.add(piece)
+
+    def _begin(self, start: int, stop: int) -> _Block:
+        block = _Block(start, stop, _fetchers.submit(self._get, start, stop))
+        _blocks.put(self._file, block)
+        return block
+
+    def _get(self, start: int, stop: int) -> memoryview:
+        data = self._remote.get(start, stop, self._tail.version)
+        if len(data) != stop - start:
+            raise changed(self._url)
+        return data
+
+    def refresh(self) -> None:
+        """Nothing: it is one version."""
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def __reduce__(self) -> tuple[Callable[..., RemoteSource], tuple[str, bytes, int, str]]:
+        return _again, (self._url, bytes(self._tail.data), self._tail.size, self._tail.version)
+
+
+def _again(url: str, data: bytes, size: int, version: str) -> RemoteSource:
+    return RemoteSource(url, find(url), Tail(memoryview(data), size, version))
+
+
+def open_url(url: str) -> RemoteSource | BinaryIO:
+    """A file on a server; where the server sends whole files only, a temporary copy of it, and a warning.
+
+    Raises:
+        RecordingError: it does not exist, may not be read, or the server does not answer.
+        MissingExtraError: what reads such URLs is not installed.
+    """
+    remote = find(url)
+    try:
+        return RemoteSource(url, remote, remote.tail(_TAIL))
+    except NoRangesError:
+        warnings.warn(
+            f"{shown(url)}: the server sends whole files only, so all of it is downloaded into a temporary file; "
+            "a server that answers range requests saves that",
+            stacklevel=2,
+        )
+    file = tempfile.TemporaryFile()  # noqa: SIM115 - the source closes it
+    try:
+        for piece in remote.pieces():
+            file.write(piece)
+        file.flush()
+        os.lseek(file.fileno(), 0, os.SEEK_SET)
+    except OSError as err:
+        file.close()
+        raise RecordingError(f"{shown(url)} cannot be copied to {tempfile.gettempdir()}: {err}") from err
+    except BaseException:
+        file.close()
+        raise
+    return file
