@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +19,7 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import bytes_of, counted, number, print_facts, print_json
 from tupli_mcap.cli.terminal import ask_secret, say
+from tupli_mcap.remote import copied, is_url
 
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["bundle", "export", "import_"]
 
 Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write (.mcap).")]
-Source = Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)]
+Source = Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or a URL.")]
 
 
 def bundle(
@@ -57,18 +58,25 @@ def bundle(
     TUPLI_MCAP_KEY_PASSPHRASE.
     """
     key = None if sign is None else _signing_key(sign)
-    path = Path(source)
-    if path.suffix == ".mcap" or path.is_file():
+    if is_url(source) or source.endswith(".mcap") or Path(source).is_file():
         if filter_text is not None:
             raise typer.BadParameter("a filter goes with a benchmark id, not with a file")
         from tupli_mcap.storage import bundles
 
-        with open_storage(storage_path) if storage_path.is_dir() else nullcontext() as known:
+        with (
+            open_storage(storage_path) if storage_path.is_dir() else nullcontext() as known,
+            _local(source) as path,
+        ):
             bundles.from_recording(path, output, known, key)
     else:
         with open_storage(storage_path) as storage:
             storage.bundle(full_id(storage, source), output, filter_of(filter_text), sign=key)
     _print_written(output, as_json)
+
+
+def _local(file: str) -> AbstractContextManager[Path]:
+    """A file, or a temporary copy of what is at a URL."""
+    return copied(file) if is_url(file) else nullcontext(Path(file))
 
 
 def export(
@@ -115,14 +123,15 @@ def import_(
     required = require_signature or bool(signers)
     keys = [find_key(text).public_key for text in signers or ()]
     signed_by: str | None = None
-    if required:
-        with Recording(file) as recording:
-            signature = bundles.checked_signature(recording, required, keys)
-            signed_by = None if signature is None else signature.fingerprint
-    with open_storage(storage_path, create=True) as storage:
-        preview = bundles.preview(storage, file)
-        if not dry_run:
-            storage.import_bundle(file, trust=trust, require_signature=required, signers=keys)
+    with _local(file) as path:
+        if required:
+            with Recording(path) as recording:
+                signature = bundles.checked_signature(recording, required, keys)
+                signed_by = None if signature is None else signature.fingerprint
+        with open_storage(storage_path, create=True) as storage:
+            preview = bundles.preview(storage, path)
+            if not dry_run:
+                storage.import_bundle(path, trust=trust, require_signature=required, signers=keys)
     if as_json:
         print_json({"dry_run": dry_run, **preview._asdict(), "signed_by": signed_by})
         return

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,6 +12,7 @@ from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
 from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.remote import is_url, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Recording, VerifyReport
@@ -29,8 +29,8 @@ _DIVERGING = 5  # episodes beside the first that are shown; what is beyond is in
 
 def verify(
     paths: Annotated[
-        list[Path],
-        typer.Argument(metavar="PATH", help="Recordings, directories, storages.", readable=False),
+        list[str],
+        typer.Argument(metavar="PATH", help="Recordings (paths or URLs), directories, storages."),
     ],
     replay: Annotated[
         bool,
@@ -59,13 +59,14 @@ def verify(
         raise typer.BadParameter("--trust, --episodes and --filter go with --rerun")
     from tupli_mcap.storage.verify import StorageReport, verify_paths
 
+    addresses = {shown(path): path for path in paths if is_url(path)}
     storage_report = StorageReport()
     for report in verify_paths(paths):
         storage_report.files.append(report)
         if not as_json:
             _print_verified(report)
         if replays is not None and report.kind == "recording" and report.ok:
-            replays.add(Path(report.path), quiet=as_json)
+            replays.add(addresses.get(report.path, report.path), quiet=as_json)
     if not storage_report.files:
         raise RecordingError("there is nothing to verify; give recordings (.mcap) or directories of them")
     if as_json:
@@ -126,7 +127,7 @@ class _Replays:
         self._trust = trust
         self._episodes = episodes
         self._wanted = wanted
-        self._found: list[tuple[Path, Certificate | None, str]] = []
+        self._found: list[tuple[str, Certificate | None, str]] = []
 
     @property
     def tried(self) -> bool:
@@ -139,7 +140,7 @@ class _Replays:
         certificates = [certificate for _, certificate, _ in self._found]
         return bool(certificates) and all(found is not None and found.agrees for found in certificates)
 
-    def add(self, path: Path, *, quiet: bool) -> None:
+    def add(self, path: str, *, quiet: bool) -> None:
         """Replays a recording; says the outcome unless `quiet`."""
         from tupli_mcap.recording import Recording
         from tupli_mcap.replay import certify
@@ -153,13 +154,13 @@ class _Replays:
                 certificate = certify(recording, trust=self._trust, episodes=numbers, progress=progress)
             seconds = time.perf_counter() - began
         except TupliError as err:
-            self._found.append((path, None, str(err)))
+            self._found.append((shown(path), None, str(err)))
             if not quiet:
                 fail(str(err))
             return
-        self._found.append((path, certificate, ""))
+        self._found.append((shown(path), certificate, ""))
         if not quiet:
-            say(f"{path}: {_outcome(certificate)}")
+            say(f"{shown(path)}: {_outcome(certificate)}")
             for line in _lines(certificate, seconds):
                 print_wrapped(line, "  ", "    ")
 

@@ -435,6 +435,7 @@ class Dataset(RandomAccess):
             num_workers=num_workers,
             seed=seed,
             drop_last=drop_last,
+            remote=any(map(is_url, {header.recording for header in self.headers})),
         )
 
     def stats(

@@ -9,6 +9,6 @@ names:    URLs, and how they may be shown.
 
 from tupli_mcap.remote.names import is_url, shown
 from tupli_mcap.remote.patterns import matching
-from tupli_mcap.remote.source import RemoteSource, open_url
+from tupli_mcap.remote.source import RemoteSource, copied, open_url
 
-__all__ = ["RemoteSource", "is_url", "matching", "open_url", "shown"]
+__all__ = ["RemoteSource", "copied", "is_url", "matching", "open_url", "shown"]

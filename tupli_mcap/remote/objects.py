@@ -158,7 +158,8 @@ class _StoredObject:
         return memoryview(_asked(self._url, found.bytes))
 
     def pieces(self) -> Iterator[memoryview]:
-        for piece in self._ask({}).stream():
+        stream = iter(self._ask({}).stream())
+        while (piece := _asked(self._url, lambda: next(stream, None))) is not None:
             yield memoryview(piece)
 
     def _ask(self, options: Any) -> Any:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 import threading
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import IO, BinaryIO, Final
+from urllib.parse import urlsplit
 
 from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.progress import progress
 from tupli_mcap.remote.names import shown
 from tupli_mcap.remote.objects import NoRangesError, RemoteObject, Tail, changed, check_process, find
 from tupli_mcap.remote.plan import Range, pieces_of
 
-__all__ = ["BLOCK_BYTES", "RemoteSource", "open_url"]
+__all__ = ["BLOCK_BYTES", "RemoteSource", "copied", "open_url"]
 
 BLOCK_BYTES: Final = 256 << 20  # of all files of this process
 _TAIL = 128 << 10
@@ -201,14 +203,44 @@ def open_url(url: str) -> RemoteSource | BinaryIO:
         )
     file = tempfile.TemporaryFile()  # noqa: SIM115 - the source closes it
     try:
-        for piece in remote.pieces():
-            file.write(piece)
-        file.flush()
-        os.lseek(file.fileno(), 0, os.SEEK_SET)
-    except OSError as err:
-        file.close()
-        raise RecordingError(f"{shown(url)} cannot be copied to {tempfile.gettempdir()}: {err}") from err
+        _download(url, remote, file, 0)
     except BaseException:
         file.close()
         raise
     return file
+
+
+@contextmanager
+def copied(url: str) -> Iterator[Path]:
+    """A temporary copy of a whole file, for those that walk through all of it.
+
+    Raises:
+        RecordingError: it cannot be read, or there is no room for it.
+        MissingExtraError: what reads such URLs is not installed.
+    """
+    remote = find(url)
+    try:
+        size = remote.tail(1).size
+    except NoRangesError:
+        size = 0  # not known
+    with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
+        path = Path(folder) / (Path(urlsplit(url).path).name or "recording.mcap")
+        with path.open("xb") as file:
+            _download(url, remote, file, size)
+        yield path
+
+
+def _download(url: str, remote: RemoteObject, file: IO[bytes], size: int) -> None:
+    """Copies a file, with a bar of the bytes; a connection that breaks off is an error."""
+    done = 0
+    try:
+        with progress(size, f"downloading {shown(url)} (bytes)") as bar:
+            for piece in remote.pieces():
+                file.write(piece)
+                done += len(piece)
+                bar.advance(len(piece))
+        file.flush()
+    except OSError as err:
+        raise RecordingError(f"{shown(url)} cannot be copied to {tempfile.gettempdir()}: {err}") from err
+    if size and done != size:
+        raise RecordingError(f"{shown(url)}: expected {size} bytes, found {done}; try again")

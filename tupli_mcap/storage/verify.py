@@ -16,6 +16,7 @@ from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, VerifyReport, verify_recording
 from tupli_mcap.recording.check.report import Findings
+from tupli_mcap.remote import copied, is_url, shown
 from tupli_mcap.storage import bundles
 from tupli_mcap.storage.artifacts import ArtifactFiles
 from tupli_mcap.storage.atomic import Lock
@@ -62,14 +63,18 @@ def verify_storage(storage: FileStorage | Path) -> StorageReport:
     return StorageReport(list(verify_paths([root])))
 
 
-def verify_paths(paths: Iterable[Path]) -> Iterator[VerifyReport]:
-    """Verifies files and directories, one after another; a bad one stops nothing.
+def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
+    """Verifies files and directories, one after another; a bad one stops nothing. A URL is copied to a temporary file.
 
     A path that does not exist is a report with a problem. What killed processes have left beside the files is
     reported last.
     """
     beside: dict[Path, None] = {}
-    for path in paths:
+    for given in paths:
+        if isinstance(given, str) and is_url(given):
+            yield _at_url(given)
+            continue
+        path = Path(given)
         if path.is_dir():
             try:
                 items = sorted(scan(path))
@@ -92,6 +97,19 @@ def verify_paths(paths: Iterable[Path]) -> Iterator[VerifyReport]:
             beside[path.parent] = None
     for directory in beside:
         yield from _left_in(directory)
+
+
+def _at_url(url: str) -> VerifyReport:
+    """The report on a file on a server, as of the copy that is verified."""
+    try:
+        with copied(url) as path:
+            report = _recording(path)
+    except TupliError as err:
+        report = VerifyReport(shown(url))
+        message, _, advice = str(err).removeprefix(f"{shown(url)} ").partition("; ")
+        Findings(report).error("file", message, advice=advice or "check the address")
+    report.path = shown(url)
+    return report
 
 
 def _recording(path: Path) -> VerifyReport:

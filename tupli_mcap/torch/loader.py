@@ -22,6 +22,7 @@ def loader(
     num_workers: int,
     seed: int | None,
     drop_last: bool,
+    remote: bool,
 ) -> DataLoader[Any]:
     """See `Dataset.loader`."""
     generator = None if seed is None else Generator().manual_seed(seed)
@@ -34,4 +35,6 @@ def loader(
         generator=generator,
         drop_last=drop_last,
         persistent_workers=num_workers > 0,
+        # what fetches from a server runs in threads, which a fork does not have
+        multiprocessing_context="spawn" if remote and num_workers else None,
     )

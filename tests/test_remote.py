@@ -1,0 +1,323 @@
+"""Files on web servers and in buckets: what is asked for, what is read, and what happens when a server misbehaves."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import multiprocessing
+import pickle
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, strategies as st
+from typer.testing import CliRunner
+from web_server import WebServer, serving
+
+import tupli_mcap
+from tupli_mcap import EpisodeData, Recording, RecordingError, TupliDataset, write_recording
+from tupli_mcap.cli import app
+from tupli_mcap.remote import matching, shown, source
+from tupli_mcap.remote.patterns import _expression
+from tupli_mcap.remote.plan import pieces_of
+
+EPISODES, STEPS = 40, 500
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of about 3 MB whose values cannot be compressed."""
+    rng = np.random.default_rng(0)
+    path = tmp_path_factory.mktemp("large") / "r.mcap"
+    write_recording(
+        path,
+        [
+            EpisodeData(
+                rng.normal(size=(STEPS, 17)).astype(np.float32), rng.normal(size=(STEPS, 6)).astype(np.float32),
+                rng.normal(size=STEPS), np.zeros(STEPS, bool), np.arange(STEPS) == STEPS - 1,
+                rng.normal(size=17).astype(np.float32), metadata={"number": i},
+            )
+            for i in range(EPISODES)
+        ],
+        observation_space=spaces.Box(-np.inf, np.inf, (17,)),
+        action_space=spaces.Box(-np.inf, np.inf, (6,)),
+    )  # fmt: skip
+    return path
+
+
+@pytest.fixture
+def server(large: Path) -> Iterator[WebServer]:
+    source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
+    with serving() as found:
+        found.files["/r.mcap"] = large.read_bytes()
+        yield found
+
+
+def test_a_file_is_opened_by_its_tail(server: WebServer, large: Path) -> None:
+    recording = Recording(server.url())
+    assert server.asked[0].range == "bytes=-131072"
+    assert len(server.asked) <= 2 and server.sent < 132_000
+    assert len(recording) == EPISODES and recording.uuid == Recording(large).uuid
+
+
+def test_a_whole_field_takes_few_requests(server: WebServer, large: Path) -> None:
+    recording = Recording(server.url())
+    server.asked.clear()
+    found = recording.read(fields=["actions"])
+    assert np.array_equal(found.actions, Recording(large).read().actions)
+    assert len(server.asked) <= 8 and server.sent <= 1.05 * large.stat().st_size
+    assert {asked.if_match for asked in server.asked} == {'"first"'}
+    server.asked.clear()
+    recording.read(fields=["states"])
+    assert not server.asked  # the same chunks
+
+
+def test_an_episode_takes_its_chunks_and_no_more(server: WebServer, large: Path) -> None:
+    recording = Recording(server.url())
+    server.asked.clear()
+    expected = Recording(large)
+    assert np.array_equal(recording.episodes[7].states, expected.episodes[7].states)
+    store = expected.file.store
+    row = expected.index[7]
+    chunks = [span.chunk for span in store.spans(expected.file.steps[0], int(row["first_row"]), STEPS)]
+    assert len(server.asked) <= 2
+    assert server.sent <= 1.2 * int(store.table["length"][chunks].sum())
+
+
+def test_a_dataset_of_urls(server: WebServer, large: Path) -> None:
+    local, remote = tupli_mcap.open(large), tupli_mcap.open(server.url())
+    assert len(remote.filter("metadata.number < 3")) == 3
+    for far, near in zip(
+        remote.sort("return").head(5).read(fields=["states", "next_states"]).__dict__.values(),
+        local.sort("return").head(5).read(fields=["states", "next_states"]).__dict__.values(),
+        strict=True,
+    ):
+        assert np.array_equal(far, near)
+    windows, expected = remote.windows(8), local.windows(8)
+    for i in (0, 999, len(expected) - 1):
+        assert np.array_equal(windows[i].states, expected[i].states)
+    assert np.array_equal(pickle.loads(pickle.dumps(windows))[5].states, expected[5].states)
+    dataset = TupliDataset.from_files(server.url())
+    dataset.load()
+    assert len(dataset.episodes) == EPISODES
+
+
+def test_save_copies_from_a_server(server: WebServer, large: Path, tmp_path: Path) -> None:
+    tupli_mcap.open(server.url()).head(3).save(tmp_path / "few.mcap")
+    few = Recording(tmp_path / "few.mcap")
+    assert np.array_equal(few.read().states, Recording(large).read([0, 1, 2]).states)
+
+
+def test_signatures_in_an_address_are_used_and_not_shown(server: WebServer) -> None:
+    address = server.url("/r.mcap?X-Amz-Signature=SECRET")
+    dataset = tupli_mcap.open(address)
+    assert len(dataset.head(2).read(fields=["rewards"]).rewards) == 2 * STEPS
+    told = [
+        repr(dataset),
+        repr(Recording(address)),
+        repr(dataset[0]),
+        *(h.recording for h in dataset.headers),
+    ]
+    server.files.clear()
+    with pytest.raises(RecordingError) as caught:
+        Recording(address)
+    server.failures = [403]
+    with pytest.raises(RecordingError, match="credentials") as refused:
+        Recording(address)
+    server.failures = [500] * 50
+    assert "SECRET" not in " ".join([*told, str(caught.value), str(refused.value)])
+    assert shown("GET https://me:pw@host/a?k=v (x)") == "GET https://host/a (x)"
+
+
+@pytest.mark.parametrize("conditions", [True, False], ids=["If-Match", "ignored"])
+def test_a_file_that_changes_is_an_error_and_never_a_mixture(server: WebServer, conditions: bool) -> None:
+    recording = Recording(server.url())
+    recording.episodes[0].states  # noqa: B018
+    server.conditions = conditions
+    server.tags["/r.mcap"] = '"second"'
+    with pytest.raises(RecordingError, match="has been changed since it was opened"):
+        recording.read()
+    assert Recording(server.url()).num_steps == EPISODES * STEPS
+
+
+def test_weak_tags_are_compared_and_not_sent(server: WebServer) -> None:
+    server.tags["/r.mcap"] = 'W/"first"'
+    recording = Recording(server.url())
+    recording.read(fields=["rewards"])
+    assert {asked.if_match for asked in server.asked} == {None}
+    server.tags["/r.mcap"] = 'W/"second"'
+    source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
+    with pytest.raises(RecordingError, match="has been changed"):
+        recording.read([3])
+
+
+def test_a_server_that_knows_no_suffixes(server: WebServer) -> None:
+    server.suffixes = False
+    assert Recording(server.url()).num_steps == EPISODES * STEPS
+    assert [asked.method for asked in server.asked[:3]] == ["GET", "HEAD", "GET"]
+
+
+def test_a_server_that_knows_no_ranges(server: WebServer, large: Path) -> None:
+    server.ranges = False
+    with pytest.warns(UserWarning, match="sends whole files only"):
+        recording = Recording(server.url())
+    with recording:
+        assert np.array_equal(recording.read().states, Recording(large).read().states)
+
+
+def test_failures_that_pass_are_tried_again(server: WebServer) -> None:
+    server.failures = [503, 500]
+    recording = Recording(server.url())
+    server.failures = [502]
+    assert len(recording.read(fields=["rewards"]).rewards) == EPISODES * STEPS
+
+
+def test_what_is_no_recording(server: WebServer) -> None:
+    server.files |= {"/empty.mcap": b"", "/text.mcap": b"hello, I am a text and nothing else" * 9}
+    with pytest.raises(tupli_mcap.FormatError, match="is empty"):
+        Recording(server.url("/empty.mcap"))
+    with pytest.raises(tupli_mcap.FormatError, match="expected an MCAP file"):
+        Recording(server.url("/text.mcap"))
+    with pytest.raises(RecordingError, match=r"nothing\.mcap does not exist"):
+        Recording(server.url("/nothing.mcap"))
+    with pytest.raises(RecordingError, match="a web server does not list its files"):
+        tupli_mcap.open(server.url("/*.mcap"))
+
+
+def test_a_recording_that_was_cut_short_is_recovered(server: WebServer, large: Path) -> None:
+    server.files["/r.mcap"] = large.read_bytes()[: 2 << 20]
+    recording = Recording(server.url())
+    assert not recording.complete
+    states = recording.read().states
+    assert np.array_equal(states, Recording(large).read().states[: len(states)]) and len(states) > 1000
+
+
+def _child(recording: Recording, answers: multiprocessing.Queue[str]) -> None:
+    try:
+        recording.read([EPISODES // 2])
+        answers.put("read")
+    except RecordingError as err:
+        answers.put(str(err))
+
+
+def test_a_forked_process_says_what_to_do_and_does_not_hang(server: WebServer) -> None:
+    recording = Recording(server.url())
+    recording.read([0])
+    context = multiprocessing.get_context("fork")
+    answers = context.Queue()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Python warns of forks with threads
+        child = context.Process(target=_child, args=(recording, answers))
+        child.start()
+    assert '"spawn"' in answers.get(timeout=60)
+    child.join()
+
+
+def test_a_loader_with_workers_reads_from_a_server(server: WebServer, large: Path) -> None:
+    pytest.importorskip("torch")
+    loader = tupli_mcap.open(server.url()).loader(batch_size=64, num_workers=1, length=4, shuffle=False)
+    first = next(iter(loader))
+    expected = next(iter(tupli_mcap.open(large).loader(batch_size=64, length=4, shuffle=False)))
+    assert bool((first["states"] == expected["states"]).all())
+
+
+@pytest.mark.parametrize("command", ["info", "verify", "doctor"])
+def test_commands_take_addresses(server: WebServer, large: Path, command: str) -> None:
+    far = CliRunner().invoke(app, [command, server.url(), "--json"])
+    near = CliRunner().invoke(app, [command, str(large), "--json"])
+    assert far.exit_code == near.exit_code == 0, far.output
+    there = far.stdout.replace(server.url(), str(large))
+    assert json.loads(there).keys() == json.loads(near.stdout).keys()
+
+
+# ---- buckets
+
+
+@pytest.fixture
+def bucket(large: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A real S3 client's stand-in: moto's server."""
+    import obstore
+    from moto.server import ThreadedMotoServer
+    from obstore.store import S3Store
+
+    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    for name, value in {
+        "AWS_ACCESS_KEY_ID": "me", "AWS_SECRET_ACCESS_KEY": "SECRET", "AWS_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ALLOW_HTTP": "true",
+    }.items():  # fmt: skip
+        monkeypatch.setenv(name, value)
+    import boto3
+
+    boto3.client("s3").create_bucket(Bucket="lab")
+    store = S3Store("lab")
+    for name in ("runs/a.mcap", "runs/deep/b.mcap", "other.mcap", "runs/note.txt"):
+        obstore.put(store, name, large.read_bytes())
+    source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
+    yield "s3://lab"
+    server.stop()
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_buckets_and_patterns(bucket: str, large: Path) -> None:
+    assert np.array_equal(Recording(f"{bucket}/runs/a.mcap").read().states, Recording(large).read().states)
+    assert matching(f"{bucket}/runs/*.mcap") == [f"{bucket}/runs/a.mcap"]
+    assert matching(f"{bucket}/**/*.mcap") == [
+        f"{bucket}/{name}" for name in ("other.mcap", "runs/a.mcap", "runs/deep/b.mcap")
+    ]
+    with pytest.raises(RecordingError, match="no file matches"):
+        tupli_mcap.open(f"{bucket}/runs/*.bag")
+    with pytest.raises(RecordingError, match=r"gone\.mcap does not exist"):
+        Recording(f"{bucket}/gone.mcap")
+    dataset = TupliDataset.from_files(f"{bucket}/runs/*.mcap")
+    dataset.load()
+    assert len(dataset.episodes) == EPISODES
+
+
+def test_other_addresses_go_through_fsspec(large: Path) -> None:
+    import fsspec
+
+    fsspec.filesystem("memory").pipe("/runs/x.mcap", large.read_bytes())
+    assert np.array_equal(Recording("memory://runs/x.mcap").read().states, Recording(large).read().states)
+    assert matching("memory:///runs/*.mcap") == ["memory:///runs/x.mcap"]
+    with pytest.raises(RecordingError, match="does not exist"):
+        Recording("memory://runs/y.mcap")
+    with pytest.raises(RecordingError, match="cannot be opened"):
+        Recording("nosuch://runs/y.mcap")
+
+
+# ---- plans
+
+
+@given(st.lists(st.tuples(st.integers(0, 1 << 26), st.integers(1, 1 << 20)), max_size=40))
+def test_pieces_cover_what_is_wanted_and_little_more(starts: list[tuple[int, int]]) -> None:
+    wanted = [(start, start + length) for start, length in starts]
+    pieces = pieces_of(wanted)
+    assert pieces == sorted(pieces)
+    assert all(first[1] <= second[0] for first, second in itertools.pairwise(pieces))
+    assert all(0 < stop - start <= 8 << 20 for start, stop in pieces)
+    covered = sum(stop - start for start, stop in pieces)
+    for start, stop in wanted:
+        inside = sum(max(0, min(stop, b) - max(start, a)) for a, b in pieces)
+        assert inside == stop - start
+    union, end = 0, 0
+    for start, stop in sorted(wanted):
+        union += max(0, stop - max(start, end))
+        end = max(end, stop)
+    assert covered <= union * 1.2 + (16 << 10)
+
+
+def test_patterns() -> None:
+    def matches(pattern: str, text: str) -> bool:
+        return re.fullmatch(_expression(pattern), text) is not None
+
+    assert matches("s3://b/*.mcap", "s3://b/x.mcap") and not matches("s3://b/*.mcap", "s3://b/c/x.mcap")
+    assert matches("s3://b/**/x?.mcap", "s3://b/x1.mcap") and matches(
+        "s3://b/**/x?.mcap", "s3://b/c/d/x1.mcap"
+    )
+    assert matches("a[0-9].m", "a7.m") and not matches("a[!0-9].m", "a7.m") and not matches("a.m", "aXm")

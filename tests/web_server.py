@@ -1,0 +1,104 @@
+"""A web server of files in memory, which serves ranges as it is told to, and keeps a list of what it was asked."""
+
+from __future__ import annotations
+
+import http.server
+import re
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+__all__ = ["Asked", "WebServer", "serving"]
+
+
+class Asked(NamedTuple):
+    """A request: its method, its range, its If-Match, and how many bytes of a body it got."""
+
+    method: str
+    range: str | None
+    if_match: str | None
+    sent: int
+
+
+class WebServer(http.server.ThreadingHTTPServer):
+    """Serves `files`, by path. Change its attributes to change what it does."""
+
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.files: dict[str, bytes] = {}
+        self.tags: dict[str, str] = {}
+        self.asked: list[Asked] = []
+        self.suffixes = self.ranges = self.conditions = True
+        self.failures: list[int] = []  # status codes of the next answers
+        self.delay = 0.0  # seconds before each answer
+
+    def url(self, path: str = "/r.mcap") -> str:
+        return f"http://127.0.0.1:{self.server_port}{path}"
+
+    @property
+    def sent(self) -> int:
+        return sum(each.sent for each in self.asked)
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server: WebServer
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
+    def do_GET(self) -> None:
+        server, path, asked = self.server, self.path.partition("?")[0], self.headers.get("Range")
+        time.sleep(server.delay)
+        data = server.files.get(path)
+        tag = server.tags.get(path, '"first"')
+        status, body, headers = (
+            200,
+            data or b"",
+            {"ETag": tag, "Last-Modified": "Mon, 23 Nov 2026 00:00:00 GMT"},
+        )
+        wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", asked or "") if server.ranges else None
+        match = self.headers.get("If-Match")
+        if server.failures:
+            status, body = server.failures.pop(0), b"no"
+        elif data is None:
+            status, body = 404, b"no"
+        elif server.conditions and match not in (None, tag):
+            status, body = 412, b"no"
+        elif wanted and not wanted[1] and not server.suffixes:
+            status, body = 416, b"no"
+        elif wanted:
+            size = len(data)
+            start = int(wanted[1]) if wanted[1] else max(0, size - int(wanted[2]))
+            stop = min(size, int(wanted[2]) + 1) if wanted[1] and wanted[2] else size
+            status, body = (206, data[start:stop]) if start < stop else (416, b"")
+            headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}" if body else f"bytes */{size}"
+        head = self.command == "HEAD"
+        server.asked.append(Asked(self.command, asked, match, 0 if head else len(body)))
+        self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        if not head:
+            self.wfile.write(body)
+
+
+@contextmanager
+def serving() -> Iterator[WebServer]:
+    """A server for as long as the block is entered."""
+    with WebServer() as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
