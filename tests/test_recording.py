@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import io
-import threading
 import time
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -141,54 +137,12 @@ def test_arrays_belong_to_the_caller(path: Path) -> None:
 # ---- sources
 
 
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[str]:
-    class Ranges(http.server.SimpleHTTPRequestHandler):
-        """The standard handler knows no ranges."""
-
-        def do_GET(self) -> None:
-            data = (tmp_path / self.path.lstrip("/")).read_bytes()
-            asked = self.headers.get("Range")
-            if asked is None:
-                start, end = 0, len(data) - 1
-                self.send_response(200)
-            else:
-                first, last = asked.removeprefix("bytes=").split("-")
-                start, end = int(first), min(int(last), len(data) - 1)
-                self.send_response(206)
-                self.send_header("Content-Range", f"bytes {start}-{end}/{len(data)}")
-            self.send_header("Accept-Ranges", "bytes")
-            self.send_header("Content-Length", str(end - start + 1))
-            self.end_headers()
-            if self.command == "GET":
-                self.wfile.write(data[start : end + 1])
-
-        do_HEAD = do_GET  # noqa: N815
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer(
-        ("127.0.0.1", 0), functools.partial(Ranges, directory=str(tmp_path))
-    ) as httpd:
-        thread = threading.Thread(target=httpd.serve_forever, daemon=True)
-        thread.start()
-        yield f"http://127.0.0.1:{httpd.server_port}"
-        httpd.shutdown()
-        thread.join()
-
-
-def test_urls_and_open_files(path: Path, server: str) -> None:
+def test_open_files(path: Path) -> None:
     record(path)
     expected = Recording(path).read().states
     with path.open("rb") as file:
         assert np.array_equal(Recording(file).read(threads=3).states, expected)
     assert np.array_equal(Recording(io.BytesIO(path.read_bytes())).read().states, expected)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)  # fsspec's own loop
-        assert np.array_equal(Recording(f"{server}/r.mcap").read().states, expected)
-        with pytest.raises(RecordingError, match=r"nothing\.mcap cannot be opened"):
-            Recording(f"{server}/nothing.mcap")
     with pytest.raises(RecordingError, match="expected a path, a URL or a seekable binary file"):
         Recording(7)  # type: ignore[arg-type]
 

@@ -59,8 +59,7 @@ def server(large: Path) -> Iterator[WebServer]:
 
 def test_a_file_is_opened_by_its_tail(server: WebServer, large: Path) -> None:
     recording = Recording(server.url())
-    assert server.asked[0].range == "bytes=-131072"
-    assert len(server.asked) <= 2 and server.sent < 132_000
+    assert sorted(asked.range or "" for asked in server.asked) == ["bytes=-131072", "bytes=0-16383"]
     assert len(recording) == EPISODES and recording.uuid == Recording(large).uuid
 
 
@@ -125,7 +124,7 @@ def test_signatures_in_an_address_are_used_and_not_shown(server: WebServer) -> N
     server.files.clear()
     with pytest.raises(RecordingError) as caught:
         Recording(address)
-    server.failures = [403]
+    server.failures = [403, 403]
     with pytest.raises(RecordingError, match="credentials") as refused:
         Recording(address)
     server.failures = [500] * 50
@@ -158,7 +157,7 @@ def test_weak_tags_are_compared_and_not_sent(server: WebServer) -> None:
 def test_a_server_that_knows_no_suffixes(server: WebServer) -> None:
     server.suffixes = False
     assert Recording(server.url()).num_steps == EPISODES * STEPS
-    assert [asked.method for asked in server.asked[:3]] == ["GET", "HEAD", "GET"]
+    assert sorted(asked.method for asked in server.asked) == ["GET", "GET", "GET", "HEAD"]
 
 
 def test_a_server_that_knows_no_ranges(server: WebServer, large: Path) -> None:

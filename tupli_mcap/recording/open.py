@@ -12,7 +12,6 @@ from tupli_mcap.mcap.summary import check_magic, foreign, has_summary, read_summ
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeIndex
 from tupli_mcap.recording.limits import check_chunks
-from tupli_mcap.remote import RemoteSource
 
 __all__ = [
     "read_contents",
@@ -42,10 +41,8 @@ def read_contents(source: Source) -> Contents:
 
 
 def _read_contents(source: Source) -> Contents:
-    finished = has_summary(source)
-    if not finished or not isinstance(source, RemoteSource):  # whose tail is here, and its head is not
-        check_magic(source)
-    if not finished:
+    check_magic(source)
+    if not has_summary(source):
         from tupli_mcap.recording.recover.find_journal import find_journal
         from tupli_mcap.recording.recover.unfinished import recover_contents
 

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from tupli_mcap.errors import RecordingError, missing_extra
 from tupli_mcap.remote.names import is_web, shown
 
-__all__ = ["NoRangesError", "RemoteObject", "Tail", "find", "listed"]
+__all__ = ["End", "NoRangesError", "RemoteObject", "find", "listed"]
 
 _T = TypeVar("_T")
 _BUCKETS = frozenset({"s3", "s3a", "gs", "az", "azure", "abfs", "abfss", "adl"})
@@ -27,8 +27,8 @@ class NoRangesError(Exception):
     """The server sends whole files only."""
 
 
-class Tail(NamedTuple):
-    """The last bytes of an object, and what was said of it: its size, and a text that differs when its content does."""
+class End(NamedTuple):
+    """Bytes of one end of an object, its size, and its version: a text that differs when its content does."""
 
     data: memoryview
     size: int
@@ -38,8 +38,12 @@ class Tail(NamedTuple):
 class RemoteObject(Protocol):
     """An object that can be read from several threads."""
 
-    def tail(self, length: int) -> Tail:
+    def tail(self, length: int) -> End:
         """Its last `length` bytes, or all of them; NoRangesError."""
+        ...
+
+    def head(self, length: int) -> End:
+        """Its first `length` bytes."""
         ...
 
     def get(self, start: int, stop: int, version: str) -> memoryview:
@@ -130,7 +134,7 @@ class _StoredObject:
         self._url = url
         self._store, self._path = _store(url)
 
-    def tail(self, length: int) -> Tail:
+    def tail(self, length: int) -> End:
         from obstore.exceptions import NotSupportedError
 
         try:
@@ -138,12 +142,18 @@ class _StoredObject:
         except (_RefusedError, NotSupportedError):
             size = _asked(self._url, lambda: self._store.head(self._path))["size"]
             if not size:
-                return Tail(memoryview(b""), 0, "")
+                return End(memoryview(b""), 0, "")
             try:
                 found = self._ask({"range": (max(0, size - length), size)})
             except (_RefusedError, NotSupportedError) as err:
                 raise NoRangesError from err
-        return Tail(memoryview(found.bytes()), found.meta["size"], _version(found.meta))
+        return self._end(found)
+
+    def head(self, length: int) -> End:
+        return self._end(self._ask({"range": (0, length)}))
+
+    def _end(self, found: Any) -> End:
+        return End(memoryview(_asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
 
     def get(self, start: int, stop: int, version: str) -> memoryview:
         options: dict[str, Any] = {"range": (start, stop)}
@@ -219,13 +229,16 @@ class _FsspecObject:
         self._url = url
         self._system, self._path = _fsspec(url)
 
-    def tail(self, length: int) -> Tail:
+    def tail(self, length: int) -> End:
         info = self._asked(lambda: self._system.info(self._path))
         size = int(info["size"])
         if not size:
-            return Tail(memoryview(b""), 0, "")
+            return End(memoryview(b""), 0, "")
         data = self._asked(lambda: self._system.cat_file(self._path, start=max(0, size - length), end=size))
-        return Tail(memoryview(data), size, f"{info.get('ETag') or info.get('mtime') or ''} {size}")
+        return End(memoryview(data), size, f"{info.get('ETag') or info.get('mtime') or ''} {size}")
+
+    def head(self, length: int) -> End:
+        raise RecordingError(f"{shown(self._url)}: the head is not fetched before it is needed")
 
     def get(self, start: int, stop: int, version: str) -> memoryview:
         return memoryview(self._asked(lambda: self._system.cat_file(self._path, start=start, end=stop)))

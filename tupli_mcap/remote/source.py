@@ -16,13 +16,16 @@ from urllib.parse import urlsplit
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.progress import progress
 from tupli_mcap.remote.names import shown
-from tupli_mcap.remote.objects import NoRangesError, RemoteObject, Tail, changed, check_process, find
+from tupli_mcap.remote.objects import End, NoRangesError, RemoteObject, changed, check_process, find
 from tupli_mcap.remote.plan import Range, pieces_of
 
 __all__ = ["BLOCK_BYTES", "RemoteSource", "copied", "open_url"]
 
 BLOCK_BYTES: Final = 256 << 20  # of all files of this process
+# What is fetched when a file is opened. The tail has the summary and the index, unless the file is huge; the head has
+# what a recording says of itself: its metadata, and mostly its run and its environment.
 _TAIL = 128 << 10
+_HEAD = 16 << 10
 _AT_ONCE = 8
 
 
@@ -87,15 +90,15 @@ _fetchers = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="tupli-remote")
 class RemoteSource:
     """One version of a file on a server. Safe from several threads; a copy in another process fetches for itself.
 
-    It was opened with the tail of the file, which stays in memory. When the file on the server changes, reading raises
-    RecordingError: bytes of two versions are never mixed.
+    It was opened with the tail and the head of the file, which stay in memory. When the file on the server changes,
+    reading raises RecordingError: bytes of two versions are never mixed.
     """
 
-    def __init__(self, url: str, remote: RemoteObject, tail: Tail) -> None:
+    def __init__(self, url: str, remote: RemoteObject, tail: End, head: memoryview) -> None:
         self.path: Path | None = None
         self.name = shown(url)
         self.size = tail.size
-        self._url, self._remote, self._tail = url, remote, tail
+        self._url, self._remote, self._tail, self._head = url, remote, tail, head
         self._file = f"{tail.version} {url}"
         self._lock = threading.Lock()
         self._planned: list[Range] = []  # not yet asked for, the next one last
@@ -116,6 +119,8 @@ class RemoteSource:
         first = self.size - len(self._tail.data)
         if offset >= first:
             return self._tail.data[offset - first : stop - first]
+        if stop <= len(self._head):
+            return self._head[offset:stop]
         check_process(self._url)
         block = _blocks.find(self._file, offset, stop) or self._ask_for(offset, stop)
         try:
@@ -132,7 +137,7 @@ class RemoteSource:
         missing = [
             (start, min(stop, self.size))
             for start, stop in ranges
-            if start < first and not _blocks.find(self._file, start, stop)
+            if len(self._head) < stop and start < first and not _blocks.find(self._file, start, stop)
         ]
         with self._lock:
             self._planned = pieces_of(missing)[::-1]
@@ -177,12 +182,13 @@ class RemoteSource:
     def close(self) -> None:
         """Nothing is held open."""
 
-    def __reduce__(self) -> tuple[Callable[..., RemoteSource], tuple[str, bytes, int, str]]:
-        return _again, (self._url, bytes(self._tail.data), self._tail.size, self._tail.version)
+    def __reduce__(self) -> tuple[Callable[..., RemoteSource], tuple[str, bytes, bytes, int, str]]:
+        tail = self._tail
+        return _again, (self._url, bytes(self._head), bytes(tail.data), tail.size, tail.version)
 
 
-def _again(url: str, data: bytes, size: int, version: str) -> RemoteSource:
-    return RemoteSource(url, find(url), Tail(memoryview(data), size, version))
+def _again(url: str, head: bytes, tail: bytes, size: int, version: str) -> RemoteSource:
+    return RemoteSource(url, find(url), End(memoryview(tail), size, version), memoryview(head))
 
 
 def open_url(url: str) -> RemoteSource | BinaryIO:
@@ -193,8 +199,10 @@ def open_url(url: str) -> RemoteSource | BinaryIO:
         MissingExtraError: what reads such URLs is not installed.
     """
     remote = find(url)
+    coming = _fetchers.submit(remote.head, _HEAD)  # side by side: it takes no time of its own
     try:
-        return RemoteSource(url, remote, remote.tail(_TAIL))
+        tail = remote.tail(_TAIL)
+        return RemoteSource(url, remote, tail, _head(url, tail, coming))
     except NoRangesError:
         warnings.warn(
             f"{shown(url)}: the server sends whole files only, so all of it is downloaded into a temporary file; "
@@ -208,6 +216,16 @@ def open_url(url: str) -> RemoteSource | BinaryIO:
         file.close()
         raise
     return file
+
+
+def _head(url: str, tail: End, coming: Future[End]) -> memoryview:
+    """The head of the file that the tail is of; empty where it did not come, or the tail is all."""
+    if len(tail.data) == tail.size or coming.exception() is not None:
+        return memoryview(b"")
+    head = coming.result()
+    if head.version != tail.version:
+        raise changed(url)
+    return head.data
 
 
 @contextmanager
