@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of, pair_of
+from tupli_mcap.cli.options import Episodes, File, FilterText, Json, filter_of, local_path, pair_of
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
@@ -19,6 +19,7 @@ from tupli_mcap.cli.output import (
     print_wrapped,
 )
 from tupli_mcap.cli.terminal import say
+from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import RecoveryReport
@@ -40,7 +41,7 @@ _SHOWN = 20  # damaged places, lost episodes: what is beyond is in --json
 
 def merge(
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE", help="Recordings of the same spaces.", readable=False)
+        list[Path], typer.Argument(metavar="FILE", help="Recordings of the same spaces.", parser=local_path)
     ],
     output: _Output,
     force: _Force = False,
@@ -63,7 +64,7 @@ def merge(
 
 
 def split(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
+    file: File,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="FILE", help="The first one; FILE_0001.mcap, … follow.")
     ],
@@ -109,8 +110,9 @@ def tag(
     from tupli_mcap.jsonvalue import dumps_any
     from tupli_mcap.recording import Recording, annotate_episodes, undo_annotation
 
-    paths = [Path(text) for text in files if "=" not in text]
-    values = dict(pair_of(text) for text in files if "=" in text)
+    given = [text for text in files if "=" not in text or is_url(text)]
+    paths = [local_path(text) for text in given]
+    values = dict(pair_of(text) for text in files if text not in given)
     if not paths or bool(values) == undo:
         raise typer.BadParameter(
             "give recordings, and KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 success=true"
@@ -139,7 +141,7 @@ def tag(
 
 
 def edit(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
+    file: File,
     name: Annotated[str | None, typer.Option(help="Of the run.")] = None,
     settings: Annotated[
         list[str] | None,
@@ -178,7 +180,7 @@ def edit(
 
 
 def filter_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
+    file: File,
     filter_text: Annotated[
         str, typer.Argument(metavar="FILTER", help="Such as 'return > 100 and metadata.success'.")
     ],
@@ -201,7 +203,7 @@ def filter_(
 
 
 def trim(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
+    file: File,
     steps: Annotated[
         str, typer.Option("--steps", metavar="10:-5", help="The steps that stay: first, and where to stop.")
     ],
@@ -245,7 +247,7 @@ def _print_made(report: Any, dry_run: bool) -> None:
 
 
 def recover(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", readable=False)],
+    file: File,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="FILE", help="By default FILE.recovered.mcap, beside it."),

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from tupli_mcap.cli.options import ColumnNames, FilterText, Json, Limit, Sort, filter_of, open_storage
+from tupli_mcap.cli.options import (
+    ColumnNames,
+    FilterText,
+    Json,
+    Limit,
+    Sort,
+    filter_of,
+    local_path,
+    open_storage,
+)
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
@@ -86,7 +95,9 @@ _MEANT = {"date": "started", "time": "started", "created": "started", "length": 
 def ls(
     paths: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="PATH", help="Files, directories, storages; here by default.", readable=False),
+        typer.Argument(
+            metavar="PATH", help="Files, directories, storages; here by default.", parser=local_path
+        ),
     ] = None,
     filter_text: FilterText = None,
     sort: Sort = None,
@@ -197,7 +208,7 @@ def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed]) -> 
 
 def episodes(
     paths: Annotated[
-        list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", readable=False)
+        list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", parser=local_path)
     ],
     filter_text: FilterText = None,
     sort: Sort = None,

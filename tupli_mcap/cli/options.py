@@ -8,16 +8,29 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.remote import is_url, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
     from tupli_mcap.storage import FileStorage
 
 __all__ = [
-    "ColumnNames", "Episodes", "FilterText", "Json", "Limit", "Sort", "StoragePath", "filter_of", "full_id",
-    "open_storage", "pair_of"
+    "ColumnNames", "Episodes", "File", "FilterText", "Json", "Limit", "Sort", "StoragePath", "filter_of", "full_id",
+    "local_path", "open_storage", "pair_of"
 ]  # fmt: skip
 
+
+def local_path(text: str) -> Path:
+    """A path; BadParameter for a URL, which this command neither changes nor lists."""
+    if is_url(text):
+        raise typer.BadParameter(
+            f"expected a path, found {shown(text)}; download the file, or save what you need of it: "
+            "tupli_mcap.open(url).save(path)"
+        )
+    return Path(text)
+
+
+File = Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", parser=local_path)]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead.")]
 Episodes = Annotated[
     str | None,

@@ -18,6 +18,7 @@ from tupli_mcap.cli.options import (
     Sort,
     StoragePath,
     filter_of,
+    local_path,
     open_storage,
 )
 from tupli_mcap.cli.output import (
@@ -114,7 +115,7 @@ def list_episodes(
 
 
 _Paths = Annotated[
-    list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", readable=False)
+    list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", parser=local_path)
 ]
 _DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say how many there are.")]
 

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, TypeVar
+from urllib.parse import unquote, urlsplit
 
 from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.remote import RemoteSource, is_url, open_url, shown
@@ -243,6 +244,8 @@ def _read_or_refused(name: str, offset: int, length: int, read: Callable[[], _T]
 
 def open_source(source: str | os.PathLike[str] | BinaryIO) -> Source:
     """A Source for a path, a URL (`https://…`, `s3://…`) or an open binary file."""
+    if isinstance(source, str) and source.startswith("file://"):
+        return PathSource(Path(unquote(urlsplit(source).path)))
     if isinstance(source, str) and is_url(source):
         found = open_url(source)
         return found if isinstance(found, RemoteSource) else FileSource(found, shown(source), owned=True)

@@ -155,7 +155,7 @@ class _Builder:
         stored = recording.stored
         source = stored.source
         if stored.where is not None and source.path is not None:
-            source = FileOfMany(self._files, stored.where, source.size)
+            source = FileOfMany(self._files, stored.where, source.path, source.size)
         rows = recording.index[positions_of(recording, listed)]
         self._layout_of.append(self._layout(recording.name, stored.layout))
         self._parts.append(_Part(stored, stored.store.elsewhere(source, self._cache), rows, listed.lengths))
@@ -272,10 +272,10 @@ class OpenFiles:
 class FileOfMany:
     """A `Source` that is open only while it is among those read last."""
 
-    def __init__(self, files: OpenFiles, where: str, size: int) -> None:
+    def __init__(self, files: OpenFiles, where: str, path: Path, size: int) -> None:
         self._files = files
         self.name = where
-        self.path: Path | None = Path(where)
+        self.path: Path | None = path
         self.size = size
 
     def read(self, offset: int, length: int) -> bytes:
