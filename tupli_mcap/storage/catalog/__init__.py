@@ -1,6 +1,7 @@
 """The catalog of a storage: a database of its episodes, a cache that may be deleted at any time.
 
-catalog             keeps it up to date with the directory, and answers queries
+catalog             answers queries, and takes in recordings
+queries             what is asked of the tables, in any SQL database
 database, tables    the database, and what is in it
 place               where it lies, for this user alone
 entries             what it holds of a recording, read here or by other processes

@@ -28,10 +28,14 @@ EPISODE_BITS: Final = 32
 
 METADATA: Final = MetaData()
 
+_ID: Final = BigInteger().with_variant(
+    Integer, "sqlite"
+)  # SQLite numbers rows by themselves in an INTEGER only
+
 RECORDING: Final = Table(
     "recording",
     METADATA,
-    Column("id", Integer, primary_key=True),
+    Column("id", _ID, primary_key=True),
     Column("path", Text, nullable=False, unique=True),
     Column("size", BigInteger, nullable=False),
     Column("mtime_ns", BigInteger, nullable=False),
@@ -44,8 +48,8 @@ RECORDING: Final = Table(
 EPISODE: Final = Table(
     "episode",
     METADATA,
-    Column("id", Integer, primary_key=True),
-    Column("recording_id", Integer, ForeignKey("recording.id"), nullable=False),
+    Column("id", _ID, primary_key=True),
+    Column("recording_id", _ID, ForeignKey("recording.id"), nullable=False),
     Column("episode", Integer, nullable=False),
     Column("env", Integer, nullable=False),
     Column("n_tuples", Integer, nullable=False),
@@ -71,7 +75,7 @@ DECLARED: Final = Table(
 VALUE: Final = Table(
     "value",
     METADATA,
-    Column("episode_id", Integer, primary_key=True, autoincrement=False),
+    Column("episode_id", _ID, primary_key=True, autoincrement=False),
     Column("key", Integer, primary_key=True, autoincrement=False),  # its number in `declared`
     Column("number", Float),
     Column("text", Text),

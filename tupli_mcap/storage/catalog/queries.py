@@ -1,0 +1,274 @@
+"""What is written to the tables of a catalog and asked of them, each in a transaction of the caller's.
+
+The tables may lie in any SQL database: in the catalog of a directory, or in that of a server.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+from sqlalchemy import Connection, Select, Table, and_, delete, func, insert, or_, select, true
+from sqlalchemy.sql.elements import ColumnElement
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import FilterError
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound
+from tupli_mcap.schema.facts import path_in
+from tupli_mcap.schema.predicate import bound_predicate
+from tupli_mcap.storage.catalog.filter_sql import Narrowed, merged, narrowed
+from tupli_mcap.storage.catalog.rows import (
+    EpisodeRow,
+    StoredRow,
+    header,
+    indexed_value,
+    is_indexed,
+    load_metadata,
+    store_row,
+)
+from tupli_mcap.storage.catalog.tables import (
+    DECLARED,
+    EPISODE,
+    EPISODE_BITS,
+    RECORDING,
+    VALUE,
+    in_order,
+    of_one_recording,
+)
+from tupli_mcap.storage.listing import RecordingStamp
+from tupli_mcap.storage.texts import escape_text, unescape_text
+
+__all__ = [
+    "After",
+    "count_episodes",
+    "declare_key",
+    "declared_keys",
+    "find_episodes",
+    "plan_of",
+    "put_recording",
+    "remove_recording",
+]
+
+_ROWS_AT_ONCE: Final = 20_000
+_COLUMNS: Final = tuple(EPISODE.c[name] for name in StoredRow._fields)
+
+
+class After(NamedTuple):
+    """The last episode of a page: the path of its recording, and its number there."""
+
+    recording: str
+    episode: int
+
+
+def put_recording(
+    connection: Connection,
+    relpath: str,
+    stamp: RecordingStamp,
+    *,
+    uuid: str,
+    benchmark_id: str,
+    rows: Iterable[EpisodeRow],
+    runs: str,
+) -> None:
+    """Adds a recording in place of what was known of it. `runs` is JSON: a list of those that its episodes are of.
+
+    Raises:
+        FormatError: A row's metadata is no strict JSON object.
+    """
+    number = _add_recording(connection, relpath, stamp, uuid, benchmark_id, runs)
+    indexed = _indexed(connection)
+    remaining = iter(rows)
+    while chunk := [store_row(number, row) for row in itertools.islice(remaining, _ROWS_AT_ONCE)]:
+        _insert_all(connection, EPISODE, StoredRow._fields, chunk)
+        _index(connection, chunk, indexed)
+
+
+def find_episodes(
+    connection: Connection,
+    filter: BaseFilter | None,
+    *,
+    limit: int | None = None,
+    offset: int = 0,
+    after: After | None = None,
+    only: ColumnElement[bool] | None = None,
+) -> Iterator[EpisodeHeader]:
+    """The episodes that a filter is true of, ordered by recording (path) and episode number.
+
+    after: where to go on. only: a condition on rows of EPISODE and RECORDING that holds besides the filter.
+
+    Raises:
+        FilterError: The filter names an unknown top-level key, or compares a fact with what it can never be.
+    """
+    meant = _bound(filter)
+    found = _narrowed(connection, meant, only, after)
+    if found.exact:
+        return _headers(connection, meant, found, limit, offset)
+    headers = _headers(connection, meant, found, None, 0)
+    return itertools.islice(headers, offset, None if limit is None else min(offset + limit, sys.maxsize))
+
+
+def count_episodes(
+    connection: Connection, filter: BaseFilter | None, *, only: ColumnElement[bool] | None = None
+) -> int:
+    """How many episodes a filter is true of. Raises as `find_episodes` does."""
+    meant = _bound(filter)
+    found = _narrowed(connection, meant, only, None)
+    if found.exact:
+        return int(connection.execute(_query(meant, found, func.count())).scalar_one())
+    return sum(1 for _ in _headers(connection, meant, found, None, 0))
+
+
+def plan_of(connection: Connection, filter: BaseFilter | None) -> str:
+    """The SQL of a filter, its parameters, SQLite's plan for it, and whether Python looks at what that finds."""
+    meant = _bound(filter)
+    found = _narrowed(connection, meant, None, None)
+    compiled = _query(meant, found, EPISODE.c.id).compile(
+        connection, compile_kwargs={"render_postcompile": True}
+    )
+    values = tuple(compiled.params[name] for name in compiled.positiontup or ())
+    plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {compiled}", values)
+    steps = [f"  {row.detail}" for row in plan]
+    last = [] if found.exact else ["then each episode that was found is compared exactly"]
+    return "\n".join([str(compiled), f"parameters: {values!r}", "plan:", *steps, *last])
+
+
+def declare_key(connection: Connection, key: str) -> None:
+    """Indexes a key, so that filters on it find few episodes among many; declaring it twice is fine.
+
+    Raises:
+        FilterError: There is no such top-level key, or it is that of all metadata.
+    """
+    path = path_in(key, EpisodeHeader)
+    if path == ("metadata",):
+        raise FilterError(f"key {key!r} cannot be declared: name one in it, such as metadata.score")
+    if connection.execute(select(DECLARED).where(DECLARED.c.key == escape_text(key))).first():
+        return
+    number = connection.execute(select(func.count()).select_from(DECLARED)).scalar_one()
+    connection.execute(insert(DECLARED).values(key=escape_text(key), number=number))
+    if is_indexed(path):
+        rows = connection.execute(select(*_COLUMNS).order_by(EPISODE.c.id))
+        for chunk in rows.partitions(_ROWS_AT_ONCE):
+            _index(connection, [StoredRow(*row) for row in chunk], {path: number})
+
+
+def declared_keys(connection: Connection) -> list[str]:
+    """The declared keys, in the order of their declaration."""
+    keys = connection.execute(select(DECLARED.c.key).order_by(DECLARED.c.number)).scalars()
+    return [unescape_text(key) for key in keys]
+
+
+def remove_recording(connection: Connection, relpath: str) -> None:
+    """Forgets a recording and its episodes; nothing happens if it is not catalogued."""
+    number = connection.execute(
+        select(RECORDING.c.id).where(RECORDING.c.path == escape_text(relpath))
+    ).scalar()
+    if number is None:
+        return
+    first = number << EPISODE_BITS
+    for episodes in (VALUE.c.episode_id, EPISODE.c.id):
+        of = and_(episodes >= first, episodes < first + (1 << EPISODE_BITS))
+        connection.execute(delete(episodes.table).where(of))
+    connection.execute(delete(RECORDING).where(RECORDING.c.id == number))
+
+
+_OF_RECORDING: Final = (RECORDING.c.uuid, RECORDING.c.benchmark_id, RECORDING.c.path)
+_EVERYTHING: Final = Narrowed(true(), exact=True)
+
+
+def _bound(filter: BaseFilter | None) -> BaseFilter | None:
+    return None if filter is None else merged(bound(filter, EpisodeHeader))
+
+
+def _narrowed(
+    connection: Connection,
+    filter: BaseFilter | None,
+    only: ColumnElement[bool] | None,
+    after: After | None,
+) -> Narrowed:
+    found = _EVERYTHING if filter is None else narrowed(filter, _indexed(connection))
+    conditions = [found.condition] if only is None else [found.condition, only]
+    if after is not None:
+        path = escape_text(after.recording)
+        same = and_(RECORDING.c.path == path, EPISODE.c.episode > after.episode)
+        conditions.append(or_(RECORDING.c.path > path, same))
+    return found if len(conditions) == 1 else found._replace(condition=and_(*conditions))
+
+
+def _query(filter: BaseFilter | None, found: Narrowed, *columns: Any) -> Select[Any]:
+    of = of_one_recording() if filter is not None else in_order()
+    return select(*columns).select_from(EPISODE.join(RECORDING, of)).where(found.condition)
+
+
+def _headers(
+    connection: Connection, filter: BaseFilter | None, found: Narrowed, limit: int | None, offset: int
+) -> Iterator[EpisodeHeader]:
+    """The episodes that a filter is true of; `limit` and `offset` count those that SQL finds."""
+    # Given the bare path to sort by, SQLite may walk all episodes in order for the few that match.
+    path = RECORDING.c.path if filter is None else func.coalesce(RECORDING.c.path, "")
+    query = _query(filter, found, *_COLUMNS, *_OF_RECORDING).order_by(path, EPISODE.c.id)
+    rows = connection.execute(query.limit(limit).offset(offset or None))
+    matches = None if filter is None or found.exact else bound_predicate(filter)
+    width = len(_COLUMNS)
+    runs: dict[int, list[dict[str, Any]]] = {}
+    for row in rows:
+        stored = StoredRow(*row[:width])
+        if stored.recording_id not in runs:
+            runs[stored.recording_id] = _runs_of(connection, stored.recording_id)
+        uuid, benchmark_id, path = row[width:]
+        made = header(stored, uuid, benchmark_id, path, runs[stored.recording_id][stored.run])
+        if matches is None or matches(made):
+            yield made
+
+
+def _runs_of(connection: Connection, recording_id: int) -> list[dict[str, Any]]:
+    """The runs that a recording's episodes are of, by their places."""
+    found: list[dict[str, Any]] = jsonvalue.loads(
+        connection.execute(select(RECORDING.c.runs).where(RECORDING.c.id == recording_id)).scalar_one()
+    )
+    return found
+
+
+def _indexed(connection: Connection) -> dict[tuple[str, ...], int]:
+    """The paths of declared keys whose values are in `VALUE`, with their numbers there."""
+    declared = connection.execute(select(DECLARED.c.key, DECLARED.c.number)).all()
+    paths = {path_in(unescape_text(key), EpisodeHeader): number for key, number in declared}
+    return {path: number for path, number in paths.items() if is_indexed(path)}
+
+
+def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[tuple[str, ...], int]) -> None:
+    """Puts what rows hold at declared keys into `VALUE`."""
+    values = []
+    for row in rows if indexed else ():
+        metadata = load_metadata(row.metadata)
+        for path, number in indexed.items():
+            value = indexed_value(row, metadata, path)
+            if value is not None:
+                values.append((row.id, number, *value))
+    if values:
+        _insert_all(connection, VALUE, ("episode_id", "key", "number", "text"), values)
+
+
+def _add_recording(
+    connection: Connection, relpath: str, stamp: RecordingStamp, uuid: str, benchmark_id: str, runs: str
+) -> int:
+    """Adds a recording without episodes, in place of what was known of it; returns its id."""
+    remove_recording(connection, relpath)
+    values = {
+        "path": escape_text(relpath), "uuid": uuid, "benchmark_id": escape_text(benchmark_id), "runs": runs
+    }  # fmt: skip
+    added = connection.execute(insert(RECORDING).values(**values, **stamp._asdict()))
+    (number,) = added.inserted_primary_key or (0,)
+    return int(number)
+
+
+def _insert_all(
+    connection: Connection, table: Table, fields: Sequence[str], rows: Sequence[tuple[Any, ...]]
+) -> None:
+    """Inserts rows as the driver takes them: SQLAlchemy would prepare each value of each row."""
+    compiled = insert(table).compile(dialect=connection.dialect, column_keys=fields)
+    if compiled.positional:
+        connection.exec_driver_sql(str(compiled), list(rows))
+    else:
+        connection.exec_driver_sql(str(compiled), [dict(zip(fields, row, strict=True)) for row in rows])
