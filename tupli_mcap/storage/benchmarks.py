@@ -19,7 +19,7 @@ from tupli_mcap.storage.base import LOCAL_USER, published_in
 from tupli_mcap.storage.benchmark_json import artifacts_of, benchmark_hash, pack, plain, restored, unpack
 from tupli_mcap.storage.texts import first_defect, is_hash, to_json
 
-__all__ = ["BenchmarkFiles"]
+__all__ = ["BenchmarkFiles", "document_of", "name_in"]
 
 
 class BenchmarkFiles:
@@ -31,7 +31,7 @@ class BenchmarkFiles:
 
     def store(self, query: BenchmarkQuery, *, created_by: str = LOCAL_USER) -> BenchmarkHeader:
         metadata = restored(plain(query.metadata))
-        uri, document, pickle = _document(query)
+        uri, document, pickle = document_of(query)
         path = self._path(uri)
         with self._lock, os_errors("cannot store the benchmark", path):
             if path.exists():
@@ -43,7 +43,7 @@ class BenchmarkFiles:
             if pickle is not None:
                 write_bytes(self._pickle_path(uri), pickle)
             write_bytes(path, to_json(document))  # last: the benchmark is there once this is
-        return header.model_copy(update={"environment": _name_in(document)})
+        return header.model_copy(update={"environment": name_in(document)})
 
     def load(self, uri: str) -> Benchmark:
         document = self._read(uri)
@@ -127,7 +127,7 @@ class BenchmarkFiles:
             raise FormatError(f"{self._path(uri)}: expected a benchmark: {first_defect(err)}") from err
         if header.id != uri:
             raise FormatError(f"{self._path(uri)}: expected benchmark {uri}, found {header.id[:80]!r}")
-        return header.model_copy(update={"environment": _name_in(document)})
+        return header.model_copy(update={"environment": name_in(document)})
 
     def _find(self, uri: str) -> Path:
         if not self.exists(uri):
@@ -148,15 +148,19 @@ def _entry(header: BenchmarkHeader) -> dict[str, Any]:
     return {key: value for key, value in plain(header).items() if key != "environment"}
 
 
-def _name_in(document: dict[str, Any]) -> str:
+def name_in(document: dict[str, Any]) -> str:
     """What a document calls its environment."""
     environment = document.get("environment")
     name = environment.get("name") if isinstance(environment, dict) else ""
     return name if isinstance(name, str) else ""
 
 
-def _document(query: BenchmarkQuery) -> tuple[str, dict[str, Any], bytes | None]:
-    """The id of a benchmark, its document without the header's fields, and its pickle."""
+def document_of(query: BenchmarkQuery) -> tuple[str, dict[str, Any], bytes | None]:
+    """The id of a benchmark, its document without the header's fields, and its pickle.
+
+    Raises:
+        StorageError: its hash is not that of its content.
+    """
     try:
         content = unpack(query.serialized)
     except FormatError:

@@ -32,7 +32,7 @@ from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp, stamp_of
 from tupli_mcap.storage.sidecar import Notes, Sidecar
 
-__all__ = ["Entry", "entry_of", "read_ahead"]
+__all__ = ["Entry", "entry_of", "read_ahead", "rows_of", "runs_of"]
 
 _MOST_EPISODES = 50_000  # of a recording that another process reads: its rows are in memory twice
 _TRIAL = 1.0  # seconds of reading here before it is known whether more processes are worth their start
@@ -68,11 +68,14 @@ def entry_of(root: Path, relative: str) -> Iterator[Entry]:
     with Recording(path) as recording:
         live |= is_locked(path)  # a writer may have come or gone meanwhile
         numbers = recording.index["episode"].tolist()
-        rows = _rows(recording, notes.about(recording.metadata), live=live)
-        each = recording.listed_runs()
-        known = {id(run): run for run in each}
-        runs = jsonvalue.dumps(list(known.values()))
-        yield Entry(stamp, live, recording.uuid, recording.benchmark_id, runs, numbers, rows)
+        rows = rows_of(recording, notes.about(recording.metadata), live=live)
+        yield Entry(stamp, live, recording.uuid, recording.benchmark_id, runs_of(recording), numbers, rows)
+
+
+def runs_of(recording: Recording) -> str:
+    """JSON: a list of the runs that a recording's episodes are of."""
+    known = {id(run): run for run in recording.listed_runs()}
+    return jsonvalue.dumps(list(known.values()))
 
 
 def read_ahead(root: Path, names: Sequence[str]) -> Generator[Entry | None]:
@@ -142,7 +145,9 @@ def _read(root: Path, relative: str) -> Entry | None:
     return None
 
 
-def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[EpisodeRow]:
+def rows_of(
+    recording: Recording, sidecar: Sidecar, *, live: bool = False, created_by: str = LOCAL_USER
+) -> Iterator[EpisodeRow]:
     """The rows of a recording, without deleted episodes and those a live writer is in the middle of."""
     index = recording.index
     columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return", "end_time")]
@@ -151,7 +156,7 @@ def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[Epi
         for has, seed in zip(index["has_seed"].tolist(), index["seed"].tolist(), strict=True)
     ]
     running = _running(columns[1], columns[3]) if live else set()
-    local = json.dumps([LOCAL_USER])
+    private = json.dumps([created_by])
     for i, (number, env, length, end, total, created_at, seed, metadata, run) in enumerate(
         zip(*columns, seeds, recording.all_metadata(), _places(recording), strict=True)
     ):
@@ -166,8 +171,8 @@ def _rows(recording: Recording, sidecar: Sidecar, *, live: bool) -> Iterator[Epi
             episode_return=total,
             seed=seed,
             created_at=created_at,
-            created_by=LOCAL_USER,
-            published_in=local if groups is None else json.dumps(groups),
+            created_by=created_by,
+            published_in=private if groups is None else json.dumps(groups),
             metadata=metadata,
             run=run,
         )

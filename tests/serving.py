@@ -1,0 +1,48 @@
+"""A real server on a port of this machine, for as long as a block runs."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import uvicorn
+
+from tupli_mcap.server.app import create_app
+from tupli_mcap.server.library import Library
+from tupli_mcap.server.settings import Settings
+
+PASSWORD = "correct horse battery staple"
+
+
+@contextlib.contextmanager
+def serving(settings: Settings) -> Iterator[str]:
+    """Serves in a thread; gives the address. The admin's password is PASSWORD."""
+    with pytest_environment("TUPLI_MCAP_ADMIN_PASSWORD", PASSWORD):
+        library = Library(settings)
+        library.first_password()
+    config = uvicorn.Config(create_app(library), host="127.0.0.1", port=0, log_level="warning")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive()
+        time.sleep(0.01)
+    sockets: Any = server.servers[0].sockets
+    try:
+        yield f"http://127.0.0.1:{sockets[0].getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join(30)
+
+
+@contextlib.contextmanager
+def pytest_environment(name: str, value: str) -> Iterator[None]:
+    """Sets a variable of the environment for a block."""
+    import pytest
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(name, value)
+        yield

@@ -1,0 +1,112 @@
+"""Who may do what: rights, the roles that give them, and the one condition that says what a caller may read.
+
+A user has roles in groups. A right counts in the group where a role gives it, and everywhere if that group is
+`global`; reading is the exception: what is private stays so for an admin too. Everybody who is signed in has a group
+of their own, with their name. An item is read by who made it, and by who may read in a group it is published in.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+from sqlalchemy import or_, select
+from sqlalchemy.sql.elements import ColumnElement
+
+from tupli_mcap.errors import TupliError
+from tupli_mcap.server.tables import AUDIENCE
+from tupli_mcap.storage.texts import escape_text
+
+__all__ = ["DEFAULT_ROLES", "GLOBAL", "GUEST", "Caller", "DeniedError", "Right", "readable"]
+
+GLOBAL: Final = "global"
+"""The group of everybody who is signed in."""
+GUEST: Final = "$$GUEST$$"
+"""The name of who is not signed in; no user can have it."""
+
+
+class DeniedError(TupliError):
+    """The caller has not the right to do this."""
+
+
+class Right(enum.StrEnum):
+    """What a role may allow."""
+
+    BENCHMARK_CREATE = "benchmark_create"
+    BENCHMARK_READ = "benchmark_read"
+    BENCHMARK_DELETE = "benchmark_delete"
+    ARTIFACT_CREATE = "artifact_create"
+    ARTIFACT_READ = "artifact_read"
+    ARTIFACT_DELETE = "artifact_delete"
+    EPISODE_CREATE = "episode_create"
+    EPISODE_READ = "episode_read"
+    EPISODE_DELETE = "episode_delete"
+    USER_CREATE = "user_create"
+    USER_READ = "user_read"
+    USER_UPDATE = "user_update"
+    USER_DELETE = "user_delete"
+    GROUP_CREATE = "group_create"
+    GROUP_READ = "group_read"
+    GROUP_UPDATE = "group_update"
+    GROUP_DELETE = "group_delete"
+    ROLE_MANAGEMENT = "role_management"
+
+
+def _content(*verbs: str) -> frozenset[Right]:
+    return frozenset(
+        Right(f"{kind}_{verb}") for kind in ("benchmark", "artifact", "episode") for verb in verbs
+    )
+
+
+_USERS: Final = frozenset({Right.USER_CREATE, Right.USER_READ, Right.USER_UPDATE, Right.USER_DELETE})
+_GROUPS: Final = frozenset({Right.GROUP_CREATE, Right.GROUP_READ, Right.GROUP_UPDATE, Right.GROUP_DELETE})
+
+DEFAULT_ROLES: Final[Mapping[str, frozenset[Right]]] = {
+    "admin": frozenset(Right),
+    "content_admin": _content("create", "read", "delete"),
+    "user_admin": _USERS,
+    "group_admin": _GROUPS | {Right.USER_READ},
+    "contributor": _content("create", "read"),
+    "member": _content("read") | {Right.GROUP_READ, Right.USER_READ},
+    "global_member": _content("read") | {Right.GROUP_CREATE, Right.USER_READ},
+    "guest": _content("read"),
+}
+
+
+class Caller(NamedTuple):
+    """Who asks: a user, or a guest; the rights in each group, and whether the token at hand may change anything."""
+
+    name: str
+    rights: Mapping[str, frozenset[Right]]
+    may_write: bool = True
+
+    @property
+    def is_guest(self) -> bool:
+        """Whether nobody is signed in."""
+        return self.name == GUEST
+
+    def may(self, right: Right, group: str = GLOBAL) -> bool:
+        """Whether a right is held in a group, or everywhere."""
+        return any(right in self.rights.get(name, ()) for name in (group, GLOBAL))
+
+    def groups_with(self, right: Right) -> list[str]:
+        """The groups in which a right is held."""
+        return [group for group, rights in self.rights.items() if right in rights]
+
+    def demand(self, right: Right, group: str = GLOBAL) -> None:
+        """Raises DeniedError without the right in the group, or everywhere."""
+        if not self.may(right, group):
+            raise DeniedError(f"Insufficient permissions in group: {group}. Required: {right}")
+
+
+def readable(
+    caller: Caller, right: Right, created_by: ColumnElement[Any], published_in: ColumnElement[Any]
+) -> ColumnElement[bool]:
+    """What a caller may read: the only place that says so.
+
+    created_by, published_in: columns of the table that is asked.
+    """
+    groups = [escape_text(group) for group in caller.groups_with(right)]
+    seen = select(AUDIENCE.c.published_in).where(AUDIENCE.c.team.in_(groups))
+    return or_(created_by == escape_text(caller.name), published_in.in_(seen))

@@ -1,0 +1,323 @@
+"""Users, groups and roles. Every function works in a transaction of its caller's."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from pwdlib import PasswordHash
+from pwdlib.hashers.argon2 import Argon2Hasher
+from sqlalchemy import Connection, delete, insert, select, update
+
+from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.server.access import DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError, Right
+from tupli_mcap.server.database import audit
+from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, REFRESH_TOKEN, ROLE, USER
+
+__all__ = [
+    "ConflictError",
+    "add_member",
+    "caller_named",
+    "change_password",
+    "create_group",
+    "create_role",
+    "create_user",
+    "delete_group",
+    "delete_role",
+    "delete_user",
+    "guest",
+    "list_groups",
+    "list_roles",
+    "list_users",
+    "members_of",
+    "memberships_of",
+    "prepare",
+    "remove_member",
+    "verify_password",
+]
+
+_HASHES: Final = PasswordHash((Argon2Hasher(),))
+_DUMMY: Final = _HASHES.hash("nobody has this password")
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+-]{0,63}")
+_GROUP: Final = re.compile(r"[^/\\\x00-\x1f\x7f]{1,100}")
+_OWN_ROLES: Final = ("user_admin", "contributor")  # in the group of the user's own name
+_EVERYBODY_S_ROLES: Final = ("global_member", "contributor")  # in `global`
+_CREATOR_S_ROLES: Final = ("group_admin", "contributor")
+_MOST_PASSWORD: Final = 1024
+
+
+class ConflictError(StorageError):
+    """Something of that name is there already."""
+
+
+def prepare(connection: Connection) -> None:
+    """Puts the names that nobody may take, and the default roles, where they are missing."""
+    for name in (GLOBAL, GUEST):
+        _reserve(connection, name, "reserved")
+    known = set(connection.execute(select(ROLE.c.name)).scalars())
+    for name, rights in DEFAULT_ROLES.items():
+        if name not in known:
+            _add_role(connection, name, sorted(rights), None, builtin=True)
+
+
+# --- users ---
+
+
+def create_user(connection: Connection, name: str, password: str) -> None:
+    """Makes a user.
+
+    Raises:
+        StorageError: the name or the password cannot be one.
+        ConflictError: a user or group of that name is there.
+    """
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise StorageError(
+            f"expected a user name of 1 to 64 letters, digits and any of . _ @ + -, found {name!r:.80}"
+        )
+    hashed = _hashed(password)
+    if not _reserve(connection, name, "user"):
+        raise ConflictError("User already exists")
+    row = {"name": name, "password": hashed, "epoch": 0, "created_at": int(time.time())}
+    connection.execute(insert(USER).values(**row))
+
+
+def verify_password(connection: Connection, name: str, password: str) -> bool:
+    """Whether a user has this password. It takes as long where there is no such user."""
+    found = connection.execute(select(USER.c.password).where(USER.c.name == name)).scalar()
+    valid = _HASHES.verify(password[:_MOST_PASSWORD], found or _DUMMY)
+    return valid and found is not None
+
+
+def change_password(connection: Connection, name: str, password: str) -> None:
+    """Gives a user another password, and ends all that was signed in with the old one.
+
+    Raises:
+        NotFoundError: there is no such user.
+    """
+    hashed = _hashed(password)
+    changed = connection.execute(
+        update(USER).where(USER.c.name == name).values(password=hashed, epoch=USER.c.epoch + 1)
+    )
+    if not changed.rowcount:
+        raise NotFoundError("User does not exist")
+    _revoke(connection, name)
+
+
+def delete_user(connection: Connection, name: str) -> bool:
+    """Deletes a user with all tokens and memberships; says whether there was one.
+
+    The name stays taken: whoever got it next would own what this user made.
+    """
+    gone = connection.execute(delete(USER).where(USER.c.name == name)).rowcount
+    connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.user == name))
+    _revoke(connection, name)
+    return bool(gone)
+
+
+def list_users(connection: Connection) -> list[str]:
+    """The names of all users, in the order of their making."""
+    return list(connection.execute(select(USER.c.name).order_by(USER.c.created_at, USER.c.name)).scalars())
+
+
+def caller_named(connection: Connection, name: str, *, may_write: bool = True) -> Caller | None:
+    """A user as the one who asks; None if there is no such user."""
+    if not connection.execute(select(USER.c.name).where(USER.c.name == name)).first():
+        return None
+    rights: dict[str, frozenset[Right]] = {}
+    for group, roles in memberships_of(connection, name).items():
+        rights[group] = frozenset[Right]().union(*(_rights_of(connection, role) for role in roles))
+    return Caller(name, rights, may_write)
+
+
+def guest(connection: Connection) -> Caller:
+    """Who is not signed in."""
+    return Caller(GUEST, {GLOBAL: _rights_of(connection, "guest")}, may_write=False)
+
+
+def memberships_of(connection: Connection, name: str) -> dict[str, list[str]]:
+    """The roles of a user by group, those that everybody has among them."""
+    found = {GLOBAL: list(_EVERYBODY_S_ROLES), name: list(_OWN_ROLES)}
+    chosen = select(MEMBERSHIP.c.team, MEMBERSHIP.c.role).where(MEMBERSHIP.c.user == name)
+    for group, role in connection.execute(chosen.order_by(MEMBERSHIP.c.team, MEMBERSHIP.c.role)):
+        roles = found.setdefault(group, [])
+        if role not in roles:
+            roles.append(role)
+    return found
+
+
+def _hashed(password: str) -> str:
+    if not isinstance(password, str) or not 1 <= len(password) <= _MOST_PASSWORD:
+        raise StorageError(f"expected a password of 1 to {_MOST_PASSWORD} characters; choose another")
+    return _HASHES.hash(password)
+
+
+def _revoke(connection: Connection, name: str) -> None:
+    for table in (REFRESH_TOKEN, API_TOKEN):
+        connection.execute(delete(table).where(table.c.user == name))
+
+
+def _reserve(connection: Connection, name: str, kind: str) -> bool:
+    """Takes a name; False if it is taken."""
+    if connection.execute(select(PRINCIPAL.c.name).where(PRINCIPAL.c.name == name)).first():
+        return False
+    connection.execute(insert(PRINCIPAL).values(name=name, kind=kind))
+    return True
+
+
+# --- groups ---
+
+
+def create_group(connection: Connection, caller: Caller, name: str, description: str | None) -> None:
+    """Makes a group that the caller leads.
+
+    Raises:
+        ConflictError: a user or group of that name is there, or was.
+    """
+    caller.demand(Right.GROUP_CREATE)
+    if not isinstance(name, str) or not name.isprintable() or not _GROUP.fullmatch(name):
+        raise StorageError(
+            f"expected a group name of 1 to 100 printable characters without slashes, found {name!r:.80}"
+        )
+    if not _reserve(connection, name, "group"):
+        raise ConflictError("Group already exists")
+    connection.execute(insert(GROUP).values(name=name, description=description))
+    for role in _CREATOR_S_ROLES:
+        connection.execute(insert(MEMBERSHIP).values(user=caller.name, team=name, role=role))
+    audit(connection, caller.name, "create_group", name)
+
+
+def list_groups(connection: Connection, caller: Caller) -> list[dict[str, str | None]]:
+    """The groups that the caller may know of: their own, and all with `group_read` in `global`."""
+    query = select(GROUP.c.name, GROUP.c.description).order_by(GROUP.c.name)
+    if Right.GROUP_READ not in caller.rights.get(GLOBAL, ()):
+        query = query.where(GROUP.c.name.in_(list(caller.rights)))
+    return [{"name": name, "description": description} for name, description in connection.execute(query)]
+
+
+def members_of(connection: Connection, caller: Caller, name: str) -> dict[str, object]:
+    """A group with its description and members (`[{user, roles}]`), for who may read it.
+
+    Raises:
+        NotFoundError: there is no such group, or the caller may not know of it.
+    """
+    _known(connection, caller, name)
+    description = connection.execute(select(GROUP.c.description).where(GROUP.c.name == name)).scalar()
+    roles: dict[str, list[str]] = {}
+    chosen = (
+        select(MEMBERSHIP.c.user, MEMBERSHIP.c.role)
+        .join(USER, USER.c.name == MEMBERSHIP.c.user)
+        .where(MEMBERSHIP.c.team == name)
+        .order_by(USER.c.created_at, USER.c.name, MEMBERSHIP.c.role)
+    )
+    for user, role in connection.execute(chosen):
+        roles.setdefault(user, []).append(role)
+    shown = caller.may(Right.USER_READ, name)
+    members = [{"user": user, "roles": held} for user, held in roles.items()] if shown else []
+    return {"name": name, "description": description, "members": members}
+
+
+def delete_group(connection: Connection, caller: Caller, name: str) -> None:
+    """Deletes a group; its name stays taken. Raises NotFoundError, DeniedError."""
+    _known(connection, caller, name)
+    caller.demand(Right.GROUP_DELETE, name)
+    connection.execute(delete(GROUP).where(GROUP.c.name == name))
+    connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.team == name))
+    audit(connection, caller.name, "delete_group", name)
+
+
+def add_member(connection: Connection, caller: Caller, group: str, user: str, roles: Sequence[str]) -> None:
+    """Gives a user roles in a group, in addition to those held there; nobody can give a right they have not.
+
+    Raises:
+        NotFoundError: there is no such group, role or user.
+        DeniedError: the caller may not change the group, or lacks a right of the roles.
+    """
+    _known(connection, caller, group)
+    caller.demand(Right.GROUP_UPDATE, group)
+    known = {role["role"] for role in list_roles(connection)}
+    for role in roles:
+        if role not in known:
+            raise NotFoundError(f"Role {role} not found")
+        for right in _rights_of(connection, role):
+            caller.demand(right, group)
+    if not connection.execute(select(USER.c.name).where(USER.c.name == user)).first():
+        raise NotFoundError(f"User {user} not found")
+    held = select(MEMBERSHIP.c.role).where(MEMBERSHIP.c.user == user, MEMBERSHIP.c.team == group)
+    for role in set(roles) - set(connection.execute(held).scalars()):
+        connection.execute(insert(MEMBERSHIP).values(user=user, team=group, role=role))
+    audit(connection, caller.name, "add_member", f"{group}: {user} {', '.join(roles)}")
+
+
+def remove_member(connection: Connection, caller: Caller, group: str, user: str) -> None:
+    """Takes a user out of a group; nothing happens if they are not in it. Raises NotFoundError, DeniedError."""
+    _known(connection, caller, group)
+    caller.demand(Right.GROUP_UPDATE, group)
+    gone = delete(MEMBERSHIP).where(MEMBERSHIP.c.team == group, MEMBERSHIP.c.user == user)
+    connection.execute(gone)
+    audit(connection, caller.name, "remove_member", f"{group}: {user}")
+
+
+def _known(connection: Connection, caller: Caller, group: str) -> None:
+    """Raises NotFoundError for a group that is not there, and likewise for one that the caller may not read."""
+    there = connection.execute(select(PRINCIPAL.c.kind).where(PRINCIPAL.c.name == group)).scalar()
+    is_group = group == GLOBAL or (
+        there == "group" and connection.execute(select(GROUP.c.name).where(GROUP.c.name == group)).first()
+    )
+    if not is_group or not caller.may(Right.GROUP_READ, group):
+        if is_group and any(caller.may(right, group) for right in (Right.GROUP_UPDATE, Right.GROUP_DELETE)):
+            return
+        raise NotFoundError("Group not found")
+
+
+# --- roles ---
+
+
+def create_role(
+    connection: Connection, caller: Caller, name: str, rights: Sequence[str], description: str | None
+) -> None:
+    """Makes a role. Raises ConflictError if there is one of that name, StorageError for an unknown right."""
+    caller.demand(Right.ROLE_MANAGEMENT)
+    unknown = [right for right in rights if right not in set(Right)]
+    if unknown or not isinstance(name, str) or not name.isprintable() or not 1 <= len(name) <= 100:
+        raise StorageError(f"expected a role's name and its rights, found {name!r:.80}, {unknown!r:.200}")
+    if connection.execute(select(ROLE.c.name).where(ROLE.c.name == name)).first():
+        raise ConflictError("Role already exists")
+    _add_role(connection, name, rights, description, builtin=False)
+    audit(connection, caller.name, "create_role", name)
+
+
+def list_roles(connection: Connection) -> list[dict[str, object]]:
+    """All roles: `role`, `rights`, `description`."""
+    rows = connection.execute(select(ROLE.c.name, ROLE.c.rights, ROLE.c.description).order_by(ROLE.c.name))
+    return [{"role": name, "rights": json.loads(rights), "description": told} for name, rights, told in rows]
+
+
+def delete_role(connection: Connection, caller: Caller, name: str) -> None:
+    """Deletes a role, wherever it was given; nothing happens if there is none.
+
+    Raises:
+        DeniedError: it is one of those that the server needs.
+    """
+    caller.demand(Right.ROLE_MANAGEMENT)
+    if name in DEFAULT_ROLES:
+        raise DeniedError(f"role {name} is one that the server needs; it cannot be deleted")
+    connection.execute(delete(ROLE).where(ROLE.c.name == name))
+    connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.role == name))
+    audit(connection, caller.name, "delete_role", name)
+
+
+def _add_role(
+    connection: Connection, name: str, rights: Sequence[str], description: str | None, *, builtin: bool
+) -> None:
+    row = {"name": name, "rights": json.dumps(list(rights)), "description": description, "builtin": builtin}
+    connection.execute(insert(ROLE).values(**row))
+
+
+def _rights_of(connection: Connection, role: str) -> frozenset[Right]:
+    if role in DEFAULT_ROLES:  # of these, the code has the truth
+        return DEFAULT_ROLES[role]
+    text = connection.execute(select(ROLE.c.rights).where(ROLE.c.name == role)).scalar()
+    return frozenset(Right(right) for right in json.loads(text)) if text else frozenset()

@@ -1,0 +1,105 @@
+"""The database of a server: its tables and those of the catalog, in SQLite or PostgreSQL."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sqlite3
+import time
+from collections.abc import Iterator, Sequence
+
+from sqlalchemy import Connection, Engine, create_engine, event, insert, select
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+
+from tupli_mcap.errors import StorageError
+from tupli_mcap.server import tables
+from tupli_mcap.storage.catalog.tables import METADATA as CATALOG
+from tupli_mcap.storage.texts import escape_text
+
+__all__ = ["Database", "audience", "audit"]
+
+_BUSY_MS = 30_000
+
+
+class Database:
+    """Transactions on the tables of a server, from any thread.
+
+    Raises:
+        StorageError: the database cannot be opened.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._engine = _engine(url)
+        with self.writing() as connection:
+            tables.METADATA.create_all(connection)
+            CATALOG.create_all(connection)
+
+    @contextlib.contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A transaction that changes nothing."""
+        with _translated(), self._engine.connect() as connection, connection.begin():
+            yield connection
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """A transaction: committed at the end, rolled back on an exception."""
+        with _translated(), self._engine.connect() as connection:
+            connection.execution_options(tupli_write=True)
+            with connection.begin():
+                yield connection
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._engine.dispose()
+
+
+def audience(connection: Connection, groups: Sequence[str]) -> str:
+    """The text that stands for a list of groups in `published_in`; from then on, SQL finds it by each of them."""
+    text = json.dumps(list(groups))
+    table = tables.AUDIENCE
+    known = set(connection.execute(select(table.c.team).where(table.c.published_in == text)).scalars())
+    new = [group for group in dict.fromkeys(map(escape_text, groups)) if group not in known]
+    if new:
+        connection.execute(insert(table), [{"published_in": text, "team": group} for group in new])
+    return text
+
+
+def audit(connection: Connection, user: str, action: str, target: str) -> None:
+    """Notes that a user has changed something."""
+    row = {"time": int(time.time()), "user": user, "action": action, "target": escape_text(target[:500])}
+    connection.execute(insert(tables.AUDIT).values(**row))
+
+
+def _engine(url: str) -> Engine:
+    try:
+        engine = create_engine(url)
+    except (SQLAlchemyError, ImportError) as err:
+        raise StorageError(
+            f"the database cannot be used: {err}; give a URL such as postgresql+psycopg://…"
+        ) from err
+    if engine.dialect.name == "sqlite":
+        _prepare_sqlite(engine)
+    return engine
+
+
+def _prepare_sqlite(engine: Engine) -> None:
+    @event.listens_for(engine, "connect")
+    def _settings(connection: sqlite3.Connection, _: object) -> None:
+        connection.isolation_level = None  # transactions are begun below
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute(f"PRAGMA busy_timeout = {_BUSY_MS}")
+        connection.execute("PRAGMA synchronous = FULL")  # what was acknowledged outlives a power loss
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        # A transaction that writes takes the lock at once: one that has read before cannot wait for it.
+        write = connection.get_execution_options().get("tupli_write")
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
+
+
+@contextlib.contextmanager
+def _translated() -> Iterator[None]:
+    try:
+        yield
+    except DBAPIError as err:
+        raise StorageError(f"the server's database cannot be used: {err.orig}") from err

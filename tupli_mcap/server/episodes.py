@@ -1,0 +1,247 @@
+"""Recordings on a server, and their episodes. Every function works in a transaction of its caller's."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import secrets
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple
+
+from sqlalchemy import Connection, and_, delete, insert, select, update
+from sqlalchemy.sql.elements import ColumnElement
+
+from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.recording import Recording
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
+from tupli_mcap.server.access import Caller, DeniedError, Right, readable
+from tupli_mcap.server.accounts import ConflictError
+from tupli_mcap.server.database import audience, audit
+from tupli_mcap.server.tables import FILE, ITEM
+from tupli_mcap.storage.base import published_in
+from tupli_mcap.storage.catalog import queries
+from tupli_mcap.storage.catalog.entries import rows_of, runs_of
+from tupli_mcap.storage.catalog.queries import After
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE
+from tupli_mcap.storage.listing import RecordingStamp
+from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.texts import escape_text, is_hash
+
+__all__ = ["StoredFile", "count_episodes", "delete_episodes", "file_of", "find_episodes", "new_name", "no_episode",
+           "publish", "register", "stored_already", "unpublish"]  # fmt: skip
+
+_PLAIN: Final = "plain"  # where recordings without a benchmark lie
+
+
+class StoredFile(NamedTuple):
+    """The file of a recording: its name among the blobs, SHA-256 and size; `whole` if the caller may read all of it."""
+
+    name: str
+    digest: str
+    size: int
+    whole: bool
+
+
+# --- asking ---
+
+
+def find_episodes(
+    connection: Connection,
+    caller: Caller,
+    filter: BaseFilter | None,
+    *,
+    limit: int | None = None,
+    offset: int = 0,
+    after: After | None = None,
+) -> Iterator[EpisodeHeader]:
+    """The readable episodes that a filter is true of, see `queries.find_episodes`."""
+    seen = _seen(caller)
+    return queries.find_episodes(connection, filter, limit=limit, offset=offset, after=after, only=seen)
+
+
+def count_episodes(connection: Connection, caller: Caller, filter: BaseFilter | None) -> int:
+    """How many readable episodes a filter is true of."""
+    return queries.count_episodes(connection, filter, only=_seen(caller))
+
+
+def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
+    """The file of a recording.
+
+    Raises:
+        NotFoundError: there is none, or none of its episodes may be read.
+    """
+    found = connection.execute(select(FILE).where(FILE.c.path == escape_text(name))).first()
+    visible = 0
+    if found is not None:
+        visible = count_episodes(connection, caller, FilterEQ(key="recording", value=name))
+    if found is None or not visible:
+        raise NotFoundError(f"there is no recording {name[:200]!r}")
+    return StoredFile(name, found.digest, found.size, visible == found.episodes)
+
+
+def _seen(caller: Caller) -> ColumnElement[bool]:
+    return readable(caller, Right.EPISODE_READ, EPISODE.c.created_by, EPISODE.c.published_in)
+
+
+# --- taking in ---
+
+
+def new_name(benchmark_id: str) -> str:
+    """A name for a recording that nothing has yet: time (UTC) and random digits."""
+    now = datetime.datetime.now(datetime.UTC)
+    return f"recordings/{benchmark_id or _PLAIN}/{now:%Y%m%dT%H%M%S}-{secrets.token_hex(6)}.mcap"
+
+
+def stored_already(connection: Connection, caller: Caller, digest: str) -> str | None:
+    """The name of the caller's recording with these bytes; None if there is none."""
+    own = select(FILE.c.path).where(FILE.c.created_by == caller.name, FILE.c.digest == digest)
+    found: str | None = connection.execute(own).scalar()
+    return found
+
+
+def register(
+    connection: Connection, caller: Caller, recording: Recording, name: str, digest: str
+) -> list[str]:
+    """Lists the episodes of a recording whose file is kept under `name`; returns the names of files to forget.
+
+    A recording that the caller has stored before, and that has grown since, takes the place of what was there:
+    its deleted episodes stay deleted, its published ones published.
+
+    Raises:
+        NotFoundError: its benchmark is not stored, or the caller may not read it.
+        ConflictError: episodes that are stored are not in it any more.
+        StorageError: it has no episodes.
+    """
+    caller.demand(Right.EPISODE_CREATE, caller.name)
+    numbers = {int(number) for number in recording.index["episode"]}
+    if not numbers:
+        raise StorageError("expected a recording with episodes, found one without any")
+    _demand_benchmark(connection, caller, recording.benchmark_id)
+    sidecar = Sidecar(uuid=recording.uuid)
+    own = select(FILE).where(FILE.c.created_by == caller.name, FILE.c.uuid == recording.uuid)
+    earlier = connection.execute(own).all()
+    for row in earlier:
+        sidecar.deleted |= set(json.loads(row.deleted))
+        for header in queries.find_episodes(connection, FilterEQ(key="recording", value=row.path)):
+            if header.episode not in numbers:
+                raise ConflictError(
+                    f"the recording {recording.uuid} is stored with episode {header.episode}, which this file lacks; "
+                    "delete what is stored first"
+                )
+            sidecar.published_in[header.episode] = header.published_in
+        _forget(connection, row.path)
+    audience(connection, [caller.name])
+    queries.put_recording(
+        connection,
+        name,
+        RecordingStamp(recording.size, 0, 0),
+        uuid=recording.uuid,
+        benchmark_id=recording.benchmark_id,
+        rows=rows_of(recording, sidecar, created_by=caller.name),
+        runs=runs_of(recording),
+    )
+    told = {"path": name, "created_by": caller.name, "uuid": recording.uuid, "digest": digest}
+    counts = {
+        "size": recording.size,
+        "episodes": len(numbers),
+        "deleted": json.dumps(sorted(sidecar.deleted)),
+    }
+    connection.execute(insert(FILE).values(**told, **counts))
+    audit(connection, caller.name, "store_recording", name)
+    return [row.path for row in earlier]
+
+
+def _demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) -> None:
+    if not benchmark_id:
+        return
+    seen = readable(caller, Right.BENCHMARK_READ, ITEM.c.created_by, ITEM.c.published_in)
+    there = select(ITEM.c.number).where(ITEM.c.kind == "benchmark", ITEM.c.id == benchmark_id, seen)
+    if not is_hash(benchmark_id) or not connection.execute(there).first():
+        raise NotFoundError(
+            f"there is no benchmark with id {benchmark_id[:80]!r}; list_benchmarks() names them all"
+        )
+
+
+# --- changing ---
+
+
+def publish(connection: Connection, caller: Caller, uri: str, group: str) -> None:
+    """Lets a group see the caller's own episode; done twice, nothing changes."""
+    header = _one(connection, caller, uri)
+    if header.created_by != caller.name:
+        raise DeniedError(f"episode {uri} is somebody else's; only its owner may publish it")
+    groups = published_in(header.published_in, group)
+    caller.demand(Right.EPISODE_CREATE, group)
+    _set_audience(connection, header, groups)
+    audit(connection, caller.name, "publish_episode", f"{uri} in {group}")
+
+
+def unpublish(connection: Connection, caller: Caller, uri: str, group: str) -> None:
+    """Takes an episode away from a group: the owner may, and who has the right to delete there."""
+    header = _one(connection, caller, uri)
+    if header.created_by != caller.name:
+        caller.demand(Right.EPISODE_DELETE, group)
+    _set_audience(connection, header, [name for name in header.published_in if name != group])
+    audit(connection, caller.name, "unpublish_episode", f"{uri} from {group}")
+
+
+def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
+    """Deletes the readable episodes that a filter is true of; returns how many, and the names of files to forget.
+
+    Raises:
+        DeniedError: one of them is somebody else's, and the caller has not the right; none is deleted then.
+    """
+    doomed: dict[str, set[int]] = {}
+    found = list(find_episodes(connection, caller, filter))
+    own = {header.id for header in found if header.created_by == caller.name}
+    for header in found:
+        if header.created_by != caller.name and not caller.may(Right.EPISODE_DELETE):
+            if header.id in own:  # somebody else has stored the same recording
+                continue
+            raise DeniedError(f"episode {header.id} is somebody else's; only its owner may delete it")
+        doomed.setdefault(header.recording, set()).add(header.episode)
+    empty = []
+    for path, numbers in doomed.items():
+        name = escape_text(path)
+        recording = connection.execute(select(RECORDING.c.id).where(RECORDING.c.path == name)).scalar_one()
+        of = and_(EPISODE.c.recording_id == recording, EPISODE.c.episode.in_(sorted(numbers)))
+        ids = select(EPISODE.c.id).where(of)
+        connection.execute(delete(VALUE).where(VALUE.c.episode_id.in_(ids)))
+        connection.execute(delete(EPISODE).where(of))
+        known = connection.execute(select(FILE.c.deleted).where(FILE.c.path == name)).scalar_one()
+        deleted = json.dumps(sorted({*json.loads(known), *numbers}))
+        connection.execute(update(FILE).where(FILE.c.path == name).values(deleted=deleted))
+        left = select(EPISODE.c.id).where(EPISODE.c.recording_id == recording).limit(1)
+        if not connection.execute(left).first():
+            _forget(connection, path)
+            empty.append(path)
+        audit(connection, caller.name, "delete_episodes", f"{path}: {', '.join(map(str, sorted(numbers)))}")
+    return sum(map(len, doomed.values())), empty
+
+
+def _one(connection: Connection, caller: Caller, uri: str) -> EpisodeHeader:
+    """A readable episode, the caller's own one first."""
+    found = sorted(
+        find_episodes(connection, caller, FilterEQ(key="id", value=uri)),
+        key=lambda header: header.created_by != caller.name,
+    )
+    if not found:
+        raise no_episode(uri)
+    return found[0]
+
+
+def no_episode(uri: str) -> NotFoundError:
+    """The error for an id that no readable episode has."""
+    return NotFoundError(f"there is no episode with id {str(uri)[:80]!r}; list_episodes() names them all")
+
+
+def _set_audience(connection: Connection, header: EpisodeHeader, groups: Sequence[str]) -> None:
+    of = select(RECORDING.c.id).where(RECORDING.c.path == escape_text(header.recording)).scalar_subquery()
+    row = and_(EPISODE.c.recording_id == of, EPISODE.c.episode == header.episode)
+    values: dict[str, Any] = {"published_in": audience(connection, groups)}
+    connection.execute(update(EPISODE).where(row).values(**values))
+
+
+def _forget(connection: Connection, path: str) -> None:
+    queries.remove_recording(connection, path)
+    connection.execute(delete(FILE).where(FILE.c.path == escape_text(path)))

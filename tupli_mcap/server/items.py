@@ -1,0 +1,275 @@
+"""Benchmarks and artifacts on a server. Every function works in a transaction of its caller's.
+
+What is stored twice by one user is one item. Two users who store the same content have one each, of which the other
+is told nothing.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any, Final, Literal
+
+from sqlalchemy import Connection, Row, Select, delete, insert, select, update
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.environment import sha256
+from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    ArtifactMetadataItem,
+    BaseFilter,
+    Benchmark,
+    BenchmarkHeader,
+    BenchmarkQuery,
+    compile_predicate,
+)
+from tupli_mcap.schema.times import time_ns
+from tupli_mcap.server.access import Caller, DeniedError, Right, readable
+from tupli_mcap.server.blobs import Blobs
+from tupli_mcap.server.database import audience, audit
+from tupli_mcap.server.tables import ITEM
+from tupli_mcap.storage.base import published_in
+from tupli_mcap.storage.benchmark_json import artifacts_of, plain, unpack
+from tupli_mcap.storage.benchmarks import document_of, name_in
+from tupli_mcap.storage.texts import is_hash
+
+__all__ = ["Items", "artifact_key"]
+
+Kind = Literal["benchmark", "artifact"]
+_CREATE: Final = {"benchmark": Right.BENCHMARK_CREATE, "artifact": Right.ARTIFACT_CREATE}
+_READ: Final = {"benchmark": Right.BENCHMARK_READ, "artifact": Right.ARTIFACT_READ}
+_DELETE: Final = {"benchmark": Right.BENCHMARK_DELETE, "artifact": Right.ARTIFACT_DELETE}
+
+
+class Items:
+    """The benchmarks and artifacts that a caller may see; bytes of artifacts lie in `blobs`."""
+
+    def __init__(self, blobs: Blobs) -> None:
+        self._blobs = blobs
+
+    # --- benchmarks ---
+
+    def store_benchmark(
+        self, connection: Connection, caller: Caller, query: BenchmarkQuery
+    ) -> BenchmarkHeader:
+        """As `TupliStorage.store_benchmark`."""
+        caller.demand(Right.BENCHMARK_CREATE, caller.name)
+        uri, document, _ = document_of(query)
+        own = self._own(connection, caller, "benchmark", uri)
+        if own is None:
+            needs: Sequence[str] = ()
+            if document.get("environment") is not None:
+                needs = artifacts_of(unpack(query.serialized).record, "the benchmark")
+            header = BenchmarkHeader.create_new(
+                id=uri,
+                hash=query.hash,
+                metadata=query.metadata,
+                created_by=caller.name,
+                environment=name_in(document),
+            )
+            own = self._add(connection, "benchmark", header, content=query.serialized, needs=needs)
+            audit(connection, caller.name, "store_benchmark", uri)
+        return _benchmark(own)
+
+    def load_benchmark(self, connection: Connection, caller: Caller, uri: str) -> Benchmark:
+        """As `TupliStorage.load_benchmark`; what may not be read is not there."""
+        row = self._find(connection, caller, "benchmark", uri)
+        content = connection.execute(select(ITEM.c.content).where(ITEM.c.number == row.number)).scalar_one()
+        return Benchmark(**dict(_benchmark(row)), serialized=content or "")
+
+    def list_benchmarks(
+        self, connection: Connection, caller: Caller, filter: BaseFilter | None
+    ) -> list[BenchmarkHeader]:
+        """The readable benchmarks that a filter is true of, oldest first."""
+        matches = compile_predicate(filter, BenchmarkHeader)
+        found = [_benchmark(row) for row in self._readable(connection, caller, "benchmark")]
+        return sorted((h for h in found if matches(h)), key=lambda h: (time_ns(h.created_at) or 0, h.id))
+
+    def delete_benchmark(self, connection: Connection, caller: Caller, uri: str) -> None:
+        """Deletes the caller's own benchmark, or with the right to, everybody's."""
+        self._delete(connection, caller, "benchmark", uri)
+
+    # --- artifacts ---
+
+    def store_artifact(
+        self, connection: Connection, caller: Caller, data: bytes, metadata: ArtifactMetadata
+    ) -> ArtifactMetadataItem:
+        """As `TupliStorage.store_artifact`."""
+        caller.demand(Right.ARTIFACT_CREATE, caller.name)
+        uri = sha256(data)
+        own = self._own(connection, caller, "artifact", uri)
+        if own is None:
+            item = ArtifactMetadataItem.create_new(**dict(metadata), id=uri, hash=uri, created_by=caller.name)
+            own = self._add(connection, "artifact", item)
+            self._blobs.write(artifact_key(uri), data)
+            audit(connection, caller.name, "store_artifact", uri)
+        return _artifact(own)
+
+    def load_artifact(self, connection: Connection, caller: Caller, uri: str) -> ArtifactMetadataItem:
+        """What is known of a readable artifact, whose bytes are under `artifact_key`."""
+        return _artifact(self._find(connection, caller, "artifact", uri))
+
+    def list_artifacts(
+        self, connection: Connection, caller: Caller, filter: BaseFilter | None
+    ) -> list[ArtifactMetadataItem]:
+        """The readable artifacts that a filter is true of, oldest first."""
+        matches = compile_predicate(filter, ArtifactMetadataItem)
+        found = [_artifact(row) for row in self._readable(connection, caller, "artifact")]
+        return sorted((i for i in found if matches(i)), key=lambda i: (time_ns(i.created_at) or 0, i.id))
+
+    def artifact_users(self, connection: Connection, caller: Caller, uri: str) -> list[str]:
+        """The ids of the readable benchmarks that need an artifact."""
+        return [
+            row.id for row in self._readable(connection, caller, "benchmark") if uri in json.loads(row.needs)
+        ]
+
+    def delete_artifact(self, connection: Connection, caller: Caller, uri: str, *, force: bool) -> None:
+        """Deletes the caller's own artifact, or with the right to, everybody's.
+
+        Raises:
+            StorageError: a benchmark of its owners needs it, and `force` is not given.
+        """
+        doomed = self._doomed(connection, caller, "artifact", uri)
+        owners = [row.created_by for row in doomed]
+        if not force:
+            of_owners = select(ITEM.c.id, ITEM.c.needs).where(
+                ITEM.c.kind == "benchmark", ITEM.c.created_by.in_(owners)
+            )
+            users = [row.id for row in connection.execute(of_owners) if uri in json.loads(row.needs)]
+            if users:
+                raise StorageError(
+                    f"artifact {uri} is needed by benchmark {', '.join(users)}; delete that first, "
+                    "or pass force=True"
+                )
+        self._delete(connection, caller, "artifact", uri)
+
+    # --- both ---
+
+    def publish(self, connection: Connection, caller: Caller, kind: Kind, uri: str, group: str) -> None:
+        """Lets a group see the caller's own item; done twice, nothing changes."""
+        row = self._owned(connection, caller, kind, uri)
+        groups = published_in(json.loads(row.published_in), group)
+        caller.demand(_CREATE[kind], group)
+        self._set_audience(connection, row, groups)
+        audit(connection, caller.name, f"publish_{kind}", f"{uri} in {group}")
+
+    def unpublish(self, connection: Connection, caller: Caller, kind: Kind, uri: str, group: str) -> None:
+        """Takes an item away from a group: the owner may, and who has the right to delete there."""
+        for row in self._visible(connection, caller, kind, uri):
+            groups = json.loads(row.published_in)
+            if row.created_by == caller.name or caller.may(_DELETE[kind], group):
+                if group in groups:
+                    self._set_audience(connection, row, [name for name in groups if name != group])
+                    audit(connection, caller.name, f"unpublish_{kind}", f"{uri} from {group}")
+                return
+        self._find(connection, caller, kind, uri)
+        raise DeniedError(f"Insufficient permissions in group: {group}. Required: {_DELETE[kind]}")
+
+    def _set_audience(self, connection: Connection, row: Row[Any], groups: list[str]) -> None:
+        text = audience(connection, groups)
+        connection.execute(update(ITEM).where(ITEM.c.number == row.number).values(published_in=text))
+
+    def _add(
+        self,
+        connection: Connection,
+        kind: Kind,
+        item: BenchmarkHeader | ArtifactMetadataItem,
+        *,
+        content: str | None = None,
+        needs: Sequence[str] = (),
+    ) -> Row[Any]:
+        header = plain(item)
+        row = {
+            "kind": kind,
+            "id": item.id,
+            "created_by": item.created_by,
+            "published_in": audience(connection, item.published_in),
+            "header": json.dumps(header),
+            "content": content,
+            "needs": json.dumps(list(needs)),
+        }
+        connection.execute(insert(ITEM).values(**row))
+        own = _COLUMNS.where(ITEM.c.kind == kind, ITEM.c.id == item.id, ITEM.c.created_by == item.created_by)
+        return connection.execute(own).one()
+
+    def _own(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> Row[Any] | None:
+        own = _COLUMNS.where(ITEM.c.kind == kind, ITEM.c.id == uri, ITEM.c.created_by == caller.name)
+        return connection.execute(own).first()
+
+    def _visible(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> list[Row[Any]]:
+        """The readable items of an id, the caller's own one first."""
+        if not is_hash(uri):
+            return []
+        seen = readable(caller, _READ[kind], ITEM.c.created_by, ITEM.c.published_in)
+        of_id = _COLUMNS.where(ITEM.c.kind == kind, ITEM.c.id == uri, seen).order_by(ITEM.c.number)
+        return sorted(connection.execute(of_id).all(), key=lambda row: row.created_by != caller.name)
+
+    def _find(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> Row[Any]:
+        found = self._visible(connection, caller, kind, uri)
+        if not found:
+            raise NotFoundError(
+                f"there is no {kind} with id {str(uri)[:80]!r}; list_{kind}s() names them all"
+            )
+        return found[0]
+
+    def _owned(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> Row[Any]:
+        row = self._find(connection, caller, kind, uri)
+        if row.created_by != caller.name:
+            raise DeniedError(f"{kind} {uri} is somebody else's; only its owner may publish it")
+        return row
+
+    def _readable(self, connection: Connection, caller: Caller, kind: Kind) -> list[Row[Any]]:
+        """One item for each readable id: the caller's own, or else the oldest."""
+        seen = readable(caller, _READ[kind], ITEM.c.created_by, ITEM.c.published_in)
+        rows = connection.execute(_COLUMNS.where(ITEM.c.kind == kind, seen).order_by(ITEM.c.number)).all()
+        chosen: dict[str, Row[Any]] = {}
+        for row in sorted(rows, key=lambda row: row.created_by != caller.name):
+            chosen.setdefault(row.id, row)
+        return list(chosen.values())
+
+    def _doomed(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> list[Row[Any]]:
+        """What a deletion takes: the caller's own item, or else with the right to, all of that id.
+
+        Raises:
+            NotFoundError: there is none, or none that the caller may know of.
+            DeniedError: it may be read, but not deleted.
+        """
+        own = self._own(connection, caller, kind, uri)
+        if own is not None:
+            return [own]
+        if caller.may(_DELETE[kind]):
+            everybody_s = _COLUMNS.where(ITEM.c.kind == kind, ITEM.c.id == uri)
+            found = list(connection.execute(everybody_s).all())
+            if found:
+                return found
+        self._find(connection, caller, kind, uri)
+        raise DeniedError(f"{kind} {uri} is somebody else's; only its owner may delete it")
+
+    def _delete(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> None:
+        for row in self._doomed(connection, caller, kind, uri):
+            connection.execute(delete(ITEM).where(ITEM.c.number == row.number))
+            audit(connection, caller.name, f"delete_{kind}", f"{uri} of {row.created_by}")
+
+
+_COLUMNS: Final[Select[Any]] = select(
+    ITEM.c.number, ITEM.c.id, ITEM.c.created_by, ITEM.c.published_in, ITEM.c.header, ITEM.c.needs
+)
+
+
+def artifact_key(uri: str) -> str:
+    """Where the bytes of an artifact lie."""
+    return f"artifacts/{uri}"
+
+
+def _benchmark(row: Row[Any]) -> BenchmarkHeader:
+    return BenchmarkHeader.model_validate(_header(row))
+
+
+def _artifact(row: Row[Any]) -> ArtifactMetadataItem:
+    return ArtifactMetadataItem.model_validate(_header(row))
+
+
+def _header(row: Row[Any]) -> dict[str, Any]:
+    told: dict[str, Any] = jsonvalue.loads(row.header)
+    return {**told, "published_in": json.loads(row.published_in)}

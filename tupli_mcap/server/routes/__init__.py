@@ -1,0 +1,8 @@
+"""The routes of a server, each a few lines over `Library`.
+
+callers      who asks, in what every route takes
+accounts     signing in, users, groups, roles, tokens
+items        benchmarks and artifacts
+episodes     episodes: listed, counted, published, deleted
+recordings   recordings: sent, fetched
+"""

@@ -1,0 +1,266 @@
+"""Signing in, users, groups, roles, and tokens of machines."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from fastapi import APIRouter, HTTPException, Request
+from pydantic import BaseModel, Field
+
+from tupli_mcap.server import accounts
+from tupli_mcap.server.access import Right
+from tupli_mcap.server.database import audit
+from tupli_mcap.server.routes.callers import AnyCaller, Reader, Served, Throttle, Writer
+from tupli_mcap.server.tokens import SignInError
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1", tags=["accounts"])
+_throttle = Throttle()
+
+
+class Credentials(BaseModel):
+    """A user's name and password."""
+
+    username: str
+    password: str
+
+
+class Refresh(BaseModel):
+    """The refresh token of the last answer."""
+
+    refresh_token: str
+
+
+class TokenPair(BaseModel):
+    """An access token, valid for `expires_in` seconds, and the token that is exchanged for the next pair."""
+
+    access_token: str
+    refresh_token: str
+    token_type: str
+    expires_in: int
+
+
+class User(BaseModel):
+    """A user, and the roles held in each group."""
+
+    username: str
+    memberships: dict[str, list[str]]
+
+
+class Password(BaseModel):
+    """A new password; `old` is needed to change one's own."""
+
+    password: str
+    old: str | None = None
+
+
+class Group(BaseModel):
+    """A group of users."""
+
+    name: str
+    description: str | None = None
+
+
+class Member(BaseModel):
+    """A user in a group."""
+
+    user: str
+    roles: list[str] = Field(default_factory=lambda: ["member"])
+
+
+class GroupWithMembers(Group):
+    """A group, and who is in it as far as the caller may know."""
+
+    members: list[Member]
+
+
+class Role(BaseModel):
+    """A role and the rights that it gives."""
+
+    role: str
+    rights: list[Right]
+    description: str | None = None
+
+
+class NewToken(BaseModel):
+    """A token for a machine: what it is called, `read` or `write`, and for how many days (None: for ever)."""
+
+    name: str
+    scope: str = "read"
+    days: int | None = Field(default=90, ge=1, le=3650)
+
+
+@router.post("/tokens")
+def sign_in(library: Served, request: Request, told: Credentials) -> TokenPair:
+    """Signs in."""
+    keys = (f"user {told.username[:80]}", f"address {request.client.host if request.client else ''}")
+    wait = _throttle.wait(*keys)
+    if wait > 0:
+        after = {"Retry-After": str(math.ceil(wait))}
+        raise HTTPException(429, "too many failed attempts; wait a minute", after)
+    with library.database.writing() as connection:
+        if accounts.verify_password(connection, told.username, told.password):
+            return TokenPair(**library.tokens.pair(connection, told.username))
+    _throttle.failed(*keys)
+    raise SignInError("Incorrect username or password")
+
+
+@router.post("/tokens/refresh")
+def refresh(library: Served, told: Refresh) -> TokenPair:
+    """Exchanges a refresh token for a new pair; each can be used once."""
+    with library.database.writing() as connection:
+        pair = library.tokens.refreshed(connection, told.refresh_token)
+    if pair is None:
+        raise SignInError("the refresh token was used before: this sign-in is ended; sign in again")
+    return TokenPair(**pair)
+
+
+@router.post("/tokens/end")
+def sign_out(library: Served, told: Refresh) -> None:
+    """Ends the sign-in of a refresh token."""
+    with library.database.writing() as connection:
+        library.tokens.end(connection, told.refresh_token)
+
+
+@router.get("/me")
+def who_am_i(library: Served, caller: Reader) -> User:
+    """The caller."""
+    if caller.is_guest:
+        return User(username=caller.name, memberships={"global": ["guest"]})
+    with library.database.reading() as connection:
+        return User(username=caller.name, memberships=accounts.memberships_of(connection, caller.name))
+
+
+@router.post("/users")
+def create_user(library: Served, caller: AnyCaller, told: Credentials) -> User:
+    """Makes a user: everybody may where the server is open to sign-ups, else who has the right to."""
+    if not library.settings.open_signup:
+        caller.demand(Right.USER_CREATE)
+    with library.database.writing() as connection:
+        accounts.create_user(connection, told.username, told.password)
+        audit(connection, caller.name, "create_user", told.username)
+        return User(username=told.username, memberships=accounts.memberships_of(connection, told.username))
+
+
+@router.get("/users")
+def list_users(library: Served, caller: Reader) -> list[User]:
+    """All users."""
+    caller.demand(Right.USER_READ)
+    with library.database.reading() as connection:
+        return [
+            User(username=name, memberships=accounts.memberships_of(connection, name))
+            for name in accounts.list_users(connection)
+        ]
+
+
+@router.delete("/users/{username}")
+def delete_user(library: Served, caller: Writer, username: str) -> None:
+    """Deletes a user; the name stays taken, and what they made stays."""
+    caller.demand(Right.USER_DELETE, username)
+    with library.database.writing() as connection:
+        accounts.delete_user(connection, username)
+        audit(connection, caller.name, "delete_user", username)
+
+
+@router.put("/users/{username}/password")
+def change_password(library: Served, caller: Writer, username: str, told: Password) -> None:
+    """Changes a password, and ends everything that was signed in with the old one."""
+    caller.demand(Right.USER_UPDATE, username)
+    with library.database.writing() as connection:
+        if username == caller.name and not accounts.verify_password(connection, username, told.old or ""):
+            raise SignInError("the old password is not right")
+        accounts.change_password(connection, username, told.password)
+        audit(connection, caller.name, "change_password", username)
+
+
+@router.post("/groups")
+def create_group(library: Served, caller: Writer, told: Group) -> Group:
+    """Makes a group that the caller leads."""
+    with library.database.writing() as connection:
+        accounts.create_group(connection, caller, told.name, told.description)
+    return told
+
+
+@router.get("/groups")
+def list_groups(library: Served, caller: Reader) -> list[Group]:
+    """The groups that the caller may know of."""
+    with library.database.reading() as connection:
+        return [Group(**group) for group in accounts.list_groups(connection, caller)]  # type: ignore[arg-type]
+
+
+@router.get("/groups/{name}")
+def read_group(library: Served, caller: Reader, name: str) -> GroupWithMembers:
+    """A group and its members."""
+    with library.database.reading() as connection:
+        return GroupWithMembers.model_validate(accounts.members_of(connection, caller, name))
+
+
+@router.delete("/groups/{name}")
+def delete_group(library: Served, caller: Writer, name: str) -> None:
+    """Deletes a group; its name stays taken."""
+    with library.database.writing() as connection:
+        accounts.delete_group(connection, caller, name)
+
+
+@router.put("/groups/{name}/members")
+def add_members(library: Served, caller: Writer, name: str, told: list[Member]) -> GroupWithMembers:
+    """Gives users roles in a group: all of them, or none."""
+    with library.database.writing() as connection:
+        for member in told:
+            accounts.add_member(connection, caller, name, member.user, member.roles)
+        return GroupWithMembers.model_validate(accounts.members_of(connection, caller, name))
+
+
+@router.delete("/groups/{name}/members/{user}")
+def remove_member(library: Served, caller: Writer, name: str, user: str) -> None:
+    """Takes a user out of a group."""
+    with library.database.writing() as connection:
+        accounts.remove_member(connection, caller, name, user)
+
+
+@router.post("/roles")
+def create_role(library: Served, caller: Writer, told: Role) -> Role:
+    """Makes a role."""
+    with library.database.writing() as connection:
+        accounts.create_role(connection, caller, told.role, told.rights, told.description)
+    return told
+
+
+@router.get("/roles")
+def list_roles(library: Served, caller: Reader) -> list[Role]:
+    """All roles."""
+    caller.demand(Right.ROLE_MANAGEMENT)
+    with library.database.reading() as connection:
+        return [Role.model_validate(role) for role in accounts.list_roles(connection)]
+
+
+@router.delete("/roles/{role}")
+def delete_role(library: Served, caller: Writer, role: str) -> None:
+    """Deletes a role, wherever it was given."""
+    with library.database.writing() as connection:
+        accounts.delete_role(connection, caller, role)
+
+
+@router.post("/api-tokens")
+def create_api_token(library: Served, caller: Writer, told: NewToken) -> dict[str, Any]:
+    """Makes a token for a machine; it is shown this once."""
+    with library.database.writing() as connection:
+        audit(connection, caller.name, "create_api_token", told.name)
+        return library.tokens.create_api_token(connection, caller, told.name, told.scope, told.days)
+
+
+@router.get("/api-tokens")
+def list_api_tokens(library: Served, caller: Writer) -> list[dict[str, Any]]:
+    """The caller's tokens for machines."""
+    with library.database.reading() as connection:
+        return library.tokens.list_api_tokens(connection, caller)
+
+
+@router.delete("/api-tokens/{token}")
+def delete_api_token(library: Served, caller: Writer, token: str) -> None:
+    """Revokes a token for a machine."""
+    with library.database.writing() as connection:
+        library.tokens.delete_api_token(connection, caller, token)
+        audit(connection, caller.name, "delete_api_token", token)

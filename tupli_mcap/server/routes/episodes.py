@@ -1,0 +1,106 @@
+"""Episodes: listed, counted, published, deleted."""
+
+from __future__ import annotations
+
+import base64
+import json
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Response
+from pydantic import BaseModel
+
+from tupli_mcap.errors import StorageError
+from tupli_mcap.schema import BaseFilter, FilterEQ
+from tupli_mcap.server import episodes
+from tupli_mcap.server.routes.callers import Reader, Served, Writer
+from tupli_mcap.server.wire import Found, Listing, answer, listed
+from tupli_mcap.storage.catalog import queries
+from tupli_mcap.storage.catalog.queries import After
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1/episodes", tags=["episodes"])
+
+
+class Chosen(BaseModel):
+    """What to count or delete: all that a filter is true of."""
+
+    filter: BaseFilter | None = None
+
+
+class Key(BaseModel):
+    """A key of episodes' metadata, such as `metadata.score`."""
+
+    key: str
+
+
+@router.post("/list", response_model=Found)
+def list_episodes(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
+    """The episodes that a filter is true of, in the order of their recordings, a page at a time."""
+    most = library.settings.max_page
+    size = most if told.limit is None else min(told.limit, most)
+    with library.database.reading() as connection:
+        found = list(
+            episodes.find_episodes(
+                connection, caller, told.filter, limit=size, offset=told.offset, after=_after(told.cursor)
+            )
+        )
+    full = len(found) == size and size > 0
+    return listed(found, _cursor(found[-1].recording, found[-1].episode) if full else None)
+
+
+@router.post("/count")
+def count_episodes(library: Served, caller: Reader, told: Annotated[Chosen, Body()]) -> int:
+    """How many episodes a filter is true of."""
+    with library.database.reading() as connection:
+        return episodes.count_episodes(connection, caller, told.filter)
+
+
+@router.post("/delete")
+def delete_episodes(library: Served, caller: Writer, told: Annotated[Chosen, Body()]) -> Response:
+    """Deletes the episodes that a filter is true of; `{"episodes": how many}`."""
+    if told.filter is None:
+        raise StorageError("expected a filter that says which episodes to delete")
+    return answer({"episodes": library.delete_episodes(caller, told.filter)})
+
+
+@router.post("/keys")
+def declare_key(library: Served, caller: Writer, told: Key) -> None:
+    """Indexes a key, so that filters on it stay fast."""
+    with library.database.writing() as connection:
+        queries.declare_key(connection, told.key)
+
+
+@router.delete("/{uri}")
+def delete_episode(library: Served, caller: Writer, uri: str) -> None:
+    """Deletes one episode."""
+    if not library.delete_episodes(caller, FilterEQ(key="id", value=uri)):
+        raise episodes.no_episode(uri)
+
+
+@router.put("/{uri}/published")
+def publish_episode(library: Served, caller: Writer, uri: str, group: str) -> None:
+    """Lets a group see an episode."""
+    with library.database.writing() as connection:
+        episodes.publish(connection, caller, uri, group)
+
+
+@router.delete("/{uri}/published")
+def unpublish_episode(library: Served, caller: Writer, uri: str, group: str) -> None:
+    """Takes an episode away from a group."""
+    with library.database.writing() as connection:
+        episodes.unpublish(connection, caller, uri, group)
+
+
+def _cursor(recording: str, episode: int) -> str:
+    return base64.urlsafe_b64encode(json.dumps([recording, episode]).encode()).decode()
+
+
+def _after(cursor: str | None) -> After | None:
+    if cursor is None:
+        return None
+    try:
+        recording, episode = json.loads(base64.urlsafe_b64decode(cursor))
+        return After(str(recording), int(episode))
+    except (ValueError, TypeError) as err:
+        raise StorageError("expected the cursor of the page before; list from the beginning") from err

@@ -1,0 +1,138 @@
+"""Benchmarks and artifacts."""
+
+from __future__ import annotations
+
+import base64
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Header, Request, Response
+from fastapi.responses import FileResponse
+from pydantic import ValidationError
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import StorageError
+from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery, FilterEQ
+from tupli_mcap.server.items import artifact_key
+from tupli_mcap.server.routes.callers import Reader, Served, Writer
+from tupli_mcap.server.wire import Found, Listing, answer, listed
+from tupli_mcap.storage.benchmark_json import restored
+from tupli_mcap.storage.texts import first_defect
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1", tags=["benchmarks and artifacts"])
+
+
+@router.post("/benchmarks")
+def store_benchmark(library: Served, caller: Writer, told: BenchmarkQuery) -> Response:
+    """Stores a benchmark, unless the caller has it already; answers with its header."""
+    metadata = BenchmarkMetadata.model_validate(restored(told.metadata.model_dump()))
+    query = told.model_copy(update={"metadata": metadata})
+    with library.database.writing() as connection:
+        return answer(library.items.store_benchmark(connection, caller, query))
+
+
+@router.post("/benchmarks/list", response_model=Found)
+def list_benchmarks(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
+    """The benchmarks that a filter is true of, oldest first."""
+    with library.database.reading() as connection:
+        found = library.items.list_benchmarks(connection, caller, told.filter)
+    stop = None if told.limit is None else told.offset + told.limit
+    return listed(found[told.offset : stop])
+
+
+@router.get("/benchmarks/{uri}")
+def load_benchmark(library: Served, caller: Reader, uri: str) -> Response:
+    """A benchmark with its environment as text."""
+    with library.database.reading() as connection:
+        return answer(library.items.load_benchmark(connection, caller, uri))
+
+
+@router.delete("/benchmarks/{uri}")
+def delete_benchmark(library: Served, caller: Writer, uri: str, episodes: bool = False) -> Response:
+    """Deletes a benchmark, and with `episodes` the caller's episodes of it too; `{"episodes": how many}`."""
+    with library.database.writing() as connection:
+        library.items.delete_benchmark(connection, caller, uri)
+    count = 0
+    if episodes:
+        own = FilterEQ(key="benchmark_id", value=uri) & FilterEQ(key="created_by", value=caller.name)
+        count = library.delete_episodes(caller, own)
+    return answer({"episodes": count})
+
+
+@router.put("/benchmarks/{uri}/published")
+def publish_benchmark(library: Served, caller: Writer, uri: str, group: str) -> None:
+    """Lets a group see a benchmark."""
+    with library.database.writing() as connection:
+        library.items.publish(connection, caller, "benchmark", uri, group)
+
+
+@router.delete("/benchmarks/{uri}/published")
+def unpublish_benchmark(library: Served, caller: Writer, uri: str, group: str) -> None:
+    """Takes a benchmark away from a group."""
+    with library.database.writing() as connection:
+        library.items.unpublish(connection, caller, "benchmark", uri, group)
+
+
+@router.post("/artifacts")
+async def store_artifact(
+    library: Served,
+    caller: Writer,
+    request: Request,
+    metadata: Annotated[str, Header(alias="Artifact-Metadata", description="JSON in base64")],
+) -> Response:
+    """Stores the bytes of the body, unless the caller has them already; answers with what is known of them."""
+    try:
+        told = ArtifactMetadata.model_validate(jsonvalue.loads(base64.b64decode(metadata)))
+    except ValidationError as err:
+        raise StorageError(f"expected the metadata of an artifact: {first_defect(err)}") from err
+    except ValueError as err:
+        raise StorageError(f"expected the metadata of an artifact as JSON in base64: {err}") from err
+    data = await request.body()
+    with library.database.writing() as connection:
+        return answer(library.items.store_artifact(connection, caller, data, told))
+
+
+@router.post("/artifacts/list", response_model=Found)
+def list_artifacts(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
+    """The artifacts that a filter is true of, oldest first."""
+    with library.database.reading() as connection:
+        found = library.items.list_artifacts(connection, caller, told.filter)
+    stop = None if told.limit is None else told.offset + told.limit
+    return listed(found[told.offset : stop])
+
+
+@router.get("/artifacts/{uri}")
+def load_artifact(library: Served, caller: Reader, uri: str) -> FileResponse:
+    """The bytes of an artifact; their SHA-256 is the `ETag`."""
+    with library.database.reading() as connection:
+        item = library.items.load_artifact(connection, caller, uri)
+    path = library.path_of(artifact_key(item.id))
+    return FileResponse(path, media_type="application/octet-stream", headers={"ETag": f'"{item.id}"'})
+
+
+@router.get("/artifacts/{uri}/users")
+def artifact_users(library: Served, caller: Reader, uri: str) -> list[str]:
+    """The ids of the benchmarks that need an artifact."""
+    with library.database.reading() as connection:
+        return library.items.artifact_users(connection, caller, uri)
+
+
+@router.delete("/artifacts/{uri}")
+def delete_artifact(library: Served, caller: Writer, uri: str, force: bool = False) -> None:
+    """Deletes an artifact; with `force` even one that a benchmark needs."""
+    library.delete_artifact(caller, uri, force=force)
+
+
+@router.put("/artifacts/{uri}/published")
+def publish_artifact(library: Served, caller: Writer, uri: str, group: str) -> None:
+    """Lets a group see an artifact."""
+    with library.database.writing() as connection:
+        library.items.publish(connection, caller, "artifact", uri, group)
+
+
+@router.delete("/artifacts/{uri}/published")
+def unpublish_artifact(library: Served, caller: Writer, uri: str, group: str) -> None:
+    """Takes an artifact away from a group."""
+    with library.database.writing() as connection:
+        library.items.unpublish(connection, caller, "artifact", uri, group)

@@ -1,0 +1,199 @@
+"""Recordings: sent as files (tus 1.0), fetched whole, in ranges, or cut to what the caller may read."""
+
+from __future__ import annotations
+
+import base64
+import os
+import tempfile
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated
+from urllib.parse import quote
+
+from fastapi import APIRouter, Body, Header, HTTPException, Query, Request, Response
+from fastapi.responses import FileResponse
+from pydantic import BaseModel
+from starlette.background import BackgroundTask
+from starlette.concurrency import run_in_threadpool
+
+from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.recording import Recording, rewrite_recording
+from tupli_mcap.schema import FilterEQ
+from tupli_mcap.server import accounts, episodes
+from tupli_mcap.server.access import Right
+from tupli_mcap.server.library import Library
+from tupli_mcap.server.routes.callers import Reader, Served, Writer
+from tupli_mcap.server.tokens import SignInError
+from tupli_mcap.server.uploads import Upload
+from tupli_mcap.storage.texts import is_hash
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1", tags=["recordings"])
+_TUS = {"Tus-Resumable": "1.0.0"}
+_MEDIA = "application/octet-stream"
+
+
+class Named(BaseModel):
+    """A recording by the name that the headers of its episodes give."""
+
+    recording: str
+
+
+class Ticket(BaseModel):
+    """Where a recording can be read without signing in, for a while; not `whole` if some of it may not be read."""
+
+    path: str
+    whole: bool
+    digest: str
+    size: int
+
+
+# --- sending ---
+
+
+@router.post("/uploads", status_code=201)
+def begin_upload(
+    library: Served,
+    caller: Writer,
+    upload_length: Annotated[int, Header(ge=1)],
+    upload_metadata: Annotated[str, Header(description="`sha256` and the hex digits in base64")],
+) -> Response:
+    """Begins an upload, or goes on with the one of the same bytes; says where if they are stored already."""
+    caller.demand(Right.EPISODE_CREATE, caller.name)
+    if upload_length > library.settings.max_upload:
+        raise HTTPException(
+            413, f"expected at most {library.settings.max_upload} bytes, found {upload_length}"
+        )
+    digest = _digest(upload_metadata)
+    with library.database.reading() as connection:
+        known = episodes.stored_already(connection, caller, digest)
+    if known is not None:
+        return Response(status_code=200, headers={**_TUS, "Recording": known})
+    upload = library.uploads.begin(caller, upload_length, digest)
+    told = {**_TUS, "Location": f"/v1/uploads/{upload.id}", "Upload-Offset": str(upload.offset)}
+    return Response(status_code=201, headers=told)
+
+
+@router.head("/uploads/{upload_id}")
+def ask_upload(library: Served, caller: Writer, upload_id: str) -> Response:
+    """How much of an upload has come."""
+    upload = library.uploads.find(caller, upload_id)
+    told = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length)}
+    return Response(headers={**_TUS, **told, "Cache-Control": "no-store"})
+
+
+@router.patch("/uploads/{upload_id}", status_code=204)
+async def go_on_with_upload(
+    library: Served,
+    caller: Writer,
+    request: Request,
+    upload_id: str,
+    upload_offset: Annotated[int, Header(ge=0)],
+) -> Response:
+    """Adds bytes to an upload. With the last ones it is stored, and `Recording` is its name."""
+    upload = library.uploads.find(caller, upload_id)
+    with library.uploads.alone(upload):
+        if upload.offset != upload_offset:
+            raise HTTPException(
+                409, f"expected bytes from {upload.offset} on", {"Upload-Offset": str(upload.offset)}
+            )
+        await _append(upload, request.stream())
+        told = {**_TUS, "Upload-Offset": str(upload.offset)}
+        if upload.offset == upload.length:
+            told["Upload-Offset"] = str(upload.length)
+            told["Recording"] = await run_in_threadpool(library.take_in, caller, upload)
+    return Response(status_code=204, headers=told)
+
+
+@router.delete("/uploads/{upload_id}", status_code=204)
+def end_upload(library: Served, caller: Writer, upload_id: str) -> Response:
+    """Forgets an upload."""
+    library.uploads.forget(library.uploads.find(caller, upload_id))
+    return Response(status_code=204, headers=_TUS)
+
+
+async def _append(upload: Upload, pieces: AsyncIterator[bytes]) -> None:
+    room = upload.length - upload.offset
+    with upload.path.open("ab") as file:
+        async for piece in pieces:
+            room -= len(piece)
+            if room < 0:
+                raise HTTPException(413, f"expected {upload.length} bytes in all, found more")
+            file.write(piece)
+
+
+def _digest(metadata: str) -> str:
+    for pair in metadata.split(","):
+        key, _, value = pair.strip().partition(" ")
+        if key == "sha256":
+            try:
+                found = base64.b64decode(value, validate=True).decode("ascii")
+            except ValueError:
+                break
+            if is_hash(found):
+                return found
+    raise StorageError("expected Upload-Metadata with `sha256`: 64 lower-case hex digits, in base64")
+
+
+# --- fetching ---
+
+
+@router.post("/tickets")
+def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body()]) -> Ticket:
+    """An address at which programs that cannot sign in may read a recording for a while."""
+    with library.database.reading() as connection:
+        found = episodes.file_of(connection, caller, told.recording)
+    ticket = library.tokens.ticket(caller.name, found.name)
+    path = f"/v1/files/{quote(found.name)}?ticket={ticket}"
+    return Ticket(path=path, whole=found.whole, digest=found.digest, size=found.size)
+
+
+@router.get("/files/{name:path}")
+@router.head("/files/{name:path}")
+def read_recording(
+    library: Served,
+    name: str,
+    ticket: Annotated[str, Query()],
+    request: Request,
+) -> Response:
+    """The bytes of a recording, or ranges of them; their SHA-256 is the `ETag`, and `If-Match` is heeded.
+
+    Where some episodes may not be read by who was given the ticket, a recording of the others is made.
+    """
+    user = library.tokens.user_of_ticket(ticket, name)
+    with library.database.reading() as connection:
+        caller = accounts.caller_named(connection, user) or accounts.guest(connection)
+        if caller.is_guest and not library.settings.guests:
+            raise SignInError("the ticket is not valid any more")
+        found = episodes.file_of(connection, caller, name)
+        kept = [
+            header.episode
+            for header in episodes.find_episodes(connection, caller, FilterEQ(key="recording", value=name))
+        ]
+    file_name = name.rpartition("/")[2]
+    if not found.whole:
+        path = _cut(library, name, kept)
+        return FileResponse(
+            path, media_type=_MEDIA, filename=file_name, background=BackgroundTask(os.unlink, path)
+        )
+    tag = f'"{found.digest}"'
+    wanted = request.headers.get("If-Match")
+    if wanted is not None and wanted.strip() != "*" and tag not in [t.strip() for t in wanted.split(",")]:
+        raise HTTPException(412, "the recording has changed; open it again")
+    return FileResponse(library.path_of(name), media_type=_MEDIA, filename=file_name, headers={"ETag": tag})
+
+
+def _cut(library: Library, name: str, kept: list[int]) -> Path:
+    """A temporary recording of some episodes of another one."""
+    directory = library.settings.own / "cuts"
+    directory.mkdir(parents=True, exist_ok=True)
+    handle, text = tempfile.mkstemp(suffix=".mcap", dir=directory)
+    os.close(handle)
+    path = Path(text)
+    path.unlink()
+    with Recording(library.blobs.place(name)) as recording:
+        if not set(kept) & {int(number) for number in recording.index["episode"]}:
+            raise NotFoundError(f"there is no recording {name[:200]!r}")
+        rewrite_recording(recording, path, episodes=kept)
+    return path

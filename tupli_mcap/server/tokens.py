@@ -1,0 +1,181 @@
+"""Tokens: what a signed-in user, a machine, or the address of one recording proves itself with.
+
+access    short-lived, signed (JWT), void after a change of the password
+refresh   kept as a digest, used once for a new pair; used twice, the whole sign-in is ended
+API       kept as a digest, for machines: reading, or reading and writing
+ticket    signed, for one recording
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import secrets
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import jwt
+from sqlalchemy import Connection, delete, insert, or_, select, update
+
+from tupli_mcap import files
+from tupli_mcap.errors import NotFoundError, StorageError, TupliError
+from tupli_mcap.server.access import Caller
+from tupli_mcap.server.accounts import caller_named
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.tables import API_TOKEN, REFRESH_TOKEN, USER
+
+__all__ = ["SignInError", "Tokens"]
+
+_API_PREFIX: Final = "tmcap_"
+_ALGORITHM: Final = "HS256"
+
+
+class SignInError(TupliError):
+    """A token or a password is not valid."""
+
+
+class Tokens:
+    """Makes tokens and says whose they are. Every method works in a transaction of its caller's."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._secret = _secret(settings.own / "secret")
+
+    def pair(self, connection: Connection, user: str, family: str = "") -> dict[str, Any]:
+        """An access token and the refresh token for the next, as OAuth 2 names them."""
+        epoch = connection.execute(select(USER.c.epoch).where(USER.c.name == user)).scalar_one()
+        refresh = secrets.token_urlsafe(32)
+        now = int(time.time())
+        connection.execute(delete(REFRESH_TOKEN).where(REFRESH_TOKEN.c.expires < now))
+        row = {"digest": _digest(refresh), "user": user, "family": family or secrets.token_hex(16)}
+        expires = now + self._settings.refresh_seconds
+        connection.execute(insert(REFRESH_TOKEN).values(**row, used=False, expires=expires))
+        return {
+            "access_token": self._signed("access", self._settings.access_seconds, sub=user, epoch=epoch),
+            "refresh_token": refresh,
+            "token_type": "bearer",
+            "expires_in": self._settings.access_seconds,
+        }
+
+    def refreshed(self, connection: Connection, refresh: str) -> dict[str, Any] | None:
+        """A new pair for a refresh token; None if that was used before, which ends the whole sign-in.
+
+        Raises:
+            SignInError: it is none, or has expired.
+        """
+        table = REFRESH_TOKEN
+        found = connection.execute(select(table).where(table.c.digest == _digest(refresh))).first()
+        if found is None or found.expires < time.time():
+            raise SignInError("the refresh token is not valid; sign in again")
+        first = update(table).where(table.c.digest == found.digest, table.c.used.is_(False)).values(used=True)
+        if not connection.execute(first).rowcount:
+            connection.execute(delete(table).where(table.c.family == found.family))
+            return None
+        return self.pair(connection, found.user, found.family)
+
+    def end(self, connection: Connection, refresh: str) -> None:
+        """Ends the sign-in of a refresh token; nothing happens if it is none."""
+        table = REFRESH_TOKEN
+        family = select(table.c.family).where(table.c.digest == _digest(refresh)).scalar_subquery()
+        connection.execute(delete(table).where(table.c.family == family))
+
+    def caller(self, connection: Connection, token: str) -> Caller:
+        """Whose access or API token it is.
+
+        Raises:
+            SignInError: it is none, has expired, or was revoked.
+        """
+        if token.startswith(_API_PREFIX):
+            return _of_api_token(connection, token)
+        told = self._told(token, "access")
+        epoch = connection.execute(select(USER.c.epoch).where(USER.c.name == told.get("sub"))).scalar()
+        caller = (
+            None if epoch is None or epoch != told.get("epoch") else caller_named(connection, told["sub"])
+        )
+        if caller is None:
+            raise SignInError("the access token is not valid any more; sign in again")
+        return caller
+
+    # --- tokens of machines ---
+
+    def create_api_token(
+        self, connection: Connection, caller: Caller, name: str, scope: str, days: int | None
+    ) -> dict[str, Any]:
+        """A token for a machine, shown this once: `id`, `token`, `name`, `scope`."""
+        if scope not in ("read", "write") or not name.isprintable() or not 1 <= len(name) <= 100:
+            raise StorageError("expected a name, and the scope 'read' or 'write'")
+        token, number = _API_PREFIX + secrets.token_urlsafe(32), secrets.token_hex(8)
+        now = int(time.time())
+        row = {"id": number, "digest": _digest(token), "user": caller.name, "name": name, "scope": scope}
+        expires = None if days is None else now + days * 24 * 3600
+        connection.execute(insert(API_TOKEN).values(**row, created_at=now, expires=expires))
+        return {"id": number, "token": token, "name": name, "scope": scope}
+
+    def list_api_tokens(self, connection: Connection, caller: Caller) -> list[dict[str, Any]]:
+        """The caller's tokens for machines, without the tokens themselves."""
+        table = API_TOKEN
+        columns = (table.c.id, table.c.name, table.c.scope, table.c.created_at, table.c.expires)
+        rows = connection.execute(select(*columns).where(table.c.user == caller.name))
+        return [dict(row._mapping) for row in rows]
+
+    def delete_api_token(self, connection: Connection, caller: Caller, number: str) -> None:
+        """Revokes one of the caller's tokens.
+
+        Raises:
+            NotFoundError: there is no such token of theirs.
+        """
+        own = (API_TOKEN.c.id == number, API_TOKEN.c.user == caller.name)
+        if not connection.execute(delete(API_TOKEN).where(*own)).rowcount:
+            raise NotFoundError("there is no such token")
+
+    # --- tickets ---
+
+    def ticket(self, user: str, recording: str) -> str:
+        """What opens one recording, as this user may read it, for as long as the settings say."""
+        return self._signed("ticket", self._settings.ticket_seconds, sub=user, recording=recording)
+
+    def user_of_ticket(self, ticket: str, recording: str) -> str:
+        """Who was given a ticket. Raises SignInError if it is none for this recording, or has expired."""
+        told = self._told(ticket, "ticket")
+        if told.get("recording") != recording:
+            raise SignInError("the ticket is for another recording; open it again")
+        return str(told.get("sub"))
+
+    def _signed(self, kind: str, seconds: int, **told: Any) -> str:
+        return jwt.encode(
+            {"typ": kind, "exp": int(time.time()) + seconds, **told}, self._secret, algorithm=_ALGORITHM
+        )
+
+    def _told(self, token: str, kind: str) -> dict[str, Any]:
+        try:
+            told: dict[str, Any] = jwt.decode(
+                token, self._secret, algorithms=[_ALGORITHM], options={"require": ["exp", "typ", "sub"]}
+            )
+        except jwt.PyJWTError:
+            raise SignInError("the token is not valid, or has expired; sign in again") from None
+        if told["typ"] != kind:
+            raise SignInError(f"expected an {kind} token, found another kind")
+        return told
+
+
+def _of_api_token(connection: Connection, token: str) -> Caller:
+    table = API_TOKEN
+    valid = or_(table.c.expires.is_(None), table.c.expires > int(time.time()))
+    found = connection.execute(select(table).where(table.c.digest == _digest(token), valid)).first()
+    caller = None if found is None else caller_named(connection, found.user, may_write=found.scope == "write")
+    if caller is None:
+        raise SignInError("the API token is not valid, or has expired; make another one")
+    return caller
+
+
+def _digest(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+def _secret(path: Path) -> bytes:
+    """What tokens are signed with, made at the first start."""
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with contextlib.suppress(FileExistsError):
+        files.write_bytes(path, secrets.token_bytes(32), overwrite=False, permissions=0o600)
+    return path.read_bytes()

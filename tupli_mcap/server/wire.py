@@ -1,0 +1,83 @@
+"""What goes over the wire: requests as models, answers as JSON, and errors as the status that clients expect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Final
+
+from fastapi import FastAPI, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import FilterError, FormatError, NotFoundError, SpaceError, StorageError, TupliError
+from tupli_mcap.schema import BaseFilter
+from tupli_mcap.server.access import DeniedError
+from tupli_mcap.server.accounts import ConflictError
+from tupli_mcap.server.tokens import SignInError
+
+__all__ = ["Error", "Found", "Listing", "answer", "listed", "tell_errors"]
+
+_STATUS: Final[dict[type[TupliError], int]] = {
+    SignInError: 401,
+    DeniedError: 403,
+    NotFoundError: 404,
+    ConflictError: 409,
+    FilterError: 400,
+    SpaceError: 400,
+    FormatError: 400,
+    StorageError: 400,
+}
+
+
+class Error(BaseModel):
+    """Why a request was refused; `error` is the class of the error that a `TupliStorage` would raise."""
+
+    detail: str
+    error: str
+
+
+class Listing(BaseModel):
+    """What to list: a filter, and which page of what it is true of. `cursor` is the `next` of the page before."""
+
+    filter: BaseFilter | None = None
+    limit: int | None = Field(default=None, ge=0)
+    offset: int = Field(default=0, ge=0)
+    cursor: str | None = None
+
+
+class Found(BaseModel):
+    """A page of what was asked for; `next` is the cursor of the one after it, None on the last."""
+
+    items: list[dict[str, Any]]
+    next: str | None = None
+
+
+def answer(value: Any) -> Response:
+    """A JSON answer; models as what they hold. Numbers that JSON lacks are tagged, as in our files."""
+    return Response(jsonvalue.dumps(_as_json(value)), media_type="application/json")
+
+
+def listed(items: Iterable[BaseModel], following: str | None = None) -> Response:
+    """A page of items."""
+    return answer({"items": list(items), "next": following})
+
+
+def _as_json(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump()
+    if isinstance(value, dict):
+        return {key: _as_json(item) for key, item in value.items()}
+    return [_as_json(item) for item in value] if isinstance(value, list) else value
+
+
+def tell_errors(app: FastAPI) -> None:
+    """Makes answers of the errors of this package."""
+
+    @app.exception_handler(TupliError)
+    def _tell(request: Request, err: TupliError) -> JSONResponse:
+        status = next((_STATUS[kind] for kind in type(err).__mro__ if kind in _STATUS), 500)
+        headers = {"WWW-Authenticate": "Bearer"} if status == 401 else None
+        kind = next(c.__name__ for c in type(err).__mro__ if c.__module__ == "tupli_mcap.errors")
+        text = str(err) if status < 500 else "the server has failed; its log says more"
+        return JSONResponse({"detail": text, "error": kind}, status, headers)
