@@ -1,5 +1,5 @@
-"""What every test gets: directories of its own for configuration and cache, so that no test touches the user's; and no
-width of a terminal, also where pytest runs in one."""
+"""What every test gets: directories of its own for configuration, cache and data, so that no test touches the user's; and
+no width of a terminal, also where pytest runs in one."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ def _private_config(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytes
     directory = tmp_path_factory.mktemp("config")
     monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(directory))
     monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+    monkeypatch.setenv("TUPLI_MCAP_DATA_DIR", str(tmp_path_factory.mktemp("data")))
     monkeypatch.delenv("COLUMNS", raising=False)  # what is printed is as wide as no terminal
     return directory
 

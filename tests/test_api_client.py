@@ -13,12 +13,6 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
 
 
-@pytest.fixture(autouse=True)
-def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("CONFIG", "DATA", "CACHE"):
-        monkeypatch.setenv(f"TUPLI_MCAP_{name}_DIR", str(tmp_path / name.lower()))
-
-
 @pytest.fixture
 def url(tmp_path: Path) -> Iterator[str]:
     with serving(Settings(tmp_path / "served")) as url:

@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ed25519
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 from gymnasium import spaces
+from serving import PASSWORD, serving
 from test_cli import COMMANDS, fill
 from test_repair import chunks, hit, record
 from typer.testing import CliRunner
@@ -22,10 +24,11 @@ from typer.testing import CliRunner
 from tupli_mcap import EpisodeData, FileStorage, write_recording
 from tupli_mcap.cli import app
 from tupli_mcap.cli.output import JSON_VERSION
+from tupli_mcap.server.settings import Settings
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 PAGE = (Path(__file__).parents[1] / "docs" / "json.md").read_text()
-WITHOUT_JSON = {"view", "help", "version"}
+WITHOUT_JSON = {"view", "serve", "help", "version"}
 
 
 def tables(page: str) -> dict[str, tuple[bool, dict[str, str]]]:
@@ -141,6 +144,16 @@ plot: plot a.mcap
 render --rerun: render a.mcap -o film.mcap --episodes first --every 10
 render: render film.mcap -o film.gif --episodes first
 tag: tag a.mcap --undo
+login: login admin --url {url}
+whoami: whoami
+signup: signup ann
+push: push lab
+push: push runs/a.mcap
+pull: pull {pole} --storage pulled
+publish: publish {pole}
+unpublish: unpublish {pole}
+password: password ann
+logout: logout
 """
 EMPTY = {
     "attachments_lost[]", "ends_lost[]", "final_states_lost[]", "foreign[]", "imports.gaps[]", "left_over[]", "notes[]",
@@ -149,10 +162,19 @@ EMPTY = {
 """Lists in which nothing is here."""
 
 
+@pytest.fixture
+def url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A server."""
+    monkeypatch.setenv("TUPLI_MCAP_PASSWORD", PASSWORD)
+    monkeypatch.setenv("TUPLI_MCAP_NEW_PASSWORD", "another")
+    with serving(Settings(tmp_path / "served")) as url:
+        yield url
+
+
 @pytest.mark.usefixtures("room")
-def test_every_command_prints_what_the_page_says() -> None:
+def test_every_command_prints_what_the_page_says(url: str) -> None:
     with FileStorage("lab") as storage:
-        ids = {header.metadata.name: header.id for header in storage.list_benchmarks()}
+        ids = {header.metadata.name: header.id for header in storage.list_benchmarks()} | {"url": url}
     seen: dict[str, set[str]] = {section: set() for section in TABLES}
     for section, line in (call.split(": ", 1) for call in CALLS.strip().split("\n")):
         call, _, code = line.partition(" | ")

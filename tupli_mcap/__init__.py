@@ -71,6 +71,7 @@ if TYPE_CHECKING:
     )
     from tupli_mcap.storage import (
         FileStorage as FileStorage,
+        TupliAPIClient as TupliAPIClient,
         TupliStorage as TupliStorage,
     )
     from tupli_mcap.wrappers import (
@@ -95,7 +96,7 @@ _HOMES = {
         "EpisodeMetadataCallback F FilterAND FilterEQ FilterGEQ FilterGT FilterIN FilterLEQ FilterLT "
         "FilterNE FilterOR RLTuple"
     ),
-    "storage": "FileStorage TupliStorage",
+    "storage": "FileStorage TupliAPIClient TupliStorage",
     "wrappers": "EpisodeWriter RecordEpisodes write_rollout",
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}

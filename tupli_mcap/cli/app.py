@@ -17,8 +17,9 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from tupli_mcap import errors
-from tupli_mcap.cli import bundle, doctor, edit, info, lists, record, render, replay, storage, trust, verify
+from tupli_mcap.cli import doctor, edit, info, lists, record, render, replay, storage, verify
 from tupli_mcap.cli.output import begin_json, print_json_error
+from tupli_mcap.cli.share import account, bundle, exchange, serve, trust
 from tupli_mcap.cli.terminal import (
     fail,
     flush,
@@ -250,6 +251,18 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "trust": trust.trust,
         "untrust": trust.untrust,
     },
+    "Server": {
+        "serve": serve.serve,
+        "login": account.login,
+        "logout": account.logout,
+        "whoami": account.whoami,
+        "signup": account.signup,
+        "password": account.password,
+        "push": exchange.push,
+        "pull": exchange.pull,
+        "publish": exchange.publish,
+        "unpublish": exchange.unpublish,
+    },
     "Storage": {
         "list-benchmarks": storage.list_benchmarks,
         "list-artifacts": storage.list_artifacts,
@@ -305,7 +318,17 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "export": ("export --storage lab --filter 'return > 100' -o good.mcap",),
     "trust": ("trust run.mcap --show", "trust --key colleague.pub --name colleague"),
     "untrust": ("untrust run.mcap",),
-    "list-benchmarks": ("list-benchmarks --storage lab",),
+    "serve": ("serve shared/", "serve shared/ --host 0.0.0.0 --port 80 --guests"),
+    "login": ("login ann --url http://192.0.2.7:8080",),
+    "signup": ("signup ann",),
+    "logout": ("logout",),
+    "whoami": ("whoami", "whoami --url http://192.0.2.7:8080"),
+    "password": ("password", "password ann"),
+    "push": ("push lab/", "push run.mcap", "push lab/ --benchmark 3f2a --filter 'return > 100'"),
+    "pull": ("pull 3f2a --storage lab",),
+    "publish": ("publish 3f2a", "publish 3f2a --group robots"),
+    "unpublish": ("unpublish 3f2a --group robots",),
+    "list-benchmarks": ("list-benchmarks --storage lab", "list-benchmarks --storage http://127.0.0.1:8080"),
     "list-artifacts": ("list-artifacts --storage lab",),
     "list-episodes": ("list-episodes --storage lab --filter 'metadata.score > 30'",),
     "compact": ("compact --storage lab --dry-run",),

@@ -35,10 +35,12 @@ from tupli_mcap.cli.terminal import fail, terminal_width
 from tupli_mcap.errors import did_you_mean
 
 if TYPE_CHECKING:
+    from tupli_mcap.dataset import Dataset
     from tupli_mcap.schema import BaseFilter, EpisodeHeader
+    from tupli_mcap.storage import TupliStorage
     from tupli_mcap.storage.listing import ListedRecording
 
-__all__ = ["episodes", "ls", "print_episodes"]
+__all__ = ["episodes", "list_stored", "ls", "print_episodes"]
 
 _ROOMY = 100  # columns of a terminal on which metadata and times fit side by side
 _Cells = Callable[["Sequence[ListedRecording]"], list[str]]
@@ -222,21 +224,45 @@ def episodes(
     = != > >= < <= in, and join with and, or, not. Times are "2026-11-23", "2026-11-23 03:31:07", "yesterday",
     "last tuesday", "7d ago", ...: a text means all of the time that it names. --sort and --columns take the same keys.
     """
-    wanted = filter_of(filter_text)
-    headers: Sequence[EpisodeHeader]
-    if sort is None and len(paths) == 1 and paths[0].is_dir():  # which looks up so many only
-        with open_storage(paths[0]) as storage:
-            headers = storage.list_episodes(wanted, limit=limit)
-        if wanted is not None and not headers and limit != 0:
-            _check_there(paths, wanted)
-    else:
-        from tupli_mcap import open as open_dataset
+    from tupli_mcap import open as open_dataset
 
-        found = open_dataset(paths[0] if len(paths) == 1 else paths)
-        found = found if wanted is None else found.filter(wanted)
-        if sort is not None:
-            found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
-        headers = found.headers[:limit]
+    if len(paths) == 1 and paths[0].is_dir():
+        with open_storage(paths[0]) as storage:
+            list_stored(storage, filter_text, sort, columns, limit, as_json)
+        return
+    found = open_dataset(paths[0] if len(paths) == 1 else paths)
+    _print_headers(_headers_of(found, filter_of(filter_text), sort)[:limit], columns, as_json=as_json)
+
+
+def list_stored(
+    storage: TupliStorage,
+    filter_text: str | None,
+    sort: str | None,
+    columns: str | None,
+    limit: int | None,
+    as_json: bool,
+) -> None:
+    """Prints the episodes of a storage."""
+    from tupli_mcap import open as open_dataset
+
+    wanted = filter_of(filter_text)
+    if sort is None:  # which looks up so many only
+        headers: Sequence[EpisodeHeader] = storage.list_episodes(wanted, limit=limit)
+        if wanted is not None and not headers and limit != 0:
+            len(open_dataset(storage).filter(wanted))  # which says so if no episode has such a key
+    else:
+        headers = _headers_of(open_dataset(storage), wanted, sort)[:limit]
+    _print_headers(headers, columns, as_json=as_json)
+
+
+def _headers_of(dataset: Dataset, wanted: BaseFilter | None, sort: str | None) -> Sequence[EpisodeHeader]:
+    found = dataset if wanted is None else dataset.filter(wanted)
+    if sort is not None:
+        found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
+    return found.headers
+
+
+def _print_headers(headers: Sequence[EpisodeHeader], columns: str | None, *, as_json: bool) -> None:
     if columns is None:
         print_episodes(headers, as_json=as_json)
     else:

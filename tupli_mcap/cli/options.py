@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,11 +13,11 @@ from tupli_mcap.remote import is_url, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
-    from tupli_mcap.storage import FileStorage
+    from tupli_mcap.storage import FileStorage, TupliStorage
 
 __all__ = [
-    "ColumnNames", "Episodes", "File", "FilterText", "Json", "Limit", "Sort", "StoragePath", "filter_of", "full_id",
-    "local_path", "open_storage", "pair_of"
+    "AnyStorage", "ColumnNames", "Episodes", "File", "FilterText", "Json", "Limit", "Sort", "StoragePath",
+    "any_storage", "filter_of", "full_id", "local_path", "open_storage", "pair_of"
 ]  # fmt: skip
 
 
@@ -60,6 +61,15 @@ StoragePath = Annotated[
     typer.Option("--storage", envvar="TUPLI_MCAP_STORAGE", help="The storage's directory.", readable=False),
 ]
 DEFAULT_STORAGE = Path("_local_storage")
+AnyStorage = Annotated[
+    str,
+    typer.Option(
+        "--storage",
+        envvar="TUPLI_MCAP_STORAGE",
+        metavar="PATH|URL",
+        help="The storage's directory, or a server.",
+    ),
+]
 _SHORTEST_ID = 4
 
 
@@ -103,7 +113,14 @@ def open_storage(path: Path, *, create: bool = False) -> FileStorage:
     return FileStorage(path)
 
 
-def full_id(storage: FileStorage, text: str) -> str:
+def any_storage(place: str) -> AbstractContextManager[TupliStorage]:
+    """The storage in a directory that is there, or on a server."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    return TupliAPIClient(place) if is_url(place) else open_storage(Path(place))
+
+
+def full_id(storage: TupliStorage, text: str) -> str:
     """The benchmark id that starts with `text`, as tables show ids in short; `text` itself if none does."""
     if len(text) < _SHORTEST_ID or len(text) >= 64 or not set(text) <= set("0123456789abcdef"):
         return text

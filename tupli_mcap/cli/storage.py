@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from tupli_mcap.cli.lists import episodes
+from tupli_mcap.cli.lists import list_stored
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
+    AnyStorage,
     ColumnNames,
     Episodes,
     FilterText,
@@ -17,6 +18,7 @@ from tupli_mcap.cli.options import (
     Limit,
     Sort,
     StoragePath,
+    any_storage,
     filter_of,
     local_path,
     open_storage,
@@ -40,13 +42,13 @@ _ROOMY = 100  # columns of a terminal on which benchmarks and their environments
 
 
 def list_benchmarks(
-    storage_path: StoragePath = DEFAULT_STORAGE, filter_text: FilterText = None, as_json: Json = False
+    place: AnyStorage = str(DEFAULT_STORAGE), filter_text: FilterText = None, as_json: Json = False
 ) -> None:
     """List the benchmarks of a storage.
 
     Filters compare id, environment, created_at, metadata.name, metadata.difficulty, metadata.extra.<name>, ...
     """
-    with open_storage(storage_path) as storage:
+    with any_storage(place) as storage:
         headers = storage.list_benchmarks(filter_of(filter_text))
     if as_json:
         print_json([header.model_dump() for header in headers])
@@ -75,13 +77,13 @@ def list_benchmarks(
 
 
 def list_artifacts(
-    storage_path: StoragePath = DEFAULT_STORAGE, filter_text: FilterText = None, as_json: Json = False
+    place: AnyStorage = str(DEFAULT_STORAGE), filter_text: FilterText = None, as_json: Json = False
 ) -> None:
     """List the artifacts of a storage.
 
     Filters compare id, name, description, created_at, extra.<name>, ...
     """
-    with open_storage(storage_path) as storage:
+    with any_storage(place) as storage:
         items = storage.list_artifacts(filter_of(filter_text))
     if as_json:
         print_json([item.model_dump() for item in items])
@@ -97,7 +99,7 @@ def list_artifacts(
 
 
 def list_episodes(
-    storage_path: StoragePath = DEFAULT_STORAGE,
+    place: AnyStorage = str(DEFAULT_STORAGE),
     filter_text: FilterText = None,
     sort: Sort = None,
     columns: ColumnNames = None,
@@ -110,8 +112,8 @@ def list_episodes(
     metadata.<name>, ... with = != > >= < <= in, and join with and, or, not. Times are "2026-11-23",
     "2026-11-23 03:31:07", "yesterday", "7d ago", ...: a text means all of the time that it names.
     """
-    with open_storage(storage_path):  # which says where to look, if it is missing
-        episodes([storage_path], filter_text, sort, columns, limit, as_json)
+    with any_storage(place) as storage:
+        list_stored(storage, filter_text, sort, columns, limit, as_json)
 
 
 _Paths = Annotated[

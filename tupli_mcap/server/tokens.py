@@ -94,7 +94,7 @@ class Tokens:
             None if epoch is None or epoch != told.get("epoch") else caller_named(connection, told["sub"])
         )
         if caller is None:
-            raise SignInError("the access token is not valid any more; sign in again")
+            raise SignInError("the access token is not valid any more")
         return caller
 
     # --- tokens of machines ---
@@ -153,7 +153,7 @@ class Tokens:
                 token, self._secret, algorithms=[_ALGORITHM], options={"require": ["exp", "typ", "sub"]}
             )
         except jwt.PyJWTError:
-            raise SignInError("the token is not valid, or has expired; sign in again") from None
+            raise SignInError("the token is not valid, or has expired") from None
         if told["typ"] != kind:
             raise SignInError(f"expected an {kind} token, found another kind")
         return told

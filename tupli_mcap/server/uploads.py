@@ -18,10 +18,14 @@ from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.server.access import Caller
 from tupli_mcap.storage.atomic import write_bytes
 
-__all__ = ["Upload", "Uploads"]
+__all__ = ["BusyError", "Upload", "Uploads"]
 
 _ID = re.compile("[0-9a-f]{32}")
 _KEPT_SECONDS = 7 * 24 * 3600
+
+
+class BusyError(StorageError):
+    """Another request writes to the upload."""
 
 
 class Upload(NamedTuple):
@@ -74,10 +78,10 @@ class Uploads:
 
     @contextlib.contextmanager
     def alone(self, upload: Upload) -> Iterator[None]:
-        """Keeps others from writing to an upload. StorageError while somebody does."""
+        """Keeps others from writing to an upload. BusyError while somebody does."""
         with self._turn:
             if upload.id in self._busy:
-                raise StorageError("this upload is being written by another request; try again later")
+                raise BusyError("this upload is being written by another request; try again later")
             self._busy.add(upload.id)
         try:
             yield

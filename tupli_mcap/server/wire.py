@@ -15,6 +15,7 @@ from tupli_mcap.schema import BaseFilter
 from tupli_mcap.server.access import DeniedError
 from tupli_mcap.server.accounts import ConflictError
 from tupli_mcap.server.tokens import SignInError
+from tupli_mcap.server.uploads import BusyError
 
 __all__ = ["Error", "Found", "Listing", "answer", "listed", "tell_errors"]
 
@@ -23,6 +24,7 @@ _STATUS: Final[dict[type[TupliError], int]] = {
     DeniedError: 403,
     NotFoundError: 404,
     ConflictError: 409,
+    BusyError: 423,
     FilterError: 400,
     SpaceError: 400,
     FormatError: 400,

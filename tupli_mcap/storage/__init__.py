@@ -1,7 +1,8 @@
 """Where benchmarks, artifacts and recordings live.
 
 base                                the contract of a storage, and who sees what is in it
-files                               `FileStorage`: a directory
+files, api/                         `FileStorage`: a directory; `TupliAPIClient`: a server
+at, exchange                        which of them a path or URL stands for; from one to another
 benchmarks, artifacts, recordings   the parts of the directory
 sidecar                             what is noted beside recordings: deletions, publications
 catalog/                            the database that finds episodes
@@ -13,7 +14,9 @@ verify                              whether all of it is whole
 atomic, texts                       whole files, the lock between processes, and the texts in files
 """
 
+from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.storage.at import storage_at
 from tupli_mcap.storage.base import TupliStorage, TupliStorageError
-from tupli_mcap.storage.files import FileStorage, storage_at
+from tupli_mcap.storage.files import FileStorage
 
-__all__ = ["FileStorage", "TupliStorage", "TupliStorageError", "storage_at"]
+__all__ = ["FileStorage", "TupliAPIClient", "TupliStorage", "TupliStorageError", "storage_at"]

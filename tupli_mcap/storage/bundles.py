@@ -51,7 +51,17 @@ if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
     from tupli_mcap.storage.files import FileStorage
 
-__all__ = ["ImportPreview", "checked_signature", "export", "from_recording", "preview", "read", "write"]
+__all__ = [
+    "ImportPreview",
+    "carried_artifacts",
+    "checked_signature",
+    "export",
+    "from_recording",
+    "incoming",
+    "preview",
+    "read",
+    "write",
+]
 
 _PIECE = 1 << 22
 
@@ -251,6 +261,7 @@ def from_recording(
 
 
 def incoming(recording: Recording, path: Path) -> tuple[EnvironmentRecord, BenchmarkHeader, BenchmarkQuery]:
+    """The benchmark that a recording carries. StorageError if there is none, FormatError if it is not what it says."""
     record = _environment(recording, path)
     header = _header(record, path)
     query = BenchmarkQuery(
@@ -419,6 +430,13 @@ def _read_artifacts(
         except ValidationError as err:
             raise FormatError(f"{path}: artifact {uri}: {first_defect(err)}") from err
     return artifacts
+
+
+def carried_artifacts(
+    recording: Recording, record: EnvironmentRecord, path: Path
+) -> list[tuple[bytes, ArtifactMetadata]]:
+    """The artifacts that a bundle carries, checked. StorageError if it lacks one."""
+    return _read_artifacts(None, recording, record, path)
 
 
 def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:

@@ -13,7 +13,6 @@ filtering and reading write nothing into the directory.
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
@@ -24,7 +23,6 @@ from pydantic import BaseModel, ValidationError
 
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording, write_recording
-from tupli_mcap.remote import is_url
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -342,21 +340,3 @@ class FileStorage(TupliStorage):
                 return _Settings.model_validate_json(path.read_bytes()) if path.exists() else _Settings()
         except ValidationError as err:
             raise FormatError(f"{path}: expected the settings of a storage: {first_defect(err)}") from err
-
-
-def storage_at(place: TupliStorage | str | os.PathLike[str]) -> TupliStorage:
-    """A storage, or the one in a directory, which need not be there yet.
-
-    Raises:
-        StorageError: it is neither, or the path is that of recordings.
-    """
-    if isinstance(place, TupliStorage):
-        return place
-    if not isinstance(place, str | os.PathLike) or not os.fspath(place):
-        raise StorageError(f"expected a storage, or the path of its directory, found {place!r:.80}")
-    name = os.fspath(place)
-    if is_url(name) or glob.has_magic(name) or name.endswith(".mcap"):
-        raise StorageError(
-            f"expected the directory of a storage, found {name!r:.80}; recordings are opened with tupli_mcap.open(...)"
-        )
-    return FileStorage(Path(place).expanduser())

@@ -42,7 +42,7 @@ AnyCaller = Annotated[Caller, Depends(_any_caller)]
 
 def _reader(library: Served, caller: AnyCaller) -> Caller:
     if caller.is_guest and not library.settings.guests:
-        raise SignInError("sign in first: this server shows nothing to guests")
+        raise SignInError("this server shows nothing to guests")
     return caller
 
 
@@ -51,7 +51,7 @@ Reader = Annotated[Caller, Depends(_reader)]
 
 def _writer(caller: AnyCaller) -> Caller:
     if caller.is_guest:
-        raise SignInError("sign in first")
+        raise SignInError("guests may change nothing")
     if not caller.may_write:
         raise DeniedError("this token may only read; make one with the scope 'write'")
     return caller

@@ -28,6 +28,13 @@ class Chosen(BaseModel):
     filter: BaseFilter | None = None
 
 
+class Shown(Chosen):
+    """Which episodes a group sees from now on, or sees no more."""
+
+    group: str
+    published: bool = True
+
+
 class Key(BaseModel):
     """A key of episodes' metadata, such as `metadata.score`."""
 
@@ -62,6 +69,17 @@ def delete_episodes(library: Served, caller: Writer, told: Annotated[Chosen, Bod
     if told.filter is None:
         raise StorageError("expected a filter that says which episodes to delete")
     return answer({"episodes": library.delete_episodes(caller, told.filter)})
+
+
+@router.post("/publish")
+def publish_episodes(library: Served, caller: Writer, told: Annotated[Shown, Body()]) -> Response:
+    """Lets a group see the episodes that a filter is true of, or no more: all, or none; `{"episodes": how many}`."""
+    change = episodes.publish if told.published else episodes.unpublish
+    with library.database.writing() as connection:
+        found = [header.id for header in episodes.find_episodes(connection, caller, told.filter)]
+        for uri in found:
+            change(connection, caller, uri, told.group)
+    return answer({"episodes": len(found)})
 
 
 @router.post("/keys")

@@ -28,7 +28,7 @@ from tupli_mcap.schema import (
     bound,
 )
 from tupli_mcap.schema.facts import path_in
-from tupli_mcap.storage.api.sending import Outbox, send_file
+from tupli_mcap.storage.api.sending import Outbox, outbox_of, send_file
 from tupli_mcap.storage.api.session import Session, pages
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import TupliStorage, anew, published_in
@@ -55,13 +55,21 @@ class TupliAPIClient(TupliStorage):
 
     def __init__(self, url: str | None = None) -> None:
         self._session = Session(url)
-        self._outbox = Outbox(self._session)
         self._outbox.send_left()
+
+    @property
+    def _outbox(self) -> Outbox:
+        return outbox_of(self._session)  # of who is signed in now
 
     @property
     def url(self) -> str:
         """The server's address."""
         return self._session.url
+
+    @property
+    def username(self) -> str:
+        """Who is signed in; empty if nobody is."""
+        return self._session.username
 
     def set_url(self, url: str) -> None:
         """Use another server from now on."""
@@ -237,6 +245,19 @@ class TupliAPIClient(TupliStorage):
     def unpublish_episode(self, uri: str, unpublish_from: str) -> None:
         """Take an episode away from a group."""
         self._unpublish("episodes", _episode(uri), unpublish_from)
+
+    def publish_episodes(self, filter: BaseFilter, publish_in: str = "global") -> int:
+        """Let a group see every episode of yours that a filter is true of; returns how many."""
+        return self._publish_all(filter, publish_in, published=True)
+
+    def unpublish_episodes(self, filter: BaseFilter, unpublish_from: str) -> int:
+        """Take every episode that a filter is true of away from a group; returns how many."""
+        return self._publish_all(filter, unpublish_from, published=False)
+
+    def _publish_all(self, filter: BaseFilter, group: str, *, published: bool) -> int:
+        self.flush()
+        told = {**_listing(filter, EpisodeHeader), "group": group, "published": published}
+        return int(self._session.ask("POST", "/v1/episodes/publish", told)["episodes"])
 
     # --- recordings ---
 

@@ -24,17 +24,29 @@ import platformdirs
 
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError
-from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.lock import is_locked, writers_kept_out
 from tupli_mcap.recording import Recording, journal_path
 from tupli_mcap.storage.api.session import Session, UnreachableError
 from tupli_mcap.storage.atomic import os_errors
 
-__all__ = ["Outbox", "send_file"]
+__all__ = ["outbox_of", "send_file"]
 
 _ATTEMPTS: Final = 6
 _PIECE: Final = 1 << 20
 _TUS: Final = {"Tus-Resumable": "1.0.0"}
 _DATA_VARIABLE: Final = "TUPLI_MCAP_DATA_DIR"
+
+_turn = threading.Lock()
+_outboxes: dict[tuple[int, str, str], Outbox] = {}
+
+
+def outbox_of(session: Session) -> Outbox:
+    """The outbox of a session's server and user: one in a process, however many clients there are."""
+    with _turn:
+        key = (os.getpid(), session.url, session.username)
+        if key not in _outboxes:
+            _outboxes[key] = Outbox(Session(session.url))
+        return _outboxes[key]
 
 
 class Outbox:
@@ -42,6 +54,7 @@ class Outbox:
 
     def __init__(self, session: Session) -> None:
         self._session = session
+        self._directory = _directory_of(session)
         self._queue: queue.Queue[Path] = queue.Queue()
         self._sender: threading.Thread | None = None
         self._turn = threading.Lock()
@@ -49,15 +62,9 @@ class Outbox:
         self._failed: dict[Path, TupliError] = {}
         self._names: dict[Path, str] = {}
 
-    @property
-    def directory(self) -> Path:
-        """Where recordings wait."""
-        server = hashlib.sha256(f"{self._session.url}\n{self._session.username}".encode()).hexdigest()[:16]
-        return _data_dir() / "outbox" / server
-
     def new_path(self, benchmark_id: str, name: str) -> Path:
         """Where a recording may be written; nothing is there yet."""
-        directory = self.directory / benchmark_id
+        directory = self._directory / benchmark_id
         with os_errors("cannot make the directory", directory):
             directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         now = datetime.datetime.now(datetime.UTC)
@@ -86,7 +93,7 @@ class Outbox:
 
     def send_left(self) -> None:
         """Sends what waits here, of this process or of others that have ended."""
-        for path in sorted(self.directory.rglob("*.mcap")):
+        for path in sorted(self._directory.rglob("*.mcap")):
             with contextlib.suppress(TupliError):  # damaged: it stays
                 self.send(path)
 
@@ -110,8 +117,9 @@ class Outbox:
         while True:
             path = self._queue.get()
             try:
-                self._names[path] = send_file(self._session, path)
-                _remove(path)
+                with writers_kept_out(path):  # nor does another process send it meanwhile
+                    self._names[path] = send_file(self._session, path)
+                    _remove(path)
             except TupliError as err:
                 with self._turn:
                     self._failed[path] = err
@@ -175,6 +183,12 @@ def _remove(path: Path) -> None:
             gone.unlink(missing_ok=True)
     except OSError as err:
         warnings.warn(f"{path} was sent, and cannot be deleted here: {err}", stacklevel=2)
+
+
+def _directory_of(session: Session) -> Path:
+    """Where the recordings of a server and user wait."""
+    server = hashlib.sha256(f"{session.url}\n{session.username}".encode()).hexdigest()[:16]
+    return _data_dir() / "outbox" / server
 
 
 def _data_dir() -> Path:

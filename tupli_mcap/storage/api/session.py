@@ -123,6 +123,8 @@ class Session:
         response = self._sent(method, path, token, repeat, headers or {}, options)
         if response.status_code == 401 and not anonymous and self._renew(token):
             response = self._sent(method, path, self._token(), repeat, headers or {}, options)
+        if response.status_code == 401 and not anonymous:
+            raise StorageError(f"{_error(response)}; sign in: tupli-mcap login USER --url {self.url}")
         if response.status_code >= 400:
             raise _error(response)
         return response
@@ -202,6 +204,8 @@ def _error(response: httpx.Response) -> TupliError:
         detail, name = str(told["detail"]), str(told.get("error", ""))
     except (ValueError, KeyError, TypeError, AttributeError):
         detail, name = f"the server answers {response.status_code}", ""
+    if response.status_code in (423, 429, 502, 503, 504):
+        return UnreachableError(f"the server is busy: {detail[:300]!r}")
     kind = getattr(errors, name, StorageError) if name in errors.__all__ else StorageError
     if not issubclass(kind, TupliError) or kind is TupliError:
         kind = NotFoundError if response.status_code == 404 else StorageError

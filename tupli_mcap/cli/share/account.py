@@ -1,0 +1,110 @@
+"""Commands on accounts at a server: login, logout, whoami, signup, password."""
+
+from __future__ import annotations
+
+import os
+from typing import Annotated, Any
+
+import typer
+
+from tupli_mcap.cli.options import Json
+from tupli_mcap.cli.output import print_facts, print_json
+from tupli_mcap.cli.terminal import ask_secret, say
+from tupli_mcap.errors import StorageError
+
+__all__ = ["Url", "login", "logout", "password", "signup", "whoami"]
+
+Url = Annotated[
+    str | None,
+    typer.Option(
+        envvar="TUPLI_MCAP_URL",
+        metavar="URL",
+        help="The server; by default that of the last login.",
+        readable=False,
+    ),
+]
+Username = Annotated[str, typer.Argument(metavar="USER")]
+
+
+def login(username: Username, url: Url = None, as_json: Json = False) -> None:
+    """Sign in to a server, until logout.
+
+    The password is asked for, or is in TUPLI_MCAP_PASSWORD.
+    """
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        client.login(username, _password("Password: "))
+        _tell(client.url, username, f"signed in to {client.url} as {username}", as_json=as_json)
+
+
+def logout(url: Url = None, as_json: Json = False) -> None:
+    """Sign out."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        username = client.username
+        client.logout()
+        _tell(client.url, username, f"signed out of {client.url}", as_json=as_json)
+
+
+def whoami(url: Url = None, as_json: Json = False) -> None:
+    """Show who is signed in, and their roles."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        found: dict[str, Any] = {"url": client.url, **client.whoami()}
+    if as_json:
+        print_json(found)
+        return
+    roles = [(group, ", ".join(held)) for group, held in found["memberships"].items()]
+    print_facts([("server", found["url"]), ("user", found["username"]), *roles])
+
+
+def signup(username: Username, url: Url = None, as_json: Json = False) -> None:
+    """Make a user.
+
+    Everybody may where the server was started with --open-signup, else who has the right to.
+    """
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        client.signup(username, _password("Password of the new user: "))
+        _tell(client.url, username, f"made the user {username} at {client.url}", as_json=as_json)
+
+
+def password(
+    username: Annotated[str | None, typer.Argument(metavar="[USER]", help="You, by default.")] = None,
+    url: Url = None,
+    as_json: Json = False,
+) -> None:
+    """Change a password, and end all sign-ins.
+
+    Passwords are asked for, or are in TUPLI_MCAP_PASSWORD (the old one) and TUPLI_MCAP_NEW_PASSWORD.
+    """
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        me = client.whoami()["username"]
+        own = username in (None, me)
+        old = _password("Old password: ") if own else None
+        new = _password("New password: ", "TUPLI_MCAP_NEW_PASSWORD")
+        client.change_password(username or me, new, old=old)
+        if own:
+            client.login(me, new)
+        changed = username or me
+        _tell(client.url, changed, f"changed the password of {changed} at {client.url}", as_json=as_json)
+
+
+def _tell(url: str, username: str, line: str, *, as_json: bool) -> None:
+    if as_json:
+        print_json({"url": url, "username": username})
+    else:
+        say(line)
+
+
+def _password(question: str, variable: str = "TUPLI_MCAP_PASSWORD") -> str:
+    found = os.environ.get(variable) or ask_secret(question)
+    if not found:
+        raise StorageError(f"a password is needed: nobody is there to be asked, and {variable} is not set")
+    return found

@@ -1,0 +1,41 @@
+"""Which storage a path or URL stands for."""
+
+from __future__ import annotations
+
+import glob
+import os
+from pathlib import Path
+
+from tupli_mcap.errors import StorageError
+from tupli_mcap.remote import is_url, shown
+from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.storage.base import TupliStorage
+from tupli_mcap.storage.files import FileStorage
+
+__all__ = ["storage_at"]
+
+
+def storage_at(place: TupliStorage | str | os.PathLike[str]) -> TupliStorage:
+    """A storage; or the one at the address of a server, or in a directory, which need not be there yet.
+
+    Raises:
+        StorageError: it is neither, or the path is that of recordings.
+    """
+    if isinstance(place, TupliStorage):
+        return place
+    if not isinstance(place, str | os.PathLike) or not os.fspath(place):
+        raise StorageError(f"expected a storage, or the path of its directory, found {place!r:.80}")
+    name = os.fspath(place)
+    if glob.has_magic(name) or name.endswith(".mcap"):
+        raise StorageError(
+            f"expected the directory of a storage, found {shown(name)!r:.80}; recordings are opened with "
+            "tupli_mcap.open(...)"
+        )
+    if name.startswith(("http://", "https://")):
+        return TupliAPIClient(name)
+    if is_url(name):
+        raise StorageError(
+            f"expected the directory of a storage or the address of a server, found {shown(name)!r:.80}; "
+            "recordings are opened with tupli_mcap.open(...)"
+        )
+    return FileStorage(Path(place).expanduser())
