@@ -1,5 +1,5 @@
-"""What every test gets: directories of its own for configuration, cache and data, so that no test touches the user's; and
-no width of a terminal, also where pytest runs in one."""
+"""What every test gets: directories of its own for configuration, cache and data, so that no test touches the user's;
+and no width of a terminal, also where pytest runs in one."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,12 +14,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from gymnasium.wrappers import TimeLimit
+from serving import PASSWORD, serving
 
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.dataset import NumpyTupleParser, TupliDataset
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import FilterEQ
-from tupli_mcap.storage import FileStorage
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.storage import TupliAPIClient, TupliStorage, storage_at
 
 SOURCE = Path(__file__).parents[1] / "tools" / "tutorial.py"
 
@@ -40,13 +43,26 @@ def wind(tutorial: ModuleType, tmp_path: Path) -> Path:
     return tmp_path / "wind.csv"
 
 
-@pytest.fixture
-def storage(tmp_path: Path) -> FileStorage:
-    return FileStorage(tmp_path / "storage")
+@pytest.fixture(params=["directory", "server"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    """A directory, or the address of a server that keeps everything there."""
+    if request.param == "directory":
+        yield str(tmp_path / "storage")
+    else:
+        with serving(Settings(tmp_path / "storage")) as url:
+            yield url
 
 
 @pytest.fixture
-def env(tutorial: ModuleType, storage: FileStorage, wind: Path) -> TupliEnvWrapper:
+def storage(place: str) -> TupliStorage:
+    found = storage_at(place)
+    if isinstance(found, TupliAPIClient):
+        found.login("admin", PASSWORD)
+    return found
+
+
+@pytest.fixture
+def env(tutorial: ModuleType, storage: TupliStorage, wind: Path) -> TupliEnvWrapper:
     benchmark_id = tutorial.store_benchmark(storage, wind)
     found: TupliEnvWrapper = tutorial.MyTupliEnvWrapper.load(
         storage=storage, benchmark_id=benchmark_id, metadata_callback=tutorial.MyCallback()
@@ -54,16 +70,16 @@ def env(tutorial: ModuleType, storage: FileStorage, wind: Path) -> TupliEnvWrapp
     return found
 
 
-def dataset_of(storage: FileStorage, env: TupliEnvWrapper) -> TupliDataset:
+def dataset_of(storage: TupliStorage, env: TupliEnvWrapper) -> TupliDataset:
     return TupliDataset(storage=storage).with_benchmark_filter(FilterEQ(key="id", value=env.id))
 
 
-def left_in(storage: FileStorage) -> list[Path]:
+def left_in(directory: Path) -> list[Path]:
     """Every file of the storage that is a benchmark's, an artifact's or a recording's."""
     return [
         path
         for name in ("benchmarks", "artifacts", "recordings")
-        for path in (storage.root / name).rglob("*")
+        for path in (directory / name).rglob("*")
         if path.is_file()
     ]
 
@@ -85,7 +101,7 @@ def test_the_wind_is_as_documented_and_slows_the_car_down(tutorial: ModuleType, 
 
 
 def test_the_wind_is_stored_as_an_artifact_and_put_back(
-    tutorial: ModuleType, storage: FileStorage, wind: Path
+    tutorial: ModuleType, storage: TupliStorage, wind: Path
 ) -> None:
     inner = TimeLimit(tutorial.CustomMountainCarEnv(data_path=wind), max_episode_steps=999)
     wrapped = tutorial.MyTupliEnvWrapper(inner, storage=storage)
@@ -104,7 +120,7 @@ def test_the_wind_is_stored_as_an_artifact_and_put_back(
         assert again.step(action)[0].tobytes() == inner.step(action)[0].tobytes()
 
 
-def test_benchmarks_of_one_wind_share_it(tutorial: ModuleType, storage: FileStorage, wind: Path) -> None:
+def test_benchmarks_of_one_wind_share_it(tutorial: ModuleType, storage: TupliStorage, wind: Path) -> None:
     first = tutorial.store_benchmark(storage, wind)
     car = tutorial.CustomMountainCarEnv(data_path=wind)
     car.max_speed = 0.05
@@ -119,13 +135,13 @@ def test_benchmarks_of_one_wind_share_it(tutorial: ModuleType, storage: FileStor
 
 def test_the_command_line_lists_the_benchmark(
     tutorial: ModuleType,
-    storage: FileStorage,
+    place: str,
     env: TupliEnvWrapper,
     capfd: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")  # pytest loads readline, which sets it unseen by os.environ
-    tutorial.list_benchmarks(storage.root)
+    tutorial.list_benchmarks(place)
     out = capfd.readouterr().out
     assert "windy-mountain-car" in out
     assert env.id is not None
@@ -133,7 +149,7 @@ def test_the_command_line_lists_the_benchmark(
 
 
 def test_random_steps_become_a_dataset(
-    tutorial: ModuleType, storage: FileStorage, env: TupliEnvWrapper, capsys: pytest.CaptureFixture[str]
+    tutorial: ModuleType, storage: TupliStorage, env: TupliEnvWrapper, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tutorial.record_random_steps(env)
     assert (
@@ -178,7 +194,7 @@ def assert_aligned(tutorial: ModuleType, env: TupliEnvWrapper, dataset: TupliDat
 
 
 def test_actions_that_are_kept_for_a_while_reach_the_flag(
-    tutorial: ModuleType, storage: FileStorage, env: TupliEnvWrapper
+    tutorial: ModuleType, storage: TupliStorage, env: TupliEnvWrapper
 ) -> None:
     tutorial.record_random_steps(env, steps=600, hold=30)
     env.close()
@@ -194,7 +210,7 @@ def test_actions_that_are_kept_for_a_while_reach_the_flag(
 
 
 def test_deleting_leaves_nothing_behind(
-    tutorial: ModuleType, storage: FileStorage, env: TupliEnvWrapper
+    tutorial: ModuleType, storage: TupliStorage, env: TupliEnvWrapper, tmp_path: Path
 ) -> None:
     tutorial.record_random_steps(env, steps=1005)
     env.deactivate_recording()
@@ -203,11 +219,11 @@ def test_deleting_leaves_nothing_behind(
     env.reset(seed=1)
     env.step(np.int64(2))
     assert storage.count_episodes() == recorded
-    assert len(left_in(storage)) > 4
+    assert len(left_in(tmp_path / "storage")) > 1
     env.close()
     result = env.delete(delete_artifacts=True)
     assert (result.episodes, len(result.artifacts), dict(result.kept)) == (recorded, 1, {})
-    assert left_in(storage) == []
+    assert left_in(tmp_path / "storage") == []
     assert storage.list_benchmarks() == storage.list_artifacts() == storage.list_episodes() == []
     assert len(TupliDataset(storage=storage)) == 0
     with pytest.raises(StorageError, match="not stored"):
@@ -231,7 +247,7 @@ def test_a_policy_is_judged_by_its_steps_to_the_flag(tutorial: ModuleType, env: 
 
 
 @pytest.mark.d3rlpy
-def test_d3rlpy_sees_the_episodes(tutorial: ModuleType, storage: FileStorage, env: TupliEnvWrapper) -> None:
+def test_d3rlpy_sees_the_episodes(tutorial: ModuleType, storage: TupliStorage, env: TupliEnvWrapper) -> None:
     tutorial.record_random_steps(env)
     dataset = dataset_of(storage, env)
     made = tutorial.make_d3rlpy_dataset(dataset)
@@ -256,4 +272,4 @@ def test_a_policy_is_trained_stored_and_played(
     out = capfd.readouterr().out
     assert "The policy reached the flag in" in out
     assert "0 benchmarks, artifacts and episodes are left." in out
-    assert left_in(FileStorage(tmp_path / "storage")) == []
+    assert left_in(tmp_path / "storage") == []

@@ -115,10 +115,10 @@ def store_benchmark(storage: TupliStorage, wind: Path) -> str:
     return tupli_env.id
 
 
-def list_benchmarks(directory: Path) -> None:
-    """The same as `tupli-mcap list-benchmarks --storage DIRECTORY` on the command line."""
+def list_benchmarks(place: str) -> None:
+    """The same as `tupli-mcap list-benchmarks --storage PLACE` on the command line."""
     code = "from tupli_mcap.cli import main; main()"
-    subprocess.run([sys.executable, "-c", code, "list-benchmarks", "--storage", str(directory)], check=True)
+    subprocess.run([sys.executable, "-c", code, "list-benchmarks", "--storage", place], check=True)
 
 
 # --- recording ---
@@ -251,7 +251,7 @@ def follow(directory: Path, steps: int, hold: int = 1) -> None:
     storage = FileStorage(directory / "storage")
 
     benchmark_id = store_benchmark(storage, directory / "wind.csv")
-    list_benchmarks(storage.root)
+    list_benchmarks(str(storage.root))
 
     env = MyTupliEnvWrapper.load(storage=storage, benchmark_id=benchmark_id, metadata_callback=MyCallback())
     record_random_steps(env, hold=hold)

@@ -119,7 +119,8 @@ class Items:
         return sorted((i for i in found if matches(i)), key=lambda i: (time_ns(i.created_at) or 0, i.id))
 
     def artifact_users(self, connection: Connection, caller: Caller, uri: str) -> list[str]:
-        """The ids of the readable benchmarks that need an artifact."""
+        """The ids of the readable benchmarks that need a readable artifact."""
+        self._find(connection, caller, "artifact", uri)
         return [
             row.id for row in self._readable(connection, caller, "benchmark") if uri in json.loads(row.needs)
         ]

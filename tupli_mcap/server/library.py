@@ -18,6 +18,7 @@ from tupli_mcap.server.database import Database
 from tupli_mcap.server.items import Items, artifact_key
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import FILE, ITEM, MEMBERSHIP, USER
+from tupli_mcap.server.throttle import Throttle
 from tupli_mcap.server.tokens import Tokens
 from tupli_mcap.server.uploads import Upload, Uploads
 from tupli_mcap.storage.texts import escape_text
@@ -42,6 +43,7 @@ class Library:
         self.blobs = DirectoryBlobs(settings.directory)
         self.items = Items(self.blobs)
         self.tokens = Tokens(settings)
+        self.throttle = Throttle()
         self.uploads = Uploads(settings.own / "uploads")
         with self.database.writing() as connection:
             accounts.prepare(connection)

@@ -11,13 +11,13 @@ from pydantic import BaseModel, Field
 from tupli_mcap.server import accounts
 from tupli_mcap.server.access import Right
 from tupli_mcap.server.database import audit
-from tupli_mcap.server.routes.callers import AnyCaller, Reader, Served, Throttle, Writer
+from tupli_mcap.server.routes.callers import AnyCaller, Reader, Served, Writer
 from tupli_mcap.server.tokens import SignInError
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["accounts"])
-_throttle = Throttle()
+_MOST_OF_A_USER, _MOST_OF_AN_ADDRESS = 10, 100  # failures a minute
 
 
 class Credentials(BaseModel):
@@ -95,15 +95,17 @@ class NewToken(BaseModel):
 @router.post("/tokens")
 def sign_in(library: Served, request: Request, told: Credentials) -> TokenPair:
     """Signs in."""
-    keys = (f"user {told.username[:80]}", f"address {request.client.host if request.client else ''}")
-    wait = _throttle.wait(*keys)
+    address = request.client.host if request.client else ""
+    # A user at an address: somebody else's failures must not keep the user out.
+    most = {f"{told.username[:80]} at {address}": _MOST_OF_A_USER, address: _MOST_OF_AN_ADDRESS}
+    wait = library.throttle.wait(most)
     if wait > 0:
         after = {"Retry-After": str(math.ceil(wait))}
         raise HTTPException(429, "too many failed attempts; wait a minute", after)
     with library.database.writing() as connection:
         if accounts.verify_password(connection, told.username, told.password):
             return TokenPair(**library.tokens.pair(connection, told.username))
-    _throttle.failed(*keys)
+    library.throttle.failed(most)
     raise SignInError("Incorrect username or password")
 
 

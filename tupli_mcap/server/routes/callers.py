@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections import deque
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -15,7 +12,7 @@ from tupli_mcap.server.access import Caller, DeniedError
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.tokens import SignInError
 
-__all__ = ["AnyCaller", "Reader", "Served", "Throttle", "Writer"]
+__all__ = ["AnyCaller", "Reader", "Served", "Writer"]
 
 _BEARER = HTTPBearer(auto_error=False, description="An access token of `POST /v1/tokens`, or an API token.")
 
@@ -58,33 +55,3 @@ def _writer(caller: AnyCaller) -> Caller:
 
 
 Writer = Annotated[Caller, Depends(_writer)]
-
-
-class Throttle:
-    """Keeps who tries passwords from trying many: ten failures a minute for a name, and from an address."""
-
-    _MOST = 10
-    _SECONDS = 60.0
-
-    def __init__(self) -> None:
-        self._failures: dict[str, deque[float]] = {}
-        self._turn = threading.Lock()
-
-    def wait(self, *keys: str) -> float:
-        """Seconds until another try; 0 if it may be made now."""
-        now = time.monotonic()
-        with self._turn:
-            for key in list(self._failures):
-                times = self._failures[key]
-                while times and times[0] < now - self._SECONDS:
-                    times.popleft()
-                if not times:
-                    del self._failures[key]
-            full = [self._failures[key] for key in keys if len(self._failures.get(key, ())) >= self._MOST]
-            return max((times[0] + self._SECONDS - now for times in full), default=0.0)
-
-    def failed(self, *keys: str) -> None:
-        """Notes a failure."""
-        with self._turn:
-            for key in keys:
-                self._failures.setdefault(key, deque()).append(time.monotonic())

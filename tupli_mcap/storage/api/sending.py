@@ -13,6 +13,7 @@ import hashlib
 import os
 import queue
 import secrets
+import tempfile
 import threading
 import time
 import warnings
@@ -25,9 +26,11 @@ import platformdirs
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
-from tupli_mcap.recording import Recording, journal_path
+from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.storage.api.session import Session, UnreachableError
 from tupli_mcap.storage.atomic import os_errors
+from tupli_mcap.storage.catalog.entries import rows_of
+from tupli_mcap.storage.sidecar import Sidecar
 
 __all__ = ["outbox_of", "send_file"]
 
@@ -61,6 +64,8 @@ class Outbox:
         self._waiting: set[Path] = set()
         self._failed: dict[Path, TupliError] = {}
         self._names: dict[Path, str] = {}
+        self._given: set[Path] = set()  # somebody in this process may write to them
+        self._shown: dict[Path, int] = {}  # how many episodes of them were sent
 
     def new_path(self, benchmark_id: str, name: str) -> Path:
         """Where a recording may be written; nothing is there yet."""
@@ -69,7 +74,10 @@ class Outbox:
             directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         now = datetime.datetime.now(datetime.UTC)
         named = f"{files.as_file_name(name)}-" if name else ""
-        return directory / f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
+        path = directory / f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
+        with self._turn:
+            self._given.add(path)
+        return path
 
     def send(self, path: Path) -> None:
         """Sends a finished recording behind; one without episodes is removed, one that is being written is left."""
@@ -98,16 +106,37 @@ class Outbox:
                 self.send(path)
 
     def flush(self) -> None:
-        """Waits until everything is sent.
+        """Waits until everything is sent; of recordings that this process writes, the episodes that have ended.
 
         Raises:
             StorageError: something could not be sent; it stays here, and is tried again at the next start.
         """
+        with self._turn:
+            given = sorted(self._given - self._waiting)
+        for path in given:
+            if not path.exists():  # it was sent, or nothing was written
+                continue
+            if is_locked(path):
+                self._send_ended(path)
+            else:
+                self.send(path)
         self._queue.join()
         with self._turn:
             failed, self._failed = self._failed, {}
         for path, err in failed.items():
             raise type(err)(f"{path} was not sent, and is kept: {err}") from err
+
+    def _send_ended(self, path: Path) -> None:
+        """Sends a copy of the episodes that have ended, of which the finished recording will take the place."""
+        with Recording(path) as recording:
+            ended = [row.episode for row in rows_of(recording, Sidecar(), live=True)]
+            if len(ended) <= self._shown.get(path, 0):
+                return
+            with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
+                copy = Path(folder) / path.name
+                rewrite_recording(recording, copy, episodes=ended)
+                send_file(self._session, copy)
+        self._shown[path] = len(ended)
 
     def name_of(self, path: Path) -> str:
         """What the server calls a recording that was sent."""

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -51,9 +52,10 @@ class Session:
             raise missing_extra("a storage on a server needs httpx", "remote") from err
         self._tokens = _TokenFile(trust.config_dir() / "servers.json")
         self.url = _checked(url or os.environ.get(_URL_VARIABLE) or self._tokens.last() or DEFAULT_URL)
-        self._client = httpx.Client(
+        self._client = client = httpx.Client(
             base_url=self.url, timeout=_TIMEOUT, headers={"Accept": "application/json"}
         )
+        weakref.finalize(self, client.close)
 
     @property
     def username(self) -> str:
@@ -61,7 +63,7 @@ class Session:
         return str(self._tokens.of(self.url).get("username", ""))
 
     def close(self) -> None:
-        """Close the connections; the session can still be used."""
+        """Close the connections; asking anything afterwards is a StorageError."""
         self._client.close()
 
     # --- signing in ---
@@ -136,6 +138,8 @@ class Session:
 
         if token:
             headers = {**headers, "Authorization": f"Bearer {token}"}
+        if self._client.is_closed:
+            raise StorageError("the client is closed; open another one")
         attempts = _ATTEMPTS if (method in _SAFE if repeat is None else repeat) else 1
         for attempt in range(attempts):
             try:

@@ -1,0 +1,394 @@
+"""Who may do what on a server, and what attackers try. The routes come from its OpenAPI document, so that none is
+forgotten."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpx
+import jwt
+import numpy as np
+import pytest
+from serving import PASSWORD, serving
+from test_storage import episode, query
+
+from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.recording import Recording
+from tupli_mcap.schema import ArtifactMetadata, EpisodeHeader, F
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.storage import TupliAPIClient
+
+FOR_ALL = {("GET", "/"), ("GET", "/health"), ("POST", "/v1/tokens"), ("POST", "/v1/tokens/refresh"),
+           ("POST", "/v1/tokens/end")}  # fmt: skip
+WITH_TICKET = "/v1/files/{name}"
+READING = {
+    ("GET", "/v1/me"), ("GET", "/v1/users"), ("GET", "/v1/groups"), ("GET", "/v1/groups/{name}"),
+    ("GET", "/v1/roles"), ("POST", "/v1/benchmarks/list"), ("GET", "/v1/benchmarks/{uri}"),
+    ("POST", "/v1/artifacts/list"), ("GET", "/v1/artifacts/{uri}"), ("GET", "/v1/artifacts/{uri}/users"),
+    ("POST", "/v1/episodes/list"), ("POST", "/v1/episodes/count"), ("POST", "/v1/tickets"),
+}  # fmt: skip
+"""Routes that change nothing; every other one needs a token that may write."""
+BODIES: dict[str, Any] = {
+    "/v1/tokens": {"username": "x", "password": "y"},
+    "/v1/tokens/refresh": {"refresh_token": "x"},
+    "/v1/tokens/end": {"refresh_token": "x"},
+    "/v1/users": {"username": "eve", "password": "y"},
+    "/v1/users/{username}/password": {"password": "y"},
+    "/v1/groups": {"name": "g"},
+    "/v1/groups/{name}/members": [{"user": "ann"}],
+    "/v1/roles": {"role": "r", "rights": []},
+    "/v1/api-tokens": {"name": "t"},
+    "/v1/benchmarks": {"hash": "h", "serialized": "s", "metadata": {"name": "n"}},
+    "/v1/episodes/delete": {"filter": {"type": "EQ", "key": "steps", "value": 1}},
+    "/v1/episodes/publish": {"filter": None, "group": "g"},
+    "/v1/episodes/keys": {"key": "metadata.x"},
+    "/v1/tickets": {"recording": "x"},
+}
+HEADERS = {
+    "Artifact-Metadata": base64.b64encode(b'{"name": "x"}').decode(),
+    "Upload-Length": "5",
+    "Upload-Offset": "0",
+    "Upload-Metadata": f"sha256 {base64.b64encode(b'0' * 64).decode()}",
+}
+
+
+class Users(NamedTuple):
+    """Clients of one server: the admin, and three users."""
+
+    url: str
+    admin: TupliAPIClient
+    ann: TupliAPIClient
+    bob: TupliAPIClient
+    eve: TupliAPIClient
+
+
+def client(url: str, name: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> TupliAPIClient:
+    """A user's client, on a machine of their own."""
+    monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(place / name))
+    monkeypatch.setenv("TUPLI_MCAP_DATA_DIR", str(place / name))
+    found = TupliAPIClient(url)
+    found.login(name, PASSWORD if name == "admin" else f"{name}-password")
+    return found
+
+
+@pytest.fixture
+def users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Users]:
+    with serving(Settings(tmp_path / "served")) as url:
+        admin = client(url, "admin", tmp_path, monkeypatch)
+        for name in ("ann", "bob", "eve"):
+            admin.signup(name, f"{name}-password")
+        rest = [client(url, name, tmp_path, monkeypatch) for name in ("ann", "bob", "eve")]
+        yield Users(url, admin, *rest)
+        for each in (admin, *rest):
+            each.close()
+
+
+def token_of(user: TupliAPIClient) -> dict[str, str]:
+    return {"Authorization": f"Bearer {user._session._token()}"}
+
+
+def routes(url: str) -> list[tuple[str, str]]:
+    document = httpx.get(f"{url}/openapi.json").json()
+    found = [(method.upper(), path) for path, item in document["paths"].items() for method in item]
+    assert len(found) > 45
+    return found
+
+
+def call(url: str, method: str, path: str, headers: dict[str, str], **names: str) -> httpx.Response:
+    known = {"uri": "0" * 64, "name": "x", "username": "nobody", "user": "x", "role": "x", "token": "x",
+             "upload_id": "0" * 32} | names  # fmt: skip
+    target = url + path.format(**known)
+    body = None if method in ("GET", "HEAD", "DELETE") else BODIES.get(path, {})
+    params = {"group": "global"} if path.endswith("/published") else {}
+    return httpx.request(method, target, headers={**HEADERS, **headers}, json=body, params=params)
+
+
+# --- every route ---
+
+
+def test_without_a_token_nothing_is_shown(users: Users) -> None:
+    for method, path in routes(users.url):
+        status = call(users.url, method, path, {}).status_code
+        if (method, path) in FOR_ALL:
+            assert status in (200, 401), (method, path)
+        elif path == WITH_TICKET:
+            assert status == 422, (method, path)  # there is no ticket
+        else:
+            assert status == (403 if (method, path) == ("POST", "/v1/users") else 401), (method, path, status)
+
+
+def test_a_token_that_may_read_changes_nothing(users: Users) -> None:
+    made = users.ann._session.ask("POST", "/v1/api-tokens", {"name": "laptop", "scope": "read"})
+    token = {"Authorization": f"Bearer {made['token']}"}
+    for method, path in routes(users.url):
+        if (method, path) in FOR_ALL or path == WITH_TICKET:
+            continue
+        status = call(users.url, method, path, token).status_code
+        if (method, path) in READING:
+            assert status in (200, 403, 404), (method, path, status)
+        else:
+            assert status == 403, (method, path, status)
+    assert users.ann.list_benchmarks() == []
+    users.ann._session.ask("DELETE", f"/v1/api-tokens/{made['id']}")
+    assert httpx.get(f"{users.url}/v1/me", headers=token).status_code == 401
+
+
+class Things(NamedTuple):
+    """What ann has stored."""
+
+    benchmark: str
+    artifact: str
+    episodes: list[EpisodeHeader]
+
+
+@pytest.fixture
+def things(users: Users) -> Things:
+    artifact = users.ann.store_artifact(b"wind", ArtifactMetadata(name="wind")).id
+    benchmark = users.ann.store_benchmark(query(artifacts=(artifact,))).id
+    return Things(benchmark, artifact, users.ann.record_episodes([episode(benchmark), episode(benchmark, 5)]))
+
+
+def statuses(user: Users, caller: TupliAPIClient, things: Things) -> dict[tuple[str, str], int]:
+    """What each route that names something of ann's answers."""
+    ids = {"/v1/benchmarks": things.benchmark, "/v1/artifacts": things.artifact}
+    found = {}
+    for method, path in routes(user.url):
+        if "{uri}" in path:
+            uri = next((ids[start] for start in ids if path.startswith(start)), things.episodes[0].id)
+            found[method, path] = call(user.url, method, path, token_of(caller), uri=uri).status_code
+    assert len(found) == 12
+    return found
+
+
+def test_what_may_not_be_read_is_not_there(users: Users, things: Things) -> None:
+    for stranger in (users.bob, users.eve):
+        assert set(statuses(users, stranger, things).values()) == {404}
+        told = {"recording": things.episodes[0].recording}
+        with pytest.raises(NotFoundError):
+            stranger._session.ask("POST", "/v1/tickets", told)
+        assert stranger.list_benchmarks() == stranger.list_artifacts() == stranger.list_episodes() == []
+        assert stranger.count_episodes() == stranger.delete_episodes(F("steps") > 0) == 0
+    reading = {key: status for key, status in statuses(users, users.admin, things).items() if key[0] == "GET"}
+    assert set(reading.values()) == {404}  # what is private stays so for an admin
+
+
+def test_what_is_published_in_a_group_is_read_there_and_nowhere_else(users: Users, things: Things) -> None:
+    users.ann.create_group("robots", "those with arms")
+    users.ann.add_group_members("robots", [{"user": "bob", "roles": ["member"]}])
+    users.ann.publish_benchmark(things.benchmark, "robots")
+    users.ann.publish_artifact(things.artifact, "robots")
+    users.ann.publish_episode(things.episodes[0].id, "robots")
+    for (method, path), status in statuses(users, users.bob, things).items():
+        assert status == (200 if method == "GET" else 403), (method, path, status)
+    assert set(statuses(users, users.eve, things).values()) == {404}
+    assert users.bob.load_artifact(things.artifact) == b"wind"
+    assert [header.id for header in users.bob.list_episodes()] == [things.episodes[0].id]
+    with pytest.raises(StorageError, match="only its owner may delete"):
+        users.bob.delete_episodes(F("steps") > 0)
+
+    users.ann.remove_group_members("robots", ["bob"])
+    assert set(statuses(users, users.bob, things).values()) == {404}
+    users.ann.add_group_members("robots", [{"user": "bob", "roles": ["member"]}])
+    users.ann.unpublish_episodes(F("steps") > 0, "robots")
+    assert users.bob.list_episodes() == []
+
+
+def test_a_recording_is_cut_to_what_may_be_read(users: Users, things: Things) -> None:
+    users.ann.publish_episode(things.episodes[1].id)
+    (header,) = users.eve.list_episodes()
+    with (
+        users.eve.open_recording(header.recording) as cut,
+        users.ann.open_recording(header.recording) as whole,
+    ):
+        assert (cut.uuid, len(cut), len(whole)) == (whole.uuid, 1, 2)
+        np.testing.assert_array_equal(cut.episodes[0].states, whole.episodes[1].states)
+    users.ann.delete_episode(things.episodes[0].id)
+    with users.ann.open_recording(header.recording) as left:
+        assert [int(number) for number in left.index["episode"]] == [1]
+
+
+def test_the_same_content_of_two_users(users: Users, things: Things) -> None:
+    """Neither is told of the other."""
+    other = users.bob.store_artifact(b"wind", ArtifactMetadata(name="my wind"))
+    assert (other.created_by, other.name) == ("bob", "my wind")
+    mine = users.bob.store_benchmark(query(artifacts=(other.id,)))
+    assert (mine.id, mine.created_by) == (things.benchmark, "bob")
+    users.ann.delete_artifact(things.artifact, force=True)
+    assert users.bob.load_artifact(other.id) == b"wind"
+    users.bob.delete_benchmark(mine.id)
+    assert users.ann.load_benchmark(things.benchmark).created_by == "ann"
+
+
+# --- names, passwords, tokens ---
+
+
+def test_users_and_groups_have_one_name_space(users: Users) -> None:
+    for name in ("ann", "global", "$$GUEST$$"):
+        with pytest.raises(StorageError, match="already exists"):
+            users.eve.create_group(name)
+    users.eve.create_group("lab")
+    for name in ("lab", "global", "bob"):
+        with pytest.raises(StorageError, match="already exists|expected a user name"):
+            users.admin.signup(name, "password")
+    users.admin.delete_user("bob")
+    with pytest.raises(StorageError, match="already exists"):  # who would own what bob made
+        users.admin.signup("bob", "password")
+    with pytest.raises(NotFoundError, match="Group not found"):
+        users.ann.read_group("lab")
+
+
+def test_nobody_gives_rights_that_they_lack(users: Users) -> None:
+    users.eve.create_group("lab")
+    with pytest.raises(StorageError, match="Insufficient permissions in group: lab"):
+        users.eve.add_group_members("lab", [{"user": "eve", "roles": ["admin"]}])
+    with pytest.raises(StorageError, match="Group not found|Insufficient permissions"):
+        users.eve.add_group_members("global", [{"user": "eve", "roles": ["admin"]}])
+    with pytest.raises(StorageError, match="Insufficient permissions"):
+        users.eve.create_role("mighty", ["role_management"])
+    with pytest.raises(StorageError, match="cannot be deleted"):
+        users.admin.delete_role("admin")
+
+
+def test_a_new_password_ends_every_sign_in(users: Users) -> None:
+    old = token_of(users.ann)
+    made = users.ann._session.ask("POST", "/v1/api-tokens", {"name": "robot", "scope": "write"})
+    with pytest.raises(StorageError, match="the old password is not right"):
+        users.ann.change_password("ann", "new", old="wrong")
+    users.ann.change_password("ann", "new", old="ann-password")
+    for token in (old, {"Authorization": f"Bearer {made['token']}"}):
+        assert httpx.get(f"{users.url}/v1/me", headers=token).status_code == 401
+    with pytest.raises(StorageError, match="tupli-mcap login"):
+        users.ann.list_benchmarks()
+    users.ann.login("ann", "new")
+    assert users.ann.whoami()["username"] == "ann"
+
+
+def test_a_refresh_token_that_is_used_twice_ends_the_sign_in(users: Users) -> None:
+    pair = httpx.post(f"{users.url}/v1/tokens", json={"username": "ann", "password": "ann-password"}).json()
+    told = {"refresh_token": pair["refresh_token"]}
+    second = httpx.post(f"{users.url}/v1/tokens/refresh", json=told)
+    assert second.status_code == 200
+    assert httpx.post(f"{users.url}/v1/tokens/refresh", json=told).status_code == 401
+    told = {"refresh_token": second.json()["refresh_token"]}
+    assert httpx.post(f"{users.url}/v1/tokens/refresh", json=told).status_code == 401
+
+
+def test_an_expired_access_token_is_renewed_by_the_client(users: Users) -> None:
+    kept = users.ann._session._tokens
+    kept.put(users.url, {**kept.of(users.url), "access_token": "expired"})
+    assert users.ann.whoami()["username"] == "ann"
+
+
+def test_forged_tokens(users: Users, tmp_path: Path) -> None:
+    secret = (tmp_path / "served" / "server" / "secret").read_bytes()
+    good = {"typ": "access", "sub": "admin", "epoch": 0, "exp": int(time.time()) + 60}
+    forged = [
+        jwt.encode(good, "another secret that is long enough!", algorithm="HS256"),
+        jwt.encode(good, None, algorithm="none"),
+        jwt.encode({**good, "exp": int(time.time()) - 1}, secret, algorithm="HS256"),
+        jwt.encode({**good, "typ": "ticket"}, secret, algorithm="HS256"),
+        jwt.encode({**good, "epoch": 7}, secret, algorithm="HS256"),
+        jwt.encode({**good, "sub": "nobody"}, secret, algorithm="HS256"),
+        jwt.encode({**good, "sub": ["admin"]}, secret, algorithm="HS256"),
+        "tmcap_guess", "x.y.z", "x" * 5000,
+    ]  # fmt: skip
+    for token in forged:
+        answer = httpx.get(f"{users.url}/v1/me", headers={"Authorization": f"Bearer {token}"})
+        assert answer.status_code == 401, token
+    real = jwt.encode(good, secret, algorithm="HS256")
+    assert httpx.get(f"{users.url}/v1/me", headers={"Authorization": f"Bearer {real}"}).status_code == 200
+
+
+def test_a_wrong_password_tells_nothing_of_the_user_and_many_are_throttled(users: Users) -> None:
+    answers = [
+        httpx.post(f"{users.url}/v1/tokens", json={"username": name, "password": "wrong"})
+        for name in ("ann", "nobody", "", "ann'; --")
+    ]
+    assert {(answer.status_code, answer.json()["detail"]) for answer in answers} == {
+        (401, "Incorrect username or password")
+    }
+    for _ in range(20):
+        last = httpx.post(f"{users.url}/v1/tokens", json={"username": "ann", "password": "wrong"})
+    assert last.status_code == 429
+    assert 0 < int(last.headers["Retry-After"]) <= 60
+
+
+# --- uploads and files ---
+
+
+def begin(url: str, token: dict[str, str], data: bytes, length: int | None = None) -> str:
+    digest = base64.b64encode(hashlib.sha256(data).hexdigest().encode()).decode()
+    headers = {"Upload-Length": str(length or len(data)), "Upload-Metadata": f"sha256 {digest}", **token}
+    answer = httpx.post(f"{url}/v1/uploads", headers=headers)
+    assert answer.status_code == 201, answer.text
+    return url + answer.headers["Location"]
+
+
+def patch(place: str, token: dict[str, str], data: bytes, offset: int = 0) -> httpx.Response:
+    return httpx.patch(place, headers={"Upload-Offset": str(offset), **token}, content=data)
+
+
+def test_an_upload_goes_on_where_it_was_broken_off(users: Users, tmp_path: Path) -> None:
+    from tupli_mcap.wrappers.rollout import record_rollouts
+
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=100, seed=1)
+    data, token = (tmp_path / "run.mcap").read_bytes(), token_of(users.ann)
+    place = begin(users.url, token, data)
+    assert patch(place, token, data[:1000]).headers["Upload-Offset"] == "1000"
+    assert begin(users.url, token, data) == place  # asked again, it is the same one
+    assert httpx.head(place, headers=token).headers["Upload-Offset"] == "1000"
+    assert patch(place, token, data[500:], 500).status_code == 409
+    assert httpx.head(place, headers=token_of(users.eve)).status_code == 404
+    name = users.ann.push(tmp_path / "run.mcap")
+    assert users.ann.push(tmp_path / "run.mcap") == name
+    with users.ann.open_recording(name) as sent, Recording(tmp_path / "run.mcap") as original:
+        assert sent.uuid == original.uuid
+    assert users.ann.count_episodes() == len(Recording(tmp_path / "run.mcap"))
+
+
+def test_what_is_no_recording_is_not_kept(users: Users, tmp_path: Path) -> None:
+    token = token_of(users.ann)
+    for sent, announced in ((b"nonsense" * 100, None), (b"x" * 800, b"y" * 800)):
+        place = begin(users.url, token, announced or sent)
+        answer = patch(place, token, sent)
+        assert answer.status_code == 400, answer.text
+        assert httpx.head(place, headers=token).status_code == 404
+    place = begin(users.url, token, b"abc", length=3)
+    assert patch(place, token, b"abcd").status_code == 413
+    kept = [path for path in (tmp_path / "served").rglob("*.mcap") if path.is_file()]
+    assert (kept, users.ann.list_episodes()) == ([], [])
+
+
+def test_ranges_and_versions_of_a_file(users: Users, things: Things) -> None:
+    told = users.ann._session.ask("POST", "/v1/tickets", {"recording": things.episodes[0].recording})
+    url = users.url + told["path"]
+    whole = httpx.get(url)
+    assert hashlib.sha256(whole.content).hexdigest() == told["digest"] == whole.headers["ETag"].strip('"')
+    part = httpx.get(url, headers={"Range": "bytes=-10", "If-Match": whole.headers["ETag"]})
+    assert (part.status_code, part.content) == (206, whole.content[-10:])
+    assert httpx.get(url, headers={"If-Match": '"another"'}).status_code == 412
+    other = url.replace("recordings/", "recordings/../")
+    assert httpx.get(other).status_code in (401, 404)
+
+
+def test_guests_see_what_is_published_where_they_may(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(Settings(tmp_path / "served", guests=True)) as url:
+        admin = client(url, "admin", tmp_path, monkeypatch)
+        benchmark = admin.store_benchmark(query()).id
+        made = admin.record_episodes([episode(benchmark), episode(benchmark)])
+        admin.publish_benchmark(benchmark)
+        admin.publish_episode(made[0].id)
+        monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "guest"))
+        with TupliAPIClient(url) as guest:
+            assert [header.id for header in guest.list_benchmarks()] == [benchmark]
+            (header,) = guest.list_episodes()
+            with guest.open_recording(header.recording) as recording:
+                assert len(recording) == 1
+            with pytest.raises(StorageError, match="guests may change nothing; sign in"):
+                guest.store_artifact(b"x", ArtifactMetadata(name="x"))
+        admin.close()
