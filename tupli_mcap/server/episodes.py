@@ -14,9 +14,9 @@ from sqlalchemy.sql.elements import ColumnElement
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
-from tupli_mcap.server.access import Caller, DeniedError, Right, readable
-from tupli_mcap.server.accounts import ConflictError
 from tupli_mcap.server.database import audience, audit
+from tupli_mcap.server.people.access import Caller, DeniedError, Right, readable
+from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.tables import FILE, ITEM
 from tupli_mcap.storage.base import published_in
 from tupli_mcap.storage.catalog import queries

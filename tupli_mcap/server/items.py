@@ -25,9 +25,9 @@ from tupli_mcap.schema import (
     compile_predicate,
 )
 from tupli_mcap.schema.times import time_ns
-from tupli_mcap.server.access import Caller, DeniedError, Right, readable
 from tupli_mcap.server.blobs import Blobs
 from tupli_mcap.server.database import audience, audit
+from tupli_mcap.server.people.access import Caller, DeniedError, Right, readable
 from tupli_mcap.server.tables import ITEM
 from tupli_mcap.storage.base import published_in
 from tupli_mcap.storage.benchmark_json import artifacts_of, plain, unpack

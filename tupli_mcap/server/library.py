@@ -11,15 +11,16 @@ from sqlalchemy import select
 from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter
-from tupli_mcap.server import accounts, episodes
-from tupli_mcap.server.access import Caller
+from tupli_mcap.server import episodes
 from tupli_mcap.server.blobs import DirectoryBlobs
 from tupli_mcap.server.database import Database
 from tupli_mcap.server.items import Items, artifact_key
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people.access import Caller
+from tupli_mcap.server.people.throttle import Throttle
+from tupli_mcap.server.people.tokens import Tokens
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import FILE, ITEM, MEMBERSHIP, USER
-from tupli_mcap.server.throttle import Throttle
-from tupli_mcap.server.tokens import Tokens
 from tupli_mcap.server.uploads import Upload, Uploads
 from tupli_mcap.storage.texts import escape_text
 

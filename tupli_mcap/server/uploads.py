@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap.errors import NotFoundError, StorageError
-from tupli_mcap.server.access import Caller
+from tupli_mcap.server.people.access import Caller
 from tupli_mcap.storage.atomic import write_bytes
 
 __all__ = ["BusyError", "Upload", "Uploads"]

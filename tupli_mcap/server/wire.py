@@ -12,9 +12,9 @@ from pydantic import BaseModel, Field
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FilterError, FormatError, NotFoundError, SpaceError, StorageError, TupliError
 from tupli_mcap.schema import BaseFilter
-from tupli_mcap.server.access import DeniedError
-from tupli_mcap.server.accounts import ConflictError
-from tupli_mcap.server.tokens import SignInError
+from tupli_mcap.server.people.access import DeniedError
+from tupli_mcap.server.people.accounts import ConflictError
+from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.uploads import BusyError
 
 __all__ = ["Error", "Found", "Listing", "answer", "listed", "tell_errors"]

@@ -8,11 +8,11 @@ from typing import Any
 from fastapi import APIRouter, HTTPException, Request
 from pydantic import BaseModel, Field
 
-from tupli_mcap.server import accounts
-from tupli_mcap.server.access import Right
 from tupli_mcap.server.database import audit
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people.access import Right
+from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import AnyCaller, Reader, Served, Writer
-from tupli_mcap.server.tokens import SignInError
 
 __all__ = ["router"]
 

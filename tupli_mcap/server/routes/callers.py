@@ -7,10 +7,10 @@ from typing import Annotated
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from tupli_mcap.server import accounts
-from tupli_mcap.server.access import Caller, DeniedError
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.tokens import SignInError
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people.access import Caller, DeniedError
+from tupli_mcap.server.people.tokens import SignInError
 
 __all__ = ["AnyCaller", "Reader", "Served", "Writer"]
 

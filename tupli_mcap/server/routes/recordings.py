@@ -19,11 +19,12 @@ from starlette.concurrency import run_in_threadpool
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema import FilterEQ
-from tupli_mcap.server import accounts, episodes
-from tupli_mcap.server.access import Right
+from tupli_mcap.server import episodes
 from tupli_mcap.server.library import Library
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people.access import Right
+from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
-from tupli_mcap.server.tokens import SignInError
 from tupli_mcap.server.uploads import Upload
 from tupli_mcap.storage.texts import is_hash
 

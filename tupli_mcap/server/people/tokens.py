@@ -20,8 +20,8 @@ from sqlalchemy import Connection, delete, insert, or_, select, update
 
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError
-from tupli_mcap.server.access import Caller
-from tupli_mcap.server.accounts import caller_named
+from tupli_mcap.server.people.access import Caller
+from tupli_mcap.server.people.accounts import caller_named
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import API_TOKEN, REFRESH_TOKEN, USER
 

@@ -13,8 +13,8 @@ from pwdlib.hashers.argon2 import Argon2Hasher
 from sqlalchemy import Connection, delete, insert, select, update
 
 from tupli_mcap.errors import NotFoundError, StorageError
-from tupli_mcap.server.access import DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError, Right
 from tupli_mcap.server.database import audit
+from tupli_mcap.server.people.access import DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError, Right
 from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, REFRESH_TOKEN, ROLE, USER
 
 __all__ = [

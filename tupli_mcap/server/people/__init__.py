@@ -1,0 +1,7 @@
+"""Who asks, and what they may do.
+
+access      rights, roles, and the one condition for what a caller may read
+accounts    users, groups, roles
+tokens      how users and machines prove who they are
+throttle    passwords are not tried too often
+"""
