@@ -308,6 +308,9 @@ class StorageContract:
         headers = storage.record_episodes([episode(benchmark), episode(benchmark)])
         storage.publish_episode(headers[1].id, "lab")
         assert [h.published_in[-1] == "lab" for h in storage.list_episodes()] == [False, True]
+        assert storage.list_episodes(FilterEQ(key="published_in", value="lab"))[0].id == headers[1].id
+        assert storage.count_episodes(FilterIN(key="published_in", value=["lab", "another"])) == 1
+        assert storage.count_episodes(F("published_in") != "lab") == 1
 
     def test_an_episode_needs_a_benchmark_and_tuples(self, storage: TupliStorage) -> None:
         with pytest.raises(NotFoundError, match="there is no benchmark"):

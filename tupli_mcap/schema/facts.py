@@ -184,8 +184,10 @@ def _time(filter: BaseFilter, value: object, now: datetime.datetime) -> TimeSpan
 
 @lru_cache(maxsize=256)
 def _kinds_of(model: type[BaseModel], name: str) -> frozenset[str]:
-    """The kinds of scalars that a field may hold; none where it holds lists or mappings."""
+    """The kinds of scalars that a field may hold, one or a list of them; none where it holds mappings."""
     annotation = model.model_fields[name].annotation
+    if typing.get_origin(annotation) is list:
+        annotation = typing.get_args(annotation)[0]
     several = typing.get_origin(annotation) in (types.UnionType, typing.Union)
     parts = typing.get_args(annotation) if several else (annotation,)
     return frozenset(_KINDS[part] for part in parts) if set(parts) <= set(_KINDS) else frozenset()

@@ -34,7 +34,7 @@ from tupli_mcap.storage.benchmark_json import artifacts_of, plain, unpack
 from tupli_mcap.storage.benchmarks import document_of, name_in
 from tupli_mcap.storage.texts import is_hash
 
-__all__ = ["Items", "artifact_key"]
+__all__ = ["Items", "Kind", "artifact_key"]
 
 Kind = Literal["benchmark", "artifact"]
 _CREATE: Final = {"benchmark": Right.BENCHMARK_CREATE, "artifact": Right.ARTIFACT_CREATE}

@@ -2,32 +2,41 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import os
 import secrets
+import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import select
 
-from tupli_mcap.errors import FormatError, StorageError
-from tupli_mcap.recording import Recording
-from tupli_mcap.schema import BaseFilter
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError
+from tupli_mcap.recording import Recording, write_recording
+from tupli_mcap.schema import BaseFilter, Episode, EpisodeHeader, EpisodeItem
 from tupli_mcap.server import episodes
 from tupli_mcap.server.blobs import DirectoryBlobs
 from tupli_mcap.server.database import Database
 from tupli_mcap.server.items import Items, artifact_key
 from tupli_mcap.server.people import accounts
-from tupli_mcap.server.people.access import Caller
-from tupli_mcap.server.people.throttle import Throttle
-from tupli_mcap.server.people.tokens import Tokens
+from tupli_mcap.server.people.access import Caller, DeniedError, Right
+from tupli_mcap.server.people.throttle import Throttle, TooManyError
+from tupli_mcap.server.people.tokens import SignInError, Tokens
 from tupli_mcap.server.settings import Settings
-from tupli_mcap.server.tables import FILE, ITEM, MEMBERSHIP, USER
+from tupli_mcap.server.tables import AUDIT, FILE, ITEM, MEMBERSHIP, USER
 from tupli_mcap.server.uploads import Upload, Uploads
+from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
+from tupli_mcap.storage.from_values import episode_data, episode_spaces
+from tupli_mcap.storage.listing import with_tuples
 from tupli_mcap.storage.texts import escape_text
 
 __all__ = ["Library"]
 
 _ADMIN = "admin"
 _PASSWORD_VARIABLE = "TUPLI_MCAP_ADMIN_PASSWORD"
+_MOST_OF_A_USER, _MOST_OF_AN_ADDRESS = 10, 100  # failures a minute
 
 
 class Library:
@@ -61,6 +70,24 @@ class Library:
             connection.execute(MEMBERSHIP.insert().values(user=_ADMIN, team="global", role=_ADMIN))
         return None if chosen else password
 
+    def sign_in(self, username: str, password: str, address: str) -> dict[str, Any]:
+        """Tokens for a user, see `Tokens.pair`.
+
+        Raises:
+            SignInError: the name or the password is wrong.
+            TooManyError: it was wrong too often.
+        """
+        # Failures of a user from an address: somebody elsewhere must not keep the user out.
+        most = {f"{username[:80]} at {address}": _MOST_OF_A_USER, address: _MOST_OF_AN_ADDRESS}
+        wait = self.throttle.wait(most)
+        if wait > 0:
+            raise TooManyError(wait)
+        with self.database.writing() as connection:
+            if accounts.verify_password(connection, username, password):
+                return self.tokens.pair(connection, username)
+        self.throttle.failed(most)
+        raise SignInError("Incorrect username or password")
+
     def take_in(self, caller: Caller, upload: Upload) -> str:
         """Stores a recording that was uploaded as a whole; returns its name.
 
@@ -68,29 +95,75 @@ class Library:
             StorageError: its bytes are not those that were announced, or it is no recording, or has no episodes.
         """
         self.uploads.verify(upload)
-        with self.database.reading() as connection:
-            known = episodes.stored_already(connection, caller, upload.digest)
-        if known is not None:
-            self.uploads.forget(upload)
-            return known
         try:
-            with Recording(upload.path) as recording:
-                if not recording.complete:
-                    raise FormatError(
-                        "expected a finished recording; close or recover it, then send it again"
-                    )
-                name = episodes.new_name(recording.benchmark_id)
-                self.blobs.take(name, upload.path)
-                try:
-                    with self.database.writing() as connection:
-                        replaced = episodes.register(connection, caller, recording, name, upload.digest)
-                except BaseException:
-                    self.blobs.delete(name)
-                    raise
+            with self.database.reading() as connection:
+                known = episodes.stored_already(connection, caller, upload.digest)
+            return known or self._keep(caller, upload.path, upload.digest)
         finally:
             self.uploads.forget(upload)
+
+    def record(self, caller: Caller, episode: Episode) -> str:
+        """Stores an episode that was built by hand as a recording; returns its name.
+
+        Raises:
+            NotFoundError: its benchmark is not stored, or the caller may not read it.
+            SpaceError: its values have no space.
+            StorageError: it has no tuples.
+        """
+        if not episode.tuples:
+            raise StorageError("an episode needs at least one tuple, found none")
+        with self.database.reading() as connection:
+            benchmark = self.items.load_benchmark(connection, caller, episode.benchmark_id)
+        spaces = episode_spaces([episode], declared_spaces(benchmark.serialized))
+        with tempfile.TemporaryDirectory(dir=self.settings.own) as folder:
+            path = Path(folder) / "episode.mcap"
+            write_recording(
+                path,
+                [episode_data(episode, spaces)],
+                observation_space=spaces[0],
+                action_space=spaces[1],
+                reward_space=spaces[2],
+                benchmark_id=benchmark.id,
+                attachments=recording_attachments(benchmark.serialized),
+            )
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            return self._keep(caller, path, digest)
+
+    def _keep(self, caller: Caller, path: Path, digest: str) -> str:
+        """Moves a recording to where it stays, and lists its episodes; returns its name."""
+        with Recording(path) as recording:
+            if not recording.complete:
+                raise FormatError("expected a finished recording; close or recover it, then send it again")
+            name = episodes.new_name(recording.benchmark_id)
+            self.blobs.take(name, path)
+            try:
+                with self.database.writing() as connection:
+                    replaced = episodes.register(connection, caller, recording, name, digest)
+            except BaseException:
+                self.blobs.delete(name)
+                raise
         self.sweep(replaced)
         return name
+
+    def with_tuples(self, headers: Sequence[EpisodeHeader]) -> Iterator[EpisodeItem]:
+        """Episodes of the catalog with their tuples."""
+        return with_tuples(headers, lambda name: Recording(self.blobs.place(name)))
+
+    @contextlib.contextmanager
+    def deleting(self, caller: Caller, action: str, uri: str) -> Iterator[None]:
+        """Deletes for PyTupli's client: what is gone is no error for who deleted it, nor for an admin; all others are
+        denied what is not there, as they are what they may not read."""
+        try:
+            yield
+        except NotFoundError:
+            done = select(AUDIT.c.number).where(
+                AUDIT.c.user == caller.name, AUDIT.c.action.startswith(action), AUDIT.c.target.contains(uri)
+            )
+            with self.database.reading() as connection:
+                known = connection.execute(done.limit(1)).first()
+            if known is None and not caller.may(Right.ROLE_MANAGEMENT):
+                raise DeniedError("You do not have sufficient permissions for this operation.") from None
 
     def delete_episodes(self, caller: Caller, filter: BaseFilter) -> int:
         """Deletes episodes, and files of which none is left; returns how many episodes."""

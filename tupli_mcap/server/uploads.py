@@ -14,11 +14,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.errors import StorageError
 from tupli_mcap.server.people.access import Caller
 from tupli_mcap.storage.atomic import write_bytes
 
-__all__ = ["BusyError", "Upload", "Uploads"]
+__all__ = ["BusyError", "GoneError", "Upload", "Uploads"]
 
 _ID = re.compile("[0-9a-f]{32}")
 _KEPT_SECONDS = 7 * 24 * 3600
@@ -26,6 +26,10 @@ _KEPT_SECONDS = 7 * 24 * 3600
 
 class BusyError(StorageError):
     """Another request writes to the upload."""
+
+
+class GoneError(StorageError):
+    """There is no such upload: it was finished, given up, or is somebody else's."""
 
 
 class Upload(NamedTuple):
@@ -70,10 +74,10 @@ class Uploads:
         return Upload(upload, self._directory / upload, caller.name, length, digest)
 
     def find(self, caller: Caller, upload: str) -> Upload:
-        """An upload of this user. NotFoundError if there is none."""
+        """An upload of this user. GoneError if there is none."""
         found = self._read(upload) if _ID.fullmatch(upload) else None
         if found is None or found.user != caller.name:
-            raise NotFoundError("there is no such upload; begin a new one")
+            raise GoneError("there is no such upload; begin a new one")
         return found
 
     @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any, Final
 
@@ -14,16 +15,19 @@ from tupli_mcap.errors import FilterError, FormatError, NotFoundError, SpaceErro
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.people.accounts import ConflictError
+from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError
-from tupli_mcap.server.uploads import BusyError
+from tupli_mcap.server.uploads import BusyError, GoneError
 
 __all__ = ["Error", "Found", "Listing", "answer", "listed", "tell_errors"]
 
 _STATUS: Final[dict[type[TupliError], int]] = {
     SignInError: 401,
+    TooManyError: 429,
     DeniedError: 403,
     NotFoundError: 404,
     ConflictError: 409,
+    GoneError: 410,
     BusyError: 423,
     FilterError: 400,
     SpaceError: 400,
@@ -79,7 +83,9 @@ def tell_errors(app: FastAPI) -> None:
     @app.exception_handler(TupliError)
     def _tell(request: Request, err: TupliError) -> JSONResponse:
         status = next((_STATUS[kind] for kind in type(err).__mro__ if kind in _STATUS), 500)
-        headers = {"WWW-Authenticate": "Bearer"} if status == 401 else None
+        headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
+        if isinstance(err, TooManyError):
+            headers["Retry-After"] = str(math.ceil(err.seconds))
         kind = next(c.__name__ for c in type(err).__mro__ if c.__module__ == "tupli_mcap.errors")
         text = str(err) if status < 500 else "the server has failed; its log says more"
         return JSONResponse({"detail": text, "error": kind}, status, headers)

@@ -8,9 +8,19 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Final
 
-__all__ = ["Throttle"]
+from tupli_mcap.errors import TupliError
+
+__all__ = ["Throttle", "TooManyError"]
 
 _SECONDS: Final = 60.0
+
+
+class TooManyError(TupliError):
+    """There were too many failures; `seconds` is how long to wait."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__("too many failed attempts; wait a minute")
+        self.seconds = seconds
 
 
 class Throttle:

@@ -52,7 +52,7 @@ class Tokens:
         expires = now + self._settings.refresh_seconds
         connection.execute(insert(REFRESH_TOKEN).values(**row, used=False, expires=expires))
         return {
-            "access_token": self._signed("access", self._settings.access_seconds, sub=user, epoch=epoch),
+            "access_token": self._access(user, epoch),
             "refresh_token": refresh,
             "token_type": "bearer",
             "expires_in": self._settings.access_seconds,
@@ -73,6 +73,27 @@ class Tokens:
             connection.execute(delete(table).where(table.c.family == found.family))
             return None
         return self.pair(connection, found.user, found.family)
+
+    def access_for(self, connection: Connection, refresh: str) -> str:
+        """An access token for a refresh token, which stays as it is: PyTupli's client keeps one for good.
+
+        Raises:
+            SignInError: it is none, was used, or has expired.
+        """
+        table = REFRESH_TOKEN
+        query = (
+            select(table.c.user, USER.c.epoch)
+            .join(USER, USER.c.name == table.c.user)
+            .where(table.c.digest == _digest(refresh), table.c.used.is_(False))
+            .where(table.c.expires > int(time.time()))
+        )
+        found = connection.execute(query).first()
+        if found is None:
+            raise SignInError("Could not validate credentials")
+        return self._access(found.user, found.epoch)
+
+    def _access(self, user: str, epoch: int) -> str:
+        return self._signed("access", self._settings.access_seconds, sub=user, epoch=epoch)
 
     def end(self, connection: Connection, refresh: str) -> None:
         """Ends the sign-in of a refresh token; nothing happens if it is none."""

@@ -5,4 +5,5 @@ accounts     signing in, users, groups, roles, tokens
 items        benchmarks and artifacts
 episodes     episodes: listed, counted, published, deleted
 recordings   recordings: sent, fetched
+pytupli      PyTupli's own routes
 """

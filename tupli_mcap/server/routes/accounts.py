@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
-from fastapi import APIRouter, HTTPException, Request
+from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
 from tupli_mcap.server.database import audit
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Right
 from tupli_mcap.server.people.tokens import SignInError
-from tupli_mcap.server.routes.callers import AnyCaller, Reader, Served, Writer
+from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, Writer
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["accounts"])
-_MOST_OF_A_USER, _MOST_OF_AN_ADDRESS = 10, 100  # failures a minute
 
 
 class Credentials(BaseModel):
@@ -93,20 +91,9 @@ class NewToken(BaseModel):
 
 
 @router.post("/tokens")
-def sign_in(library: Served, request: Request, told: Credentials) -> TokenPair:
+def sign_in(library: Served, address: Address, told: Credentials) -> TokenPair:
     """Signs in."""
-    address = request.client.host if request.client else ""
-    # A user at an address: somebody else's failures must not keep the user out.
-    most = {f"{told.username[:80]} at {address}": _MOST_OF_A_USER, address: _MOST_OF_AN_ADDRESS}
-    wait = library.throttle.wait(most)
-    if wait > 0:
-        after = {"Retry-After": str(math.ceil(wait))}
-        raise HTTPException(429, "too many failed attempts; wait a minute", after)
-    with library.database.writing() as connection:
-        if accounts.verify_password(connection, told.username, told.password):
-            return TokenPair(**library.tokens.pair(connection, told.username))
-    library.throttle.failed(most)
-    raise SignInError("Incorrect username or password")
+    return TokenPair(**library.sign_in(told.username, told.password, address))
 
 
 @router.post("/tokens/refresh")

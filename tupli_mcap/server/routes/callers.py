@@ -12,7 +12,7 @@ from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError
 from tupli_mcap.server.people.tokens import SignInError
 
-__all__ = ["AnyCaller", "Reader", "Served", "Writer"]
+__all__ = ["Address", "AnyCaller", "Reader", "Served", "Writer"]
 
 _BEARER = HTTPBearer(auto_error=False, description="An access token of `POST /v1/tokens`, or an API token.")
 
@@ -23,6 +23,13 @@ def _library(request: Request) -> Library:
 
 
 Served = Annotated[Library, Depends(_library)]
+
+
+def _address(request: Request) -> str:
+    return request.client.host if request.client else ""
+
+
+Address = Annotated[str, Depends(_address)]
 _Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)]
 
 

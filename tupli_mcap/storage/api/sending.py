@@ -24,7 +24,7 @@ from typing import Final
 import platformdirs
 
 from tupli_mcap import files
-from tupli_mcap.errors import NotFoundError, StorageError, TupliError
+from tupli_mcap.errors import StorageError, TupliError
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.storage.api.session import Session, UnreachableError
@@ -40,15 +40,15 @@ _TUS: Final = {"Tus-Resumable": "1.0.0"}
 _DATA_VARIABLE: Final = "TUPLI_MCAP_DATA_DIR"
 
 _turn = threading.Lock()
-_outboxes: dict[tuple[int, str, str], Outbox] = {}
+_outboxes: dict[tuple[int, tuple[str, ...]], Outbox] = {}
 
 
 def outbox_of(session: Session) -> Outbox:
     """The outbox of a session's server and user: one in a process, however many clients there are."""
     with _turn:
-        key = (os.getpid(), session.url, session.username)
+        key = (os.getpid(), session.identity)
         if key not in _outboxes:
-            _outboxes[key] = Outbox(Session(session.url))
+            _outboxes[key] = Outbox(session.another())
         return _outboxes[key]
 
 
@@ -182,7 +182,7 @@ def send_file(session: Session, path: Path) -> str:
             return _send_rest(
                 session, path, begun.headers["Location"], int(begun.headers["Upload-Offset"]), size
             )
-        except (UnreachableError, NotFoundError):
+        except UnreachableError:
             if attempt == _ATTEMPTS - 1:
                 raise
         time.sleep(0.5 * 2**attempt)

@@ -45,17 +45,26 @@ class Session:
         MissingExtraError: httpx is not installed.
     """
 
-    def __init__(self, url: str | None = None) -> None:
+    def __init__(self, url: str | None = None, tokens: _TokenFile | None = None) -> None:
         try:
             import httpx
         except ImportError as err:
             raise missing_extra("a storage on a server needs httpx", "remote") from err
-        self._tokens = _TokenFile(trust.config_dir() / "servers.json")
+        self._tokens = tokens or _TokenFile(trust.config_dir() / "servers.json")
         self.url = _checked(url or os.environ.get(_URL_VARIABLE) or self._tokens.last() or DEFAULT_URL)
         self._client = client = httpx.Client(
             base_url=self.url, timeout=_TIMEOUT, headers={"Accept": "application/json"}
         )
         weakref.finalize(self, client.close)
+
+    def another(self) -> Session:
+        """One of the same server and user, with connections of its own."""
+        return Session(self.url, self._tokens)
+
+    @property
+    def identity(self) -> tuple[str, str, str]:
+        """Equal for sessions of one server and user, whose tokens lie at one place."""
+        return self.url, self.username, str(self._tokens.path)
 
     @property
     def username(self) -> str:
@@ -160,7 +169,7 @@ class _TokenFile:
     """Tokens by server, readable by this user alone."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
         self._lock = Lock(path.with_name(f"{path.name}.lock"))
 
     def alone(self) -> contextlib.AbstractContextManager[object]:
@@ -182,11 +191,11 @@ class _TokenFile:
             known = {name: kept for name, kept in self._read().items() if name != url}
             if tokens is not None:
                 known[url] = tokens
-            files.write_bytes(self._path, json.dumps(known, indent=2).encode(), permissions=0o600)
+            files.write_bytes(self.path, json.dumps(known, indent=2).encode(), permissions=0o600)
 
     def _read(self) -> dict[str, Any]:
         try:
-            found = json.loads(self._path.read_bytes())
+            found = json.loads(self.path.read_bytes())
         except (OSError, ValueError):
             return {}
         return found if isinstance(found, dict) else {}
@@ -208,7 +217,7 @@ def _error(response: httpx.Response) -> TupliError:
         detail, name = str(told["detail"]), str(told.get("error", ""))
     except (ValueError, KeyError, TypeError, AttributeError):
         detail, name = f"the server answers {response.status_code}", ""
-    if response.status_code in (423, 429, 502, 503, 504):
+    if response.status_code in (410, 423, 429, 502, 503, 504):
         return UnreachableError(f"the server is busy: {detail[:300]!r}")
     kind = getattr(errors, name, StorageError) if name in errors.__all__ else StorageError
     if not issubclass(kind, TupliError) or kind is TupliError:

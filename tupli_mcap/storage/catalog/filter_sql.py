@@ -11,6 +11,7 @@ declared: without them, all is asked again.
 
 from __future__ import annotations
 
+import json
 import math
 import operator
 import re
@@ -164,6 +165,8 @@ def _compared(filter: BaseFilter) -> Narrowed:
         return _exactly(filter, _INTEGERS[name], _bindable)
     if name == "id":
         return _of_ids(filter)
+    if name == "published_in":
+        return _of_groups(filter)
     if filter.type is FilterType.NE or name == "run":  # few runs have many episodes
         return _ALL
     if name in _NUMBERS:
@@ -226,6 +229,17 @@ def _in_metadata(filter: BaseFilter) -> Condition:
     if filter.type not in ORDERING:
         parts.append(func.json_type(EPISODE.c.metadata, where) == "array")  # an element may be equal
     return or_(*parts)
+
+
+def _of_groups(filter: BaseFilter) -> Narrowed:
+    """A comparison with groups, of which the column has a list in JSON."""
+    if filter.type not in (FilterType.EQ, FilterType.IN):
+        return _ALL
+    groups = filter.value if filter.type is FilterType.IN else [filter.value]
+    if len(groups) > _MOST_VALUES:
+        return _ALL
+    held = (EPISODE.c.published_in.contains(json.dumps(group), autoescape=True) for group in groups)
+    return Narrowed(or_(false(), *held), exact=False)
 
 
 def _of_ids(filter: BaseFilter) -> Narrowed:

@@ -1,0 +1,426 @@
+"""PyTupli's own routes, for its client as it is: the same functions under other names.
+
+Unlike the routes of `/v1`, they answer 403 both for what is unknown and for what may not be read, except to an admin.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Depends, File, Form, Response
+from fastapi.responses import FileResponse
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from pydantic import BaseModel, ValidationError
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import FilterError, NotFoundError, StorageError
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    ArtifactMetadataItem,
+    BaseFilter,
+    Benchmark,
+    BenchmarkHeader,
+    BenchmarkQuery,
+    Episode,
+    EpisodeHeader,
+    FilterEQ,
+)
+from tupli_mcap.server import episodes
+from tupli_mcap.server.items import Kind, artifact_key
+from tupli_mcap.server.library import Library
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people.access import Caller, DeniedError, Right
+from tupli_mcap.server.people.accounts import ConflictError
+from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served
+from tupli_mcap.server.wire import answer
+from tupli_mcap.storage.texts import first_defect
+
+__all__ = ["router"]
+
+router = APIRouter(tags=["PyTupli's routes"])
+_DENIED = "You do not have sufficient permissions for this operation."
+_BEARER = HTTPBearer(auto_error=False)
+_Filter = Annotated[dict[str, Any] | None, Body()]
+
+
+class Credentials(BaseModel):
+    """A user's name and password."""
+
+    username: str
+    password: str
+
+
+class Group(BaseModel):
+    """A group."""
+
+    name: str
+    description: str | None = None
+
+
+class Member(BaseModel):
+    """A user in a group."""
+
+    user: str
+    roles: list[str] | None = None
+
+
+class Members(BaseModel):
+    """Users of one group."""
+
+    group_name: str
+    members: list[Member]
+
+
+class Role(BaseModel):
+    """A role and its rights."""
+
+    role: str
+    rights: list[Right]
+    description: str | None = None
+
+
+def _changing(caller: Reader) -> Caller:
+    if not caller.is_guest and not caller.may_write:
+        raise DeniedError("this token may only read; make one with the scope 'write'")
+    return caller
+
+
+Changing = Annotated[Caller, Depends(_changing)]
+"""Who changes something. A guest lacks the rights, and is told so."""
+
+
+@contextlib.contextmanager
+def _hidden(caller: Caller, text: str) -> Iterator[None]:
+    """Answers that something is not there only to an admin."""
+    try:
+        yield
+    except NotFoundError as err:
+        if caller.may(Right.ROLE_MANAGEMENT):
+            raise NotFoundError(text) from err
+        raise DeniedError(_DENIED) from err
+
+
+# --- users ---
+
+
+def _user(library: Library, name: str) -> dict[str, Any]:
+    with library.database.reading() as connection:
+        held = accounts.memberships_of(connection, name)
+    return {
+        "username": name,
+        "memberships": [{"group": group, "roles": roles} for group, roles in held.items()],
+    }
+
+
+@router.post("/access/users/create")
+def create_user(library: Served, caller: AnyCaller, told: Credentials) -> dict[str, Any]:
+    """Makes a user."""
+    if not library.settings.open_signup:
+        caller.demand(Right.USER_CREATE)
+    with library.database.writing() as connection:
+        accounts.create_user(connection, told.username, told.password)
+    return _user(library, told.username)
+
+
+@router.get("/access/users/list")
+def list_users(library: Served, caller: Reader) -> list[dict[str, Any]]:
+    """All users."""
+    caller.demand(Right.USER_READ)
+    with library.database.reading() as connection:
+        names = accounts.list_users(connection)
+    return [_user(library, name) for name in names]
+
+
+@router.delete("/access/users/delete")
+def delete_user(library: Served, caller: Changing, username: str) -> None:
+    """Deletes a user; nothing happens if there is none."""
+    caller.demand(Right.USER_DELETE, username)
+    with library.database.writing() as connection:
+        accounts.delete_user(connection, username)
+
+
+@router.put("/access/users/change-password")
+def change_password(library: Served, caller: Changing, told: Credentials) -> None:
+    """Changes a password, and ends all that was signed in with the old one."""
+    caller.demand(Right.USER_UPDATE, told.username)
+    with library.database.writing() as connection:
+        accounts.change_password(connection, told.username, told.password)
+
+
+@router.post("/access/users/token")
+def sign_in(library: Served, address: Address, told: Credentials) -> dict[str, Any]:
+    """Signs in."""
+    pair = library.sign_in(told.username, told.password, address)
+    return {name: {"token": pair[name], "token_type": "bearer"} for name in ("access_token", "refresh_token")}
+
+
+@router.post("/access/users/refresh-token")
+def refresh(
+    library: Served, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)]
+) -> dict[str, str]:
+    """Another access token for a refresh token. `access_token` is where PyTupli's client looks for it."""
+    if credentials is None:
+        raise DeniedError(_DENIED)
+    with library.database.reading() as connection:
+        token = library.tokens.access_for(connection, credentials.credentials)
+    return {"token": token, "token_type": "bearer", "access_token": token}
+
+
+# --- groups and roles ---
+
+
+def _group(library: Library, caller: Caller, name: str) -> dict[str, Any]:
+    with library.database.reading() as connection:
+        found = accounts.members_of(connection, caller, name)
+    members: Any = found["members"]
+    return {**found, "members": [member["user"] for member in members]}
+
+
+@router.post("/access/groups/create")
+def create_group(library: Served, caller: Changing, told: Group) -> Group:
+    """Makes a group that the caller leads."""
+    with library.database.writing() as connection:
+        accounts.create_group(connection, caller, told.name, told.description)
+    return told
+
+
+@router.get("/access/groups/list")
+def list_groups(library: Served, caller: Reader) -> list[dict[str, Any]]:
+    """The groups that the caller may know of."""
+    with library.database.reading() as connection:
+        return [dict(group) for group in accounts.list_groups(connection, caller)]
+
+
+@router.get("/access/groups/read")
+def read_group(library: Served, caller: Reader, group_name: str) -> dict[str, Any]:
+    """A group and the names of its members."""
+    with _hidden(caller, "Group not found"):
+        return _group(library, caller, group_name)
+
+
+@router.delete("/access/groups/delete")
+def delete_group(library: Served, caller: Changing, group_name: str) -> None:
+    """Deletes a group."""
+    if caller.may(Right.ROLE_MANAGEMENT):  # for whom an unknown one is deleted already
+        with contextlib.suppress(NotFoundError), library.database.writing() as connection:
+            accounts.delete_group(connection, caller, group_name)
+        return
+    with _hidden(caller, "Group not found"), library.database.writing() as connection:
+        accounts.delete_group(connection, caller, group_name)
+
+
+@router.post("/access/groups/add-members")
+def add_members(library: Served, caller: Changing, told: Members) -> dict[str, Any]:
+    """Gives users roles in a group."""
+    with library.database.writing() as connection:
+        for member in told.members:
+            roles = member.roles or ["member"]
+            accounts.add_member(connection, caller, told.group_name, member.user, roles)
+    return _group(library, caller, told.group_name)
+
+
+@router.post("/access/groups/remove-members")
+def remove_members(library: Served, caller: Changing, told: Members) -> dict[str, Any]:
+    """Takes users out of a group."""
+    with library.database.writing() as connection:
+        for member in told.members:
+            accounts.remove_member(connection, caller, told.group_name, member.user)
+    return _group(library, caller, told.group_name)
+
+
+@router.post("/access/roles/create")
+def create_role(library: Served, caller: Changing, told: Role) -> Role:
+    """Makes a role."""
+    with library.database.writing() as connection:
+        accounts.create_role(connection, caller, told.role, told.rights, told.description)
+    return told
+
+
+@router.get("/access/roles/list")
+def list_roles(library: Served, caller: Reader) -> list[Role]:
+    """All roles."""
+    caller.demand(Right.ROLE_MANAGEMENT)
+    with library.database.reading() as connection:
+        return [Role.model_validate(role) for role in accounts.list_roles(connection)]
+
+
+@router.delete("/access/roles/delete")
+def delete_role(library: Served, caller: Changing, role_name: str) -> None:
+    """Deletes a role, wherever it was given."""
+    with library.database.writing() as connection:
+        accounts.delete_role(connection, caller, role_name)
+
+
+# --- benchmarks and artifacts ---
+
+
+def _publish(library: Library, caller: Caller, kind: Kind, uri: str, group: str) -> None:
+    with _hidden(caller, f"{kind.title()} not found"), library.database.writing() as connection:
+        library.items.publish(connection, caller, kind, uri, group)
+
+
+def _unpublish(library: Library, caller: Caller, kind: Kind, uri: str, group: str) -> None:
+    with _hidden(caller, f"{kind.title()} not found"), library.database.writing() as connection:
+        library.items.unpublish(connection, caller, kind, uri, group)
+
+
+@router.post("/benchmarks/create", response_model=BenchmarkHeader)
+def store_benchmark(library: Served, caller: Changing, told: BenchmarkQuery) -> Response:
+    """Stores a benchmark that the caller does not have yet."""
+    own = FilterEQ(key="hash", value=told.hash) & FilterEQ(key="created_by", value=caller.name)
+    with library.database.writing() as connection:
+        if library.items.list_benchmarks(connection, caller, own):
+            raise ConflictError("Benchmark already exists")
+        return answer(library.items.store_benchmark(connection, caller, told))
+
+
+@router.get("/benchmarks/load", response_model=Benchmark)
+def load_benchmark(library: Served, caller: Reader, benchmark_id: str) -> Response:
+    """A benchmark with its environment as text."""
+    with _hidden(caller, "Benchmark not found"), library.database.reading() as connection:
+        return answer(library.items.load_benchmark(connection, caller, benchmark_id))
+
+
+@router.post("/benchmarks/list", response_model=list[BenchmarkHeader])
+def list_benchmarks(library: Served, caller: Reader, told: _Filter = None) -> Response:
+    """The benchmarks that a filter is true of."""
+    with library.database.reading() as connection:
+        return answer(library.items.list_benchmarks(connection, caller, _filter(told)))
+
+
+@router.put("/benchmarks/publish")
+def publish_benchmark(library: Served, caller: Changing, benchmark_id: str, publish_in: str) -> None:
+    """Lets a group see a benchmark."""
+    _publish(library, caller, "benchmark", benchmark_id, publish_in)
+
+
+@router.put("/benchmarks/unpublish")
+def unpublish_benchmark(library: Served, caller: Changing, benchmark_id: str, unpublish_from: str) -> None:
+    """Takes a benchmark away from a group."""
+    _unpublish(library, caller, "benchmark", benchmark_id, unpublish_from)
+
+
+@router.delete("/benchmarks/delete")
+def delete_benchmark(library: Served, caller: Changing, benchmark_id: str) -> None:
+    """Deletes a benchmark; its episodes and artifacts stay."""
+    with library.deleting(caller, "delete_benchmark", benchmark_id), library.database.writing() as connection:
+        library.items.delete_benchmark(connection, caller, benchmark_id)
+
+
+@router.post("/artifacts/upload", response_model=ArtifactMetadataItem)
+def store_artifact(
+    library: Served, caller: Changing, data: Annotated[bytes, File()], metadata: Annotated[str, Form()]
+) -> Response:
+    """Stores bytes."""
+    try:
+        told = ArtifactMetadata.model_validate(jsonvalue.loads(metadata))
+    except ValidationError as err:
+        raise StorageError(f"expected the metadata of an artifact: {first_defect(err)}") from err
+    except ValueError as err:
+        raise StorageError(f"expected the metadata of an artifact as JSON: {err}") from err
+    with library.database.writing() as connection:
+        return answer(library.items.store_artifact(connection, caller, data, told))
+
+
+@router.get("/artifacts/download")
+def load_artifact(library: Served, caller: Reader, artifact_id: str) -> FileResponse:
+    """The bytes of an artifact; what is known of it is JSON in `X-Metadata`."""
+    with _hidden(caller, "Artifact does not exist"), library.database.reading() as connection:
+        item = library.items.load_artifact(connection, caller, artifact_id)
+    told = json.dumps(item.model_dump(), default=str)  # in ASCII
+    path = library.path_of(artifact_key(item.id))
+    return FileResponse(path, media_type="application/octet-stream", headers={"X-Metadata": told})
+
+
+@router.post("/artifacts/list", response_model=list[ArtifactMetadataItem])
+def list_artifacts(library: Served, caller: Reader, told: _Filter = None) -> Response:
+    """The artifacts that a filter is true of."""
+    with library.database.reading() as connection:
+        return answer(library.items.list_artifacts(connection, caller, _filter(told)))
+
+
+@router.put("/artifacts/publish")
+def publish_artifact(library: Served, caller: Changing, artifact_id: str, publish_in: str) -> None:
+    """Lets a group see an artifact."""
+    _publish(library, caller, "artifact", artifact_id, publish_in)
+
+
+@router.put("/artifacts/unpublish")
+def unpublish_artifact(library: Served, caller: Changing, artifact_id: str, unpublish_from: str) -> None:
+    """Takes an artifact away from a group."""
+    _unpublish(library, caller, "artifact", artifact_id, unpublish_from)
+
+
+@router.delete("/artifacts/delete")
+def delete_artifact(library: Served, caller: Changing, artifact_id: str) -> None:
+    """Deletes an artifact, needed or not, as PyTupli does."""
+    with library.deleting(caller, "delete_artifact", artifact_id):
+        library.delete_artifact(caller, artifact_id, force=True)
+
+
+# --- episodes ---
+
+
+@router.post("/episodes/record", response_model=EpisodeHeader)
+def record_episode(library: Served, caller: Changing, told: Episode) -> Response:
+    """Stores an episode, as a recording of its own."""
+    with _hidden(caller, "Benchmark id doesn't exist"):
+        name = library.record(caller, told)
+    with library.database.reading() as connection:
+        (header,) = episodes.find_episodes(connection, caller, FilterEQ(key="recording", value=name))
+    return answer(header)
+
+
+@router.post("/episodes/list", response_model=list[EpisodeHeader])
+def list_episodes(library: Served, caller: Reader, told: _Filter = None) -> Response:
+    """The episodes that a filter is true of, with their tuples if `include_tuples` says so."""
+    with_tuples = bool((told or {}).get("include_tuples"))
+    with library.database.reading() as connection:
+        found = list(episodes.find_episodes(connection, caller, _filter(told)))
+    if not with_tuples:
+        return answer(found)
+    items = [item.model_dump() for item in library.with_tuples(found)]
+    return Response(jsonvalue.dumps_plain(items), media_type="application/json")
+
+
+@router.put("/episodes/publish")
+def publish_episode(library: Served, caller: Changing, episode_id: str, publish_in: str) -> None:
+    """Lets a group see an episode."""
+    with _hidden(caller, "Episode not found"), library.database.writing() as connection:
+        episodes.publish(connection, caller, episode_id, publish_in)
+
+
+@router.put("/episodes/unpublish")
+def unpublish_episode(library: Served, caller: Changing, episode_id: str, unpublish_from: str) -> None:
+    """Takes an episode away from a group."""
+    with _hidden(caller, "Episode not found"), library.database.writing() as connection:
+        episodes.unpublish(connection, caller, episode_id, unpublish_from)
+
+
+@router.delete("/episodes/delete")
+def delete_episode(library: Served, caller: Changing, episode_id: str) -> None:
+    """Deletes an episode."""
+    with library.deleting(caller, "delete_episode", episode_id):
+        if not library.delete_episodes(caller, FilterEQ(key="id", value=episode_id)):
+            raise episodes.no_episode(episode_id)
+
+
+def _filter(told: dict[str, Any] | None) -> BaseFilter | None:
+    """A filter of PyTupli's: without parts it is true of everything, and fields that it does not know do not count."""
+    if not told or (told.get("key") is None and not told.get("filters")):
+        return None
+    try:
+        return BaseFilter.model_validate(_known(told, 0))
+    except ValidationError as err:
+        raise FilterError(f"expected a filter: {first_defect(err)}") from err
+
+
+def _known(told: Any, depth: int) -> dict[str, Any]:
+    if not isinstance(told, dict) or depth > 32:
+        raise FilterError("expected a filter: an object with type, and key and value, or filters")
+    parts = told.get("filters") or []
+    found = {"type": told.get("type", "OR"), "filters": [_known(part, depth + 1) for part in parts]}
+    return found if told.get("key") is None else {**found, "key": told["key"], "value": told.get("value")}
