@@ -23,6 +23,7 @@ def serving(settings: Settings) -> Iterator[str]:
     with pytest_environment("TUPLI_MCAP_ADMIN_PASSWORD", PASSWORD):
         library = Library(settings)
         library.first_password()
+        library.adopt()
     config = uvicorn.Config(create_app(library), host="127.0.0.1", port=0, log_level="warning")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)

@@ -21,7 +21,7 @@ from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import ArtifactMetadata, EpisodeHeader, F
 from tupli_mcap.server.settings import Settings
-from tupli_mcap.storage import TupliAPIClient
+from tupli_mcap.storage import FileStorage, TupliAPIClient
 
 FOR_ALL = {
     ("GET", "/"), ("GET", "/health"), ("POST", "/v1/tokens"), ("POST", "/v1/tokens/refresh"),
@@ -402,6 +402,28 @@ def test_ranges_and_versions_of_a_file(users: Users, things: Things) -> None:
     assert httpx.get(url, headers={"If-Match": '"another"'}).status_code == 412
     other = url.replace("recordings/", "recordings/../")
     assert httpx.get(other).status_code in (401, 404)
+
+
+def test_a_directory_that_is_a_storage_is_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with FileStorage(tmp_path / "lab") as storage:
+        artifact = storage.store_artifact(b"wind", ArtifactMetadata(name="wind")).id
+        benchmark = storage.store_benchmark(query(artifacts=(artifact,))).id
+        made = storage.record_episodes([episode(benchmark), episode(benchmark), episode(benchmark)])
+        storage.delete_episode(made[1].id)
+    for _ in range(2):
+        with serving(Settings(tmp_path / "lab")) as url:
+            admin = client(url, "admin", tmp_path, monkeypatch)
+            assert [header.id for header in admin.list_episodes()] == [made[0].id, made[2].id]
+            assert admin.load_benchmark(benchmark).created_by == "admin"
+            assert admin.load_artifact(artifact) == b"wind"
+            with admin.open_recording(made[0].recording) as recording:
+                assert len(recording) == 2
+            admin.close()
+    with serving(Settings(tmp_path / "lab")) as url:
+        admin = client(url, "admin", tmp_path, monkeypatch)
+        assert admin.delete_episodes(F("steps") > 0) == 2
+        admin.close()
+    assert not (tmp_path / "lab" / made[0].recording).exists()
 
 
 def test_guests_see_what_is_published_where_they_may(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import sqlite3
 import time
 from collections.abc import Iterator, Sequence
 
-from sqlalchemy import Connection, Engine, create_engine, event, insert, select
+from sqlalchemy import Connection, Engine, create_engine, delete, event, insert, select
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from tupli_mcap.errors import StorageError
@@ -16,7 +16,7 @@ from tupli_mcap.server import tables
 from tupli_mcap.storage.catalog.tables import METADATA as CATALOG
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["Database", "audience", "audit"]
+__all__ = ["Database", "audience", "audit", "pend", "settle"]
 
 _BUSY_MS = 30_000
 
@@ -68,6 +68,18 @@ def audit(connection: Connection, user: str, action: str, target: str) -> None:
     """Notes that a user has changed something."""
     row = {"time": int(time.time()), "user": user, "action": action, "target": escape_text(target[:500])}
     connection.execute(insert(tables.AUDIT).values(**row))
+
+
+def pend(connection: Connection, name: str) -> None:
+    """Notes that a file is on its way in or out, until `settle`."""
+    settle(connection, name)
+    row = {"path": escape_text(name), "since": int(time.time())}
+    connection.execute(insert(tables.PENDING).values(**row))
+
+
+def settle(connection: Connection, name: str) -> None:
+    """Notes that a file has come, or is gone."""
+    connection.execute(delete(tables.PENDING).where(tables.PENDING.c.path == escape_text(name)))
 
 
 def _engine(url: str) -> Engine:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import Connection, and_, delete, insert, select, update
@@ -14,7 +14,7 @@ from sqlalchemy.sql.elements import ColumnElement
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
-from tupli_mcap.server.database import audience, audit
+from tupli_mcap.server.database import audience, audit, pend, settle
 from tupli_mcap.server.people.access import Caller, DeniedError, Right, readable
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.tables import FILE, ITEM
@@ -100,9 +100,16 @@ def stored_already(connection: Connection, caller: Caller, digest: str) -> str |
 
 
 def register(
-    connection: Connection, caller: Caller, recording: Recording, name: str, digest: str
+    connection: Connection,
+    caller: Caller,
+    recording: Recording,
+    name: str,
+    digest: str,
+    *,
+    deleted: Collection[int] = (),
 ) -> list[str]:
-    """Lists the episodes of a recording whose file is kept under `name`; returns the names of files to forget.
+    """Lists the episodes of a recording whose file is kept under `name`, but those that are `deleted`; returns the
+    names of files to forget.
 
     A recording that the caller has stored before, and that has grown since, takes the place of what was there:
     its deleted episodes stay deleted, its published ones published.
@@ -117,19 +124,20 @@ def register(
     if not numbers:
         raise StorageError("expected a recording with episodes, found one without any")
     _demand_benchmark(connection, caller, recording.benchmark_id)
-    sidecar = Sidecar(uuid=recording.uuid)
+    sidecar = Sidecar(uuid=recording.uuid, deleted=set(deleted))
     own = select(FILE).where(FILE.c.created_by == caller.name, FILE.c.uuid == recording.uuid)
     earlier = connection.execute(own).all()
     for row in earlier:
         sidecar.deleted |= set(json.loads(row.deleted))
         for header in queries.find_episodes(connection, FilterEQ(key="recording", value=row.path)):
-            if header.episode not in numbers:
+            if header.episode not in numbers and header.episode not in sidecar.deleted:
                 raise ConflictError(
                     f"the recording {recording.uuid} is stored with episode {header.episode}, which this file lacks; "
                     "delete what is stored first"
                 )
             sidecar.published_in[header.episode] = header.published_in
         _forget(connection, row.path)
+    settle(connection, name)
     audience(connection, [caller.name])
     queries.put_recording(
         connection,
@@ -148,7 +156,7 @@ def register(
     }
     connection.execute(insert(FILE).values(**told, **counts))
     audit(connection, caller.name, "store_recording", name)
-    return [row.path for row in earlier]
+    return [row.path for row in earlier if row.path != name]
 
 
 def _demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) -> None:
@@ -244,4 +252,5 @@ def _set_audience(connection: Connection, header: EpisodeHeader, groups: Sequenc
 
 def _forget(connection: Connection, path: str) -> None:
     queries.remove_recording(connection, path)
+    pend(connection, path)
     connection.execute(delete(FILE).where(FILE.c.path == escape_text(path)))

@@ -26,7 +26,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.server.blobs import Blobs
-from tupli_mcap.server.database import audience, audit
+from tupli_mcap.server.database import audience, audit, pend
 from tupli_mcap.server.people.access import Caller, DeniedError, Right, readable
 from tupli_mcap.server.tables import ITEM
 from tupli_mcap.storage.base import published_in
@@ -87,7 +87,7 @@ class Items:
         return sorted((h for h in found if matches(h)), key=lambda h: (time_ns(h.created_at) or 0, h.id))
 
     def delete_benchmark(self, connection: Connection, caller: Caller, uri: str) -> None:
-        """Deletes the caller's own benchmark, or with the right to, everybody's."""
+        """Deletes the caller's own benchmark, or with the right to, what others have published."""
         self._delete(connection, caller, "benchmark", uri)
 
     # --- artifacts ---
@@ -126,7 +126,7 @@ class Items:
         ]
 
     def delete_artifact(self, connection: Connection, caller: Caller, uri: str, *, force: bool) -> None:
-        """Deletes the caller's own artifact, or with the right to, everybody's.
+        """Deletes the caller's own artifact, or with the right to, what others have published.
 
         Raises:
             StorageError: a benchmark of its owners needs it, and `force` is not given.
@@ -230,20 +230,17 @@ class Items:
         return list(chosen.values())
 
     def _doomed(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> list[Row[Any]]:
-        """What a deletion takes: the caller's own item, or else with the right to, all of that id.
+        """What a deletion takes: the caller's own item, or else with the right to, all readable ones of that id.
 
         Raises:
             NotFoundError: there is none, or none that the caller may know of.
             DeniedError: it may be read, but not deleted.
         """
-        own = self._own(connection, caller, kind, uri)
-        if own is not None:
-            return [own]
-        if caller.may(_DELETE[kind]):
-            everybody_s = _COLUMNS.where(ITEM.c.kind == kind, ITEM.c.id == uri)
-            found = list(connection.execute(everybody_s).all())
-            if found:
-                return found
+        found = self._visible(connection, caller, kind, uri)
+        if found and found[0].created_by == caller.name:
+            return found[:1]
+        if found and caller.may(_DELETE[kind]):
+            return found
         self._find(connection, caller, kind, uri)
         raise DeniedError(f"{kind} {uri} is somebody else's; only its owner may delete it")
 
@@ -251,6 +248,8 @@ class Items:
         for row in self._doomed(connection, caller, kind, uri):
             connection.execute(delete(ITEM).where(ITEM.c.number == row.number))
             audit(connection, caller.name, f"delete_{kind}", f"{uri} of {row.created_by}")
+        if kind == "artifact":
+            pend(connection, artifact_key(uri))
 
 
 _COLUMNS: Final[Select[Any]] = select(

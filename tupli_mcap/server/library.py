@@ -6,36 +6,50 @@ import contextlib
 import hashlib
 import os
 import secrets
+import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import select
 
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError
 from tupli_mcap.recording import Recording, write_recording
-from tupli_mcap.schema import BaseFilter, Episode, EpisodeHeader, EpisodeItem
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    ArtifactMetadataItem,
+    BaseFilter,
+    BenchmarkQuery,
+    Episode,
+    EpisodeHeader,
+    EpisodeItem,
+)
 from tupli_mcap.server import episodes
 from tupli_mcap.server.blobs import DirectoryBlobs
-from tupli_mcap.server.database import Database
+from tupli_mcap.server.database import Database, pend, settle
 from tupli_mcap.server.items import Items, artifact_key
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.throttle import Throttle, TooManyError
 from tupli_mcap.server.people.tokens import SignInError, Tokens
 from tupli_mcap.server.settings import Settings
-from tupli_mcap.server.tables import AUDIT, FILE, ITEM, MEMBERSHIP, USER
+from tupli_mcap.server.tables import AUDIT, FILE, ITEM, MEMBERSHIP, PENDING, USER
 from tupli_mcap.server.uploads import Upload, Uploads
+from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
 from tupli_mcap.storage.from_values import episode_data, episode_spaces
-from tupli_mcap.storage.listing import with_tuples
-from tupli_mcap.storage.texts import escape_text
+from tupli_mcap.storage.listing import is_storage, scan, with_tuples
+from tupli_mcap.storage.sidecar import Notes
+from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = ["Library"]
 
 _ADMIN = "admin"
 _PASSWORD_VARIABLE = "TUPLI_MCAP_ADMIN_PASSWORD"
+_PENDING_SECONDS = 600.0  # by then a file has come or gone, or the process that moved it has ended
 _MOST_OF_A_USER, _MOST_OF_AN_ADDRESS = 10, 100  # failures a minute
 
 
@@ -58,6 +72,8 @@ class Library:
         with self.database.writing() as connection:
             accounts.prepare(connection)
         self.uploads.forget_old()
+        self.sweep(self._pending(seconds=_PENDING_SECONDS))
+        shutil.rmtree(settings.own / "cuts", ignore_errors=True)  # of a process that was killed
 
     def first_password(self) -> str | None:
         """Makes the user `admin` where there is none; returns the password if nobody has chosen it."""
@@ -69,6 +85,51 @@ class Library:
             accounts.create_user(connection, _ADMIN, password)
             connection.execute(MEMBERSHIP.insert().values(user=_ADMIN, team="global", role=_ADMIN))
         return None if chosen else password
+
+    def adopt(self) -> int:
+        """Takes in what a `FileStorage` has in the directory, for the admin; returns how many recordings were new.
+
+        Files stay where they are. What changes there while the server runs is noticed when it starts again.
+        """
+        with self.database.reading() as connection:
+            admin = accounts.caller_named(connection, _ADMIN)
+            sizes = {row.path: row.size for row in connection.execute(select(FILE.c.path, FILE.c.size))}
+        if admin is None or not is_storage(self.settings.directory):
+            return 0
+        with FileStorage(self.settings.directory) as storage:
+            for item in storage.list_artifacts():
+                told = ArtifactMetadata.model_validate(item.model_dump())
+                self.store_artifact(admin, storage.load_artifact(item.id), told)
+            for header in storage.list_benchmarks():
+                found = storage.load_benchmark(header.id)
+                query = BenchmarkQuery(hash=found.hash, serialized=found.serialized, metadata=found.metadata)
+                with self.database.writing() as connection:
+                    self.items.store_benchmark(connection, admin, query)
+        pending = set(self._pending(seconds=0))
+        new = [
+            item.relative
+            for item in sorted(scan(self.settings.directory))
+            if not item.relative.startswith(f"{self.settings.own.name}/")
+            and sizes.get(escape_text(item.relative)) != item.stamp.size
+            and item.relative not in pending
+        ]
+        return sum(self._adopt(admin, name) for name in new)
+
+    def _adopt(self, admin: Caller, name: str) -> bool:
+        """Takes in a recording of the directory; says whether it could. One that is unfinished is left."""
+        path = self.settings.directory / name
+        try:
+            with Recording(path) as recording, path.open("rb") as file:
+                if not recording.complete or not len(recording):
+                    return False
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+                deleted = Notes.read(path, self.settings.directory).about(recording.metadata).deleted
+                with self.database.writing() as connection:
+                    episodes.register(connection, admin, recording, name, digest, deleted=deleted)
+        except (TupliError, OSError) as err:
+            warnings.warn(f"not served: {err}", stacklevel=3)
+            return False
+        return True
 
     def sign_in(self, username: str, password: str, address: str) -> dict[str, Any]:
         """Tokens for a user, see `Tokens.pair`.
@@ -136,12 +197,14 @@ class Library:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
             name = episodes.new_name(recording.benchmark_id)
+            with self.database.writing() as connection:
+                pend(connection, name)
             self.blobs.take(name, path)
             try:
                 with self.database.writing() as connection:
                     replaced = episodes.register(connection, caller, recording, name, digest)
             except BaseException:
-                self.blobs.delete(name)
+                self.sweep([name])
                 raise
         self.sweep(replaced)
         return name
@@ -172,14 +235,19 @@ class Library:
         self.sweep(empty)
         return count
 
+    def store_artifact(self, caller: Caller, data: bytes, metadata: ArtifactMetadata) -> ArtifactMetadataItem:
+        """As `TupliStorage.store_artifact`."""
+        with self.database.writing() as connection:
+            return self.items.store_artifact(connection, caller, data, metadata)
+
     def delete_artifact(self, caller: Caller, uri: str, *, force: bool) -> None:
         """Deletes an artifact, and its bytes if nobody else has it."""
         with self.database.writing() as connection:
             self.items.delete_artifact(connection, caller, uri, force=force)
         self.sweep([artifact_key(uri)])
 
-    def sweep(self, names: list[str]) -> None:
-        """Deletes files that nothing in the database names, while nobody adds any."""
+    def sweep(self, names: Iterable[str]) -> None:
+        """Deletes files that are pending and that nothing in the database names, while nobody adds any."""
         for name in names:
             with self.database.writing() as connection:
                 uri = name.removeprefix("artifacts/")
@@ -187,6 +255,13 @@ class Library:
                 items = select(ITEM.c.number).where(ITEM.c.kind == "artifact", ITEM.c.id == uri)
                 if not connection.execute(files).first() and not connection.execute(items).first():
                     self.blobs.delete(name)
+                settle(connection, name)
+
+    def _pending(self, *, seconds: float) -> list[str]:
+        """The files that have been pending for so long."""
+        old = select(PENDING.c.path).where(PENDING.c.since <= time.time() - seconds)
+        with self.database.reading() as connection:
+            return [unescape_text(path) for path in connection.execute(old).scalars()]
 
     def path_of(self, name: str) -> Path:
         """The file of a recording, or of an artifact."""

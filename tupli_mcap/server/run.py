@@ -22,7 +22,9 @@ def run(settings: Settings, host: str, port: int, tell: Callable[[str, str | Non
         StorageError: the directory or its database cannot be used.
     """
     library = Library(settings)
-    tell(f"http://{host}:{port}", library.first_password())
+    password = library.first_password()
+    library.adopt()
+    tell(f"http://{host}:{port}", password)
     config = uvicorn.Config(
         create_app(library),
         host=host,

@@ -15,6 +15,7 @@ __all__ = [
     "ITEM",
     "MEMBERSHIP",
     "METADATA",
+    "PENDING",
     "PRINCIPAL",
     "REFRESH_TOKEN",
     "ROLE",
@@ -122,6 +123,14 @@ FILE: Final = Table(
     Column("size", BigInteger, nullable=False),
     Column("episodes", Integer, nullable=False),  # in the file, deleted ones too
     Column("deleted", Text, nullable=False),  # JSON: numbers of episodes
+)
+
+# Files on their way in or out: what nothing names by the next start is deleted then, and never taken for a new one.
+PENDING: Final = Table(
+    "pending",
+    METADATA,
+    Column("path", Text, primary_key=True),
+    Column("since", BigInteger, nullable=False),
 )
 
 AUDIT: Final = Table(

@@ -8,6 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Header, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StorageError
@@ -89,8 +90,7 @@ async def store_artifact(
     except ValueError as err:
         raise StorageError(f"expected the metadata of an artifact as JSON in base64: {err}") from err
     data = await request.body()
-    with library.database.writing() as connection:
-        return answer(library.items.store_artifact(connection, caller, data, told))
+    return answer(await run_in_threadpool(library.store_artifact, caller, data, told))
 
 
 @router.post("/artifacts/list", response_model=Found)

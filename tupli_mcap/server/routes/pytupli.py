@@ -321,8 +321,7 @@ def store_artifact(
         raise StorageError(f"expected the metadata of an artifact: {first_defect(err)}") from err
     except ValueError as err:
         raise StorageError(f"expected the metadata of an artifact as JSON: {err}") from err
-    with library.database.writing() as connection:
-        return answer(library.items.store_artifact(connection, caller, data, told))
+    return answer(library.store_artifact(caller, data, told))
 
 
 @router.get("/artifacts/download")
