@@ -227,7 +227,9 @@ class TupliAPIClient(TupliStorage):
 
     def count_episodes(self, filter: BaseFilter | None = None) -> int:
         self.flush()
-        return int(self._session.ask("POST", "/v1/episodes/count", _listing(filter, EpisodeHeader)))
+        return int(
+            self._session.ask("POST", "/v1/episodes/count", _listing(filter, EpisodeHeader), repeat=True)
+        )
 
     def delete_episode(self, uri: str) -> None:
         self.flush()
@@ -274,7 +276,7 @@ class TupliAPIClient(TupliStorage):
             raise NotFoundError(
                 f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
             )
-        ticket = self._session.ask("POST", "/v1/tickets", {"recording": recording})
+        ticket = self._session.ask("POST", "/v1/tickets", {"recording": recording}, repeat=True)
         if ticket["whole"]:
             return Recording(self.url + ticket["path"])
         with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:

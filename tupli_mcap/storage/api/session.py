@@ -110,12 +110,24 @@ class Session:
 
     # --- asking ---
 
-    def ask(self, method: str, path: str, told: Any = None, *, anonymous: bool = False, **query: Any) -> Any:
-        """What the server answers to a JSON body, as a value; the errors that it tells are raised as they are named."""
+    def ask(
+        self,
+        method: str,
+        path: str,
+        told: Any = None,
+        *,
+        anonymous: bool = False,
+        repeat: bool | None = None,
+        **query: Any,
+    ) -> Any:
+        """What the server answers to a JSON body, as a value; the errors that it tells are raised as they are named.
+
+        repeat: whether to ask again where the connection fails; by default, where the method says so.
+        """
         headers = {"Content-Type": "application/json"}
         content = None if told is None else jsonvalue.dumps(told).encode()
         response = self.send(
-            method, path, content=content, headers=headers, params=query, anonymous=anonymous
+            method, path, content=content, headers=headers, params=query, anonymous=anonymous, repeat=repeat
         )
         return jsonvalue.loads(response.content) if response.content else None
 
@@ -229,7 +241,7 @@ def pages(session: Session, path: str, told: dict[str, Any]) -> Iterator[dict[st
     """All that is listed, a page at a time; `limit` and `offset` in `told` are of the whole."""
     left = told.get("limit")
     while True:
-        page = session.ask("POST", path, {**told, "limit": left})
+        page = session.ask("POST", path, {**told, "limit": left}, repeat=True)
         yield from page["items"]
         left = None if left is None else left - len(page["items"])
         if page["next"] is None or left == 0:
