@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 from serving import PASSWORD, serving
 from test_storage import StorageContract
 
+from tupli_mcap import RecordEpisodes
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
 
@@ -31,3 +33,18 @@ class TestContract(StorageContract):
     def storage(self, admin: TupliAPIClient) -> TupliAPIClient:
         admin.create_group("lab")
         return admin
+
+
+def test_a_recording_that_has_grown_keeps_its_name(admin: TupliAPIClient, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    names = []
+    for episodes in (1, 2):
+        with RecordEpisodes(gym.make("CartPole-v1"), path, mode="a") as env:
+            env.reset(seed=episodes)
+            while not env.step(env.action_space.sample())[2]:
+                pass
+        names.append(admin.push(path))
+        with admin.open_recording(names[-1]) as recording:
+            assert len(recording) == episodes
+    assert names[0] == names[1]
+    assert [header.recording for header in admin.list_episodes()] == names

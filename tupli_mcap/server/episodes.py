@@ -25,7 +25,7 @@ from tupli_mcap.storage.catalog.queries import After
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.sidecar import Sidecar
-from tupli_mcap.storage.texts import escape_text, is_hash
+from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
 
 __all__ = ["StoredFile", "count_episodes", "delete_episodes", "file_of", "find_episodes", "new_name", "no_episode",
            "publish", "register", "stored_already", "unpublish"]  # fmt: skip
@@ -34,9 +34,11 @@ _PLAIN: Final = "plain"  # where recordings without a benchmark lie
 
 
 class StoredFile(NamedTuple):
-    """The file of a recording: its name among the blobs, SHA-256 and size; `whole` if the caller may read all of it."""
+    """The file of a recording: its place among the blobs, SHA-256 and size; `whole` if the caller may read all
+    of it."""
 
     name: str
+    place: str
     digest: str
     size: int
     whole: bool
@@ -76,7 +78,7 @@ def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
         visible = count_episodes(connection, caller, FilterEQ(key="recording", value=name))
     if found is None or not visible:
         raise NotFoundError(f"there is no recording {name[:200]!r}")
-    return StoredFile(name, found.digest, found.size, visible == found.episodes)
+    return StoredFile(name, unescape_text(found.place), found.digest, found.size, visible == found.episodes)
 
 
 def _seen(caller: Caller) -> ColumnElement[bool]:
@@ -103,13 +105,13 @@ def register(
     connection: Connection,
     caller: Caller,
     recording: Recording,
-    name: str,
+    place: str,
     digest: str,
     *,
     deleted: Collection[int] = (),
-) -> list[str]:
-    """Lists the episodes of a recording whose file is kept under `name`, but those that are `deleted`; returns the
-    names of files to forget.
+) -> tuple[str, list[str]]:
+    """Lists the episodes of a recording whose file is kept at `place`, but those that are `deleted`; returns the
+    name of the recording, and the places of files to forget.
 
     A recording that the caller has stored before, and that has grown since, takes the place of what was there:
     its deleted episodes stay deleted, its published ones published.
@@ -127,17 +129,20 @@ def register(
     sidecar = Sidecar(uuid=recording.uuid, deleted=set(deleted))
     own = select(FILE).where(FILE.c.created_by == caller.name, FILE.c.uuid == recording.uuid)
     earlier = connection.execute(own).all()
+    name = unescape_text(earlier[0].path) if earlier else place  # who has listed it opens it again
     for row in earlier:
         sidecar.deleted |= set(json.loads(row.deleted))
-        for header in queries.find_episodes(connection, FilterEQ(key="recording", value=row.path)):
+        for header in queries.find_episodes(
+            connection, FilterEQ(key="recording", value=unescape_text(row.path))
+        ):
             if header.episode not in numbers and header.episode not in sidecar.deleted:
                 raise ConflictError(
                     f"the recording {recording.uuid} is stored with episode {header.episode}, which this file lacks; "
                     "delete what is stored first"
                 )
             sidecar.published_in[header.episode] = header.published_in
-        _forget(connection, row.path)
-    settle(connection, name)
+        _forget(connection, unescape_text(row.path))
+    settle(connection, place)
     audience(connection, [caller.name])
     queries.put_recording(
         connection,
@@ -148,7 +153,13 @@ def register(
         rows=rows_of(recording, sidecar, created_by=caller.name),
         runs=runs_of(recording),
     )
-    told = {"path": name, "created_by": caller.name, "uuid": recording.uuid, "digest": digest}
+    told = {
+        "path": escape_text(name),
+        "place": escape_text(place),
+        "created_by": caller.name,
+        "uuid": recording.uuid,
+        "digest": digest,
+    }
     counts = {
         "size": recording.size,
         "episodes": len(numbers),
@@ -156,7 +167,7 @@ def register(
     }
     connection.execute(insert(FILE).values(**told, **counts))
     audit(connection, caller.name, "store_recording", name)
-    return [row.path for row in earlier if row.path != name]
+    return name, [unescape_text(row.place) for row in earlier if row.place != escape_text(place)]
 
 
 def _demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) -> None:
@@ -221,8 +232,7 @@ def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) 
         connection.execute(update(FILE).where(FILE.c.path == name).values(deleted=deleted))
         left = select(EPISODE.c.id).where(EPISODE.c.recording_id == recording).limit(1)
         if not connection.execute(left).first():
-            _forget(connection, path)
-            empty.append(path)
+            empty.append(_forget(connection, path))
         audit(connection, caller.name, "delete_episodes", f"{path}: {', '.join(map(str, sorted(numbers)))}")
     return sum(map(len, doomed.values())), empty
 
@@ -250,7 +260,10 @@ def _set_audience(connection: Connection, header: EpisodeHeader, groups: Sequenc
     connection.execute(update(EPISODE).where(row).values(**values))
 
 
-def _forget(connection: Connection, path: str) -> None:
+def _forget(connection: Connection, path: str) -> str:
+    """Forgets a recording; returns the place of its file, which is pending."""
+    place = connection.execute(select(FILE.c.place).where(FILE.c.path == escape_text(path))).scalar_one()
     queries.remove_recording(connection, path)
-    pend(connection, path)
     connection.execute(delete(FILE).where(FILE.c.path == escape_text(path)))
+    pend(connection, unescape_text(place))
+    return unescape_text(place)

@@ -93,7 +93,7 @@ class Library:
         """
         with self.database.reading() as connection:
             admin = accounts.caller_named(connection, _ADMIN)
-            sizes = {row.path: row.size for row in connection.execute(select(FILE.c.path, FILE.c.size))}
+            sizes = {row.place: row.size for row in connection.execute(select(FILE.c.place, FILE.c.size))}
         if admin is None or not is_storage(self.settings.directory):
             return 0
         with FileStorage(self.settings.directory) as storage:
@@ -196,22 +196,31 @@ class Library:
         with Recording(path) as recording:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
-            name = episodes.new_name(recording.benchmark_id)
+            place = episodes.new_name(recording.benchmark_id)
             with self.database.writing() as connection:
-                pend(connection, name)
-            self.blobs.take(name, path)
+                pend(connection, place)
+            self.blobs.take(place, path)
             try:
                 with self.database.writing() as connection:
-                    replaced = episodes.register(connection, caller, recording, name, digest)
+                    name, replaced = episodes.register(connection, caller, recording, place, digest)
             except BaseException:
-                self.sweep([name])
+                self.sweep([place])
                 raise
         self.sweep(replaced)
         return name
 
     def with_tuples(self, headers: Sequence[EpisodeHeader]) -> Iterator[EpisodeItem]:
         """Episodes of the catalog with their tuples."""
-        return with_tuples(headers, lambda name: Recording(self.blobs.place(name)))
+
+        def opened(name: str) -> Recording:
+            with self.database.reading() as connection:
+                found = select(FILE.c.place).where(FILE.c.path == escape_text(name))
+                place = connection.execute(found).scalar()
+            if place is None:
+                raise NotFoundError(f"there is no recording {name[:200]!r}")
+            return Recording(self.blobs.place(unescape_text(place)))
+
+        return with_tuples(headers, opened)
 
     @contextlib.contextmanager
     def deleting(self, caller: Caller, action: str, uri: str) -> Iterator[None]:
@@ -251,7 +260,7 @@ class Library:
         for name in names:
             with self.database.writing() as connection:
                 uri = name.removeprefix("artifacts/")
-                files = select(FILE.c.path).where(FILE.c.path == escape_text(name))
+                files = select(FILE.c.path).where(FILE.c.place == escape_text(name))
                 items = select(ITEM.c.number).where(ITEM.c.kind == "artifact", ITEM.c.id == uri)
                 if not connection.execute(files).first() and not connection.execute(items).first():
                     self.blobs.delete(name)

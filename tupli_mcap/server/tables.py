@@ -119,6 +119,7 @@ FILE: Final = Table(
     Column("path", Text, primary_key=True),
     Column("created_by", Text, nullable=False, index=True),
     Column("uuid", Text, nullable=False, index=True),
+    Column("place", Text, nullable=False),  # its name among the blobs: another one for each version
     Column("digest", Text, nullable=False),  # SHA-256 in hex digits
     Column("size", BigInteger, nullable=False),
     Column("episodes", Integer, nullable=False),  # in the file, deleted ones too

@@ -174,7 +174,7 @@ def read_recording(
         ]
     file_name = name.rpartition("/")[2]
     if not found.whole:
-        path = _cut(library, name, kept)
+        path = _cut(library, found.place, kept)
         return FileResponse(
             path, media_type=_MEDIA, filename=file_name, background=BackgroundTask(os.unlink, path)
         )
@@ -182,10 +182,12 @@ def read_recording(
     wanted = request.headers.get("If-Match")
     if wanted is not None and wanted.strip() != "*" and tag not in [t.strip() for t in wanted.split(",")]:
         raise HTTPException(412, "the recording has changed; open it again")
-    return FileResponse(library.path_of(name), media_type=_MEDIA, filename=file_name, headers={"ETag": tag})
+    return FileResponse(
+        library.path_of(found.place), media_type=_MEDIA, filename=file_name, headers={"ETag": tag}
+    )
 
 
-def _cut(library: Library, name: str, kept: list[int]) -> Path:
+def _cut(library: Library, place: str, kept: list[int]) -> Path:
     """A temporary recording of some episodes of another one."""
     directory = library.settings.own / "cuts"
     directory.mkdir(parents=True, exist_ok=True)
@@ -193,8 +195,8 @@ def _cut(library: Library, name: str, kept: list[int]) -> Path:
     os.close(handle)
     path = Path(text)
     path.unlink()
-    with Recording(library.blobs.place(name)) as recording:
+    with Recording(library.blobs.place(place)) as recording:
         if not set(kept) & {int(number) for number in recording.index["episode"]}:
-            raise NotFoundError(f"there is no recording {name[:200]!r}")
+            raise NotFoundError("there is no such recording")
         rewrite_recording(recording, path, episodes=kept)
     return path
