@@ -555,7 +555,19 @@ class TestCommands:
             ("x",),
             "eval",
         )
-        for words in (["tag", path], ["tag", "x=1"], ["edit", path], ["edit", path, "--set", "novalue"]):
+        other = str(record(tmp_path / "other.mcap"))
+        command("edit", path, other, "--split", "train")
+        assert {Recording(one).run.split for one in (path, other)} == {"train"}
+        unsaid = CliRunner().invoke(app, ["tag", path, "x=1"])
+        assert "--episodes all" in unsaid.output
+        assert "x" not in Recording(path).episodes[0].metadata
+        for words in (
+            ["tag", path],
+            ["tag", path, "x=1"],
+            ["tag", "x=1"],
+            ["edit", path],
+            ["edit", path, "--set", "novalue"],
+        ):
             assert CliRunner().invoke(app, words).exit_code == 2
 
     def test_record_says_what_run_it_is(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

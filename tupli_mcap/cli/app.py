@@ -288,7 +288,11 @@ _EXAMPLES: dict[str, Sequence[str]] = {
         "tag run.mcap --filter 'return > 100' quality=good",
         "tag run.mcap --undo",
     ),
-    "edit": ("edit run.mcap --name ppo-seed3 --set lr=0.0003 --tag baseline", "edit run.mcap --undo"),
+    "edit": (
+        "edit run.mcap --name ppo-seed3 --set lr=0.0003 --tag baseline",
+        "edit runs/*.mcap --split eval",
+        "edit run.mcap --undo",
+    ),
     "info": ("info run.mcap", "info runs/", "info run.mcap --filter 'return > 100'"),
     "episodes": (
         "episodes run.mcap --filter 'return > 100'",

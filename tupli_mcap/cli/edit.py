@@ -102,7 +102,7 @@ def tag(
 ) -> None:
     """Say more about episodes, such as success=true.
 
-    Values count more than the metadata that were recorded, in filters and tables too. They are JSON where they look
+    --episodes or --filter says which; --episodes all means all. Values count more than the metadata that were recorded, in filters and tables too. They are JSON where they look
     like it, else texts; KEY= takes a key away. The end of a file is written anew, its steps are not touched; who said
     it and when is kept. A signature is left out.
     """
@@ -116,6 +116,10 @@ def tag(
     if not paths or bool(values) == undo:
         raise typer.BadParameter(
             "give recordings, and KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 success=true"
+        )
+    if not undo and episodes is None and filter_text is None:
+        raise typer.BadParameter(
+            "say which episodes: --episodes 3,7, --filter 'return < 10' or --episodes all"
         )
     wanted = filter_of(filter_text)
     done: list[dict[str, Any]] = []
@@ -141,7 +145,7 @@ def tag(
 
 
 def edit(
-    file: File,
+    files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Recordings.", parser=local_path)],
     name: Annotated[str | None, typer.Option(help="Of the run.")] = None,
     settings: Annotated[
         list[str] | None,
@@ -155,9 +159,9 @@ def edit(
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Change what a recording says of its run.
+    """Change what recordings say of their runs.
 
-    The recording keeps its identity; the end of the file is written anew, its steps are not touched. A signature is
+    A recording keeps its identity; the end of the file is written anew, its steps are not touched. A signature is
     left out.
     """
     from tupli_mcap.recording import edit_run, undo_edit
@@ -165,18 +169,22 @@ def edit(
     if undo == any(given is not None for given in (name, settings, tags, run_split)):
         raise typer.BadParameter("give what to change: --name, --set KEY=VALUE, --tag or --split; or --undo")
     metadata = dict(pair_of(text) for text in settings or ())
-    if undo:
-        run = undo_edit(file, dry_run=dry_run)
-    else:
-        run = edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry_run)
+    runs = [
+        undo_edit(file, dry_run=dry_run)
+        if undo
+        else edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry_run)
+        for file in files
+    ]
     if as_json:
-        print_json({"dry_run": dry_run, "path": file, "run": run.as_dict()})
+        edited = zip(files, runs, strict=True)
+        print_json([{"dry_run": dry_run, "path": file, "run": run.as_dict()} for file, run in edited])
         return
     from tupli_mcap.jsonvalue import shown
 
-    facts = {"run": run.name, "split": run.split, "tags": ", ".join(run.tags)}
-    facts |= {key: shown(value) for key, value in run.metadata.items()}
-    print_facts([(key, text) for key, text in facts.items() if text])
+    for file, run in zip(files, runs, strict=True):
+        facts = {"recording": str(file), "run": run.name, "split": run.split, "tags": ", ".join(run.tags)}
+        facts |= {key: shown(value) for key, value in run.metadata.items()}
+        print_facts([(key, text) for key, text in facts.items() if text])
 
 
 def filter_(
