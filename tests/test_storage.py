@@ -23,9 +23,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from sqlalchemy.exc import OperationalError
 
-from tupli_mcap import TupliDataset
+from tupli_mcap import EpisodeWriter, TupliDataset, TupliEnvWrapper
 from tupli_mcap.environment import capture
 from tupli_mcap.errors import (
     FilterError,
@@ -49,6 +50,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, recordings
 from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
+from tupli_mcap.storage.bundles import from_recording
 from tupli_mcap.storage.catalog import database
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.place import catalog_path
@@ -837,6 +839,26 @@ class TestFileStorage(StorageContract):
             env.step(0)
         with pytest.raises(StorageError, match="recorded outside a storage"):
             storage.import_bundle(tmp_path / "plain.mcap")
+
+    def test_a_plain_recording_gets_a_benchmark_of_its_environment(
+        self, storage: FileStorage, tmp_path: Path
+    ) -> None:
+        for name in ("a", "b"):
+            with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / f"{name}.mcap") as env:
+                env.reset(seed=1)
+                env.step(0)
+            from_recording(tmp_path / f"{name}.mcap", tmp_path / f"{name}-bundle.mcap")
+        ids = {storage.import_bundle(tmp_path / f"{name}-bundle.mcap") for name in ("a", "b")}
+        (header,) = storage.list_benchmarks()
+        assert ({header.id}, header.metadata.name) == (ids, "CartPole-v1")
+        assert [episode.benchmark_id for episode in storage.list_episodes()] == [header.id] * 2
+        with TupliEnvWrapper.load(storage=storage, benchmark_id=header.id) as env:
+            assert env.unwrapped.spec.id == "CartPole-v1"
+        with EpisodeWriter(tmp_path / "robot.mcap", spaces.Box(-1, 1, (2,)), spaces.Discrete(2)) as writer:
+            writer.begin()
+            writer.step(np.zeros(2, np.float32), 0, 0.0)
+        with pytest.raises(StorageError, match="carries no environment"):
+            from_recording(tmp_path / "robot.mcap", tmp_path / "never.mcap")
 
     def test_importing_at_home_changes_nothing(self, storage: FileStorage, tmp_path: Path) -> None:
         header = storage.store_benchmark(query())

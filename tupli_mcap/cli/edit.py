@@ -102,9 +102,9 @@ def tag(
 ) -> None:
     """Say more about episodes, such as success=true.
 
-    --episodes or --filter says which; --episodes all means all. Values count more than the metadata that were recorded, in filters and tables too. They are JSON where they look
-    like it, else texts; KEY= takes a key away. The end of a file is written anew, its steps are not touched; who said
-    it and when is kept. A signature is left out.
+    --episodes or --filter says which; --episodes all means all. Values count more than the metadata that were
+    recorded, in filters and tables too. They are JSON where they look like it, else texts; KEY= takes a key away. The
+    end of a file is written anew, its steps are not touched; who said it and when is kept. A signature is left out.
     """
     from tupli_mcap.dataset.which import choose_episodes
     from tupli_mcap.jsonvalue import dumps_any

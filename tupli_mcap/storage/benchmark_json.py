@@ -14,12 +14,13 @@ from pydantic import BaseModel
 from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
 from tupli_mcap.errors import FormatError, SpaceError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain, loads
-from tupli_mcap.schema import BenchmarkMetadata
+from tupli_mcap.schema import BenchmarkHeader, BenchmarkMetadata
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 from tupli_mcap.storage.texts import is_hash
 
 __all__ = [
     "BenchmarkContent",
+    "benchmark_entry",
     "benchmark_hash",
     "declared_spaces",
     "facts_about",
@@ -53,6 +54,11 @@ def plain(model: BaseModel) -> dict[str, Any]:
     except (TypeError, ValueError) as err:
         raise StorageError(f"{type(model).__name__}: expected values that JSON can hold: {err}") from err
     return value
+
+
+def benchmark_entry(header: BenchmarkHeader) -> dict[str, Any]:
+    """A header as the `benchmark` entry of a document, whose `environment` entry has the name."""
+    return {key: value for key, value in plain(header).items() if key != "environment"}
 
 
 def restored(value: Any) -> Any:

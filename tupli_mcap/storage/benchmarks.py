@@ -16,7 +16,15 @@ from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQ
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
 from tupli_mcap.storage.base import LOCAL_USER, published_in
-from tupli_mcap.storage.benchmark_json import artifacts_of, benchmark_hash, pack, plain, restored, unpack
+from tupli_mcap.storage.benchmark_json import (
+    artifacts_of,
+    benchmark_entry,
+    benchmark_hash,
+    pack,
+    plain,
+    restored,
+    unpack,
+)
 from tupli_mcap.storage.texts import first_defect, is_hash, to_json
 
 __all__ = ["BenchmarkFiles", "document_of", "name_in"]
@@ -39,7 +47,7 @@ class BenchmarkFiles:
             header = BenchmarkHeader.create_new(
                 id=uri, hash=query.hash, metadata=metadata, created_by=created_by
             )
-            document["benchmark"] = {**(document.get("benchmark") or {}), **_entry(header)}
+            document["benchmark"] = {**(document.get("benchmark") or {}), **benchmark_entry(header)}
             if pickle is not None:
                 write_bytes(self._pickle_path(uri), pickle)
             write_bytes(path, to_json(document))  # last: the benchmark is there once this is
@@ -141,11 +149,6 @@ class BenchmarkFiles:
 
     def _pickle_path(self, uri: str) -> Path:
         return self._directory / f"{uri}.cloudpickle"
-
-
-def _entry(header: BenchmarkHeader) -> dict[str, Any]:
-    """A header as the `benchmark` entry of a document, whose `environment` entry has the name."""
-    return {key: value for key, value in plain(header).items() if key != "environment"}
 
 
 def name_in(document: dict[str, Any]) -> str:

@@ -24,18 +24,21 @@ from tupli_mcap.schema import (
     ArtifactMetadata,
     BaseFilter,
     BenchmarkHeader,
+    BenchmarkMetadata,
     BenchmarkQuery,
     EpisodeHeader,
     FilterEQ,
     FilterIN,
 )
+from tupli_mcap.spaces.space_json import space_to_json
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import anew
+from tupli_mcap.storage.base import LOCAL_USER, anew
 from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,
     DOCUMENT_NAME,
     PICKLE_NAME,
     artifacts_of,
+    benchmark_entry,
     benchmark_hash,
     declared_spaces,
     pack,
@@ -225,6 +228,8 @@ def from_recording(
 ) -> Path:
     """Write the episodes of one recording into a new file that carries its benchmark and all artifacts.
 
+    A recording that was made outside a storage gets a benchmark: its environment, under the name that it has.
+
     sign: the key to sign it with; without it, a signature stays where nothing it covers changes.
 
     storage: has what the recording lacks; None if it lacks nothing, as a bundle or a recording of a plain
@@ -232,14 +237,16 @@ def from_recording(
 
     Raises:
         NotFoundError: The storage does not know the recording's benchmark.
-        StorageError: Something is missing and no storage given, or the file exists or cannot be written.
+        StorageError: The recording carries no environment; something is missing and no storage given; or the file
+            exists or cannot be written.
     """
     _refuse_existing(target)
     notes = Notes.read(path)
     with Recording(path) as recording:
         deleted = notes.about(recording.metadata).deleted
         attachments: Attachments = {}
-        if recording.benchmark_id:
+        benchmark_id = recording.benchmark_id
+        if benchmark_id:
             record = recording.benchmark.record if DOCUMENT_NAME in recording.attachments else None
             named = () if record is None else artifacts_of(record, str(path))
             if record is None or any(ARTIFACT_PREFIX + uri not in recording.attachments for uri in named):
@@ -250,14 +257,28 @@ def from_recording(
                     )
                 attachments = _attachments(storage, recording.benchmark_id)
         else:
-            _environment(recording, path)  # refuses a recording that carries none
+            benchmark_id, attachments = _own_benchmark(recording, path)
         kept = [int(number) for number in recording.index["episode"] if int(number) not in deleted]
         with os_errors("cannot write the bundle", target), fill(target) as temporary:
             chosen = kept if len(kept) < len(recording) else None
-            rewrite_recording(recording, temporary, episodes=chosen, attachments=attachments)
+            rewrite_recording(
+                recording, temporary, episodes=chosen, attachments=attachments, benchmark_id=benchmark_id
+            )
             if sign is not None:
                 sign_recording(temporary, sign)
     return target
+
+
+def _own_benchmark(recording: Recording, path: Path) -> tuple[str, Attachments]:
+    """The id of a benchmark that is a recording's environment and nothing else, and what a file carries of it."""
+    record = _environment(recording, path)
+    spaces = {"observation_space": recording.observation_space, "action_space": recording.action_space}
+    facts = {name: space_to_json(space) for name, space in spaces.items()}
+    metadata = BenchmarkMetadata(name=record.name)
+    uri = benchmark_hash(unpack(pack(record)), metadata)
+    header = BenchmarkHeader.create_new(id=uri, hash=uri, metadata=metadata, created_by=LOCAL_USER)
+    document = record.to_json({**facts, "artifacts": [], **benchmark_entry(header)})
+    return uri, {DOCUMENT_NAME: ("application/json", document)}
 
 
 def incoming(recording: Recording, path: Path) -> tuple[EnvironmentRecord, BenchmarkHeader, BenchmarkQuery]:
@@ -390,7 +411,8 @@ def _frames(recording: Recording, position: int) -> list[tuple[int, EncodedFrame
 def _environment(recording: Recording, path: Path) -> EnvironmentRecord:
     if DOCUMENT_NAME not in recording.attachments:
         raise StorageError(
-            f"{str(path)!r} carries no benchmark ({DOCUMENT_NAME}); copy it into the storage instead"
+            f"{str(path)!r} carries no environment ({DOCUMENT_NAME}), so there is no benchmark of it; it is whole as "
+            "it is: copy it into the storage's directory, where its episodes are found"
         )
     pickle = recording.read_attachment(PICKLE_NAME) if PICKLE_NAME in recording.attachments else None
     return EnvironmentRecord.from_json(
@@ -401,8 +423,8 @@ def _environment(recording: Recording, path: Path) -> EnvironmentRecord:
 def _header(record: EnvironmentRecord, path: Path) -> BenchmarkHeader:
     if not (record.benchmark or {}).get("id"):
         raise StorageError(
-            f"{str(path)!r} carries an environment, but no benchmark: it was recorded outside a storage; "
-            "copy the file into the storage's directory, where its episodes are found"
+            f"{str(path)!r} carries an environment, but no benchmark: it was recorded outside a storage; make a bundle "
+            "of it (tupli-mcap bundle), or copy it into the storage's directory, where its episodes are found"
         )
     try:
         return BenchmarkHeader.model_validate(restored(record.benchmark))
