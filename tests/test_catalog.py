@@ -17,13 +17,16 @@ from typing import Any
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tupli_mcap.errors import FilterError, FormatError, StorageError
+from tupli_mcap.errors import FilterError, FormatError, NotFoundError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain
-from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR
+from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR, parse_filter
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog import place
 from tupli_mcap.storage.catalog.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
 from tupli_mcap.storage.catalog.place import cache_dir, catalog_path
+from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
+from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
+from tupli_mcap.storage.catalog.tallies import Tally, tallies
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
 CREATED_NS = 1_795_251_600_000_001_999
@@ -190,6 +193,116 @@ class TestRecordings:
         for unknown in ("c-07", "c--7", "c-7 ", "c-", "-7", "", "c-" + "9" * 5000, "c-٧"):
             assert catalog.count(F("id") == unknown) == 0
         assert "SEARCH episode USING INTEGER PRIMARY KEY" in catalog.explain(F("id") == "a-b-7")
+
+
+class TestOrder:
+    @pytest.fixture
+    def mixed(self, catalog: Catalog) -> Catalog:
+        rng = random.Random(0)
+        values = [3, 3.5, -1, True, None, "a", "b", [1], math.nan, 2**70, "a\x00", 0]
+        for path in ("b.mcap", "a.mcap"):
+            rows = [
+                row(
+                    i,
+                    {"score": rng.choice(values)} if rng.random() < 0.8 else {},
+                    episode_return=rng.choice([1.0, -2.0, math.inf, math.nan, None]),
+                    n_tuples=rng.randrange(1, 4),
+                    seed=rng.choice([None, 5, 2**127]),
+                    created_at=CREATED_NS + rng.randrange(5) * 10**9,
+                )
+                for i in range(40)
+            ]
+            put(catalog, path, rows, uuid=path)
+        return catalog
+
+    @pytest.mark.parametrize("descending", [False, True])
+    @pytest.mark.parametrize(
+        "key", ["return", "steps", "ended", "seed", "end", "recording", "metadata.score", ""]
+    )
+    @pytest.mark.parametrize("text", ["", "steps > 1", "metadata.score != 3"])
+    def test_pages_forth_and_back_are_the_whole(
+        self, mixed: Catalog, key: str, descending: bool, text: str
+    ) -> None:
+        sort, wanted = Sort(key, descending) if key else None, parse_filter(text) if text else None
+        with mixed._read() as connection:
+            whole = [header.id for header in find_episodes(connection, wanted, sort=sort)]
+            assert sorted(whole) == sorted(h.id for h in find_episodes(connection, wanted))
+            for backwards in (False, True):
+                after, paged = None, []
+                while page := list(
+                    find_episodes(connection, wanted, limit=7, sort=sort, after=after, backwards=backwards)
+                ):
+                    paged += [header.id for header in page]
+                    after = After(page[-1].recording, page[-1].episode)
+                assert paged == (whole[::-1] if backwards else whole)
+
+    @pytest.mark.parametrize("descending", [False, True])
+    def test_what_has_no_value_comes_last(self, mixed: Catalog, descending: bool) -> None:
+        with mixed._read() as connection:
+            returns = [
+                h.episode_return for h in find_episodes(connection, None, sort=Sort("return", descending))
+            ]
+            scores = [
+                h.metadata.get("score")
+                for h in find_episodes(connection, None, sort=Sort("metadata.score", descending))
+            ]
+        numbers = [value for value in returns if value is not None and not math.isnan(value)]
+        assert numbers == sorted(numbers, reverse=descending) == returns[: len(numbers)]
+        known = [value for value in scores if isinstance(value, int | float) and not math.isnan(value)]
+        assert known == sorted(known, reverse=descending)
+        assert scores[-1] is None
+
+    def test_a_page_after_what_is_gone(self, mixed: Catalog) -> None:
+        with (
+            mixed._read() as connection,
+            pytest.raises(NotFoundError, match="is gone; list from the beginning"),
+        ):
+            find_episodes(connection, None, after=After("a.mcap", 99))
+
+    @pytest.mark.parametrize("key", ["run.name", "metadata", "published_in", 'metadata."a\\"b"', "nope"])
+    def test_keys_that_have_no_order(self, mixed: Catalog, key: str) -> None:
+        with (
+            mixed._read() as connection,
+            pytest.raises(FilterError, match="cannot sort by|unknown filter key"),
+        ):
+            find_episodes(connection, None, sort=Sort(key))
+
+    def test_counting_stops(self, mixed: Catalog) -> None:
+        with mixed._read() as connection:
+            assert count_episodes(connection, None, most=7) == 7
+            assert count_episodes(connection, parse_filter("metadata.score != 3"), most=7) == 7
+            assert count_episodes(connection, None, most=1000) == 80
+
+
+class TestTallies:
+    def test_they_are_what_the_episodes_say(self, catalog: Catalog) -> None:
+        rows = [
+            row(0, {"success": True}, episode_return=1.0, n_tuples=2),
+            row(1, {"is_success": False}, episode_return=-3.0, created_at=CREATED_NS + 10**9),
+            row(2, {"success": "yes"}, episode_return=math.nan),
+            row(3, published_in='["me", "all"]', episode_return=None),
+        ]
+        catalog.put_recording(
+            "a.mcap",
+            STAMP,
+            uuid="u",
+            benchmark_id="",
+            rows=rows,
+            runs='[{"name": "r", "environment": "Cart-v1"}]',
+        )
+        put(catalog, "empty.mcap")
+        with catalog._read() as connection:
+            (told,) = tallies(connection)
+            (seen,) = tallies(connection, TALLY.c.published_in == '["me", "all"]')
+            assert list(tallies(connection, of=RECORDING.c.environment == "Hopper-v5")) == []
+        assert told == Tally(
+            "a.mcap", "u", "", "Cart-v1", 10, 30, [{"name": "r", "environment": "Cart-v1"}],
+            4, 68, 2, -2.0, -3.0, 1.0, 2, 1, CREATED_NS // 1000 * 1000, (CREATED_NS + 10**9) // 1000 * 1000,
+        )  # fmt: skip
+        assert (seen.episodes, seen.returns, seen.return_sum) == (1, 0, None)
+        catalog.remove_recording("a.mcap")
+        with catalog._read() as connection:
+            assert list(tallies(connection)) == []
 
 
 class TestDeclaredKeys:

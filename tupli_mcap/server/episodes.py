@@ -23,6 +23,7 @@ from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.entries import rows_of, runs_of
 from tupli_mcap.storage.catalog.queries import After
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE
+from tupli_mcap.storage.catalog.tallies import tally
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
@@ -184,24 +185,38 @@ def _demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str)
 # --- changing ---
 
 
-def publish(connection: Connection, caller: Caller, uri: str, group: str) -> None:
-    """Lets a group see the caller's own episode; done twice, nothing changes."""
-    header = _one(connection, caller, uri)
-    if header.created_by != caller.name:
-        raise DeniedError(f"episode {uri} is somebody else's; only its owner may publish it")
-    groups = published_in(header.published_in, group)
-    caller.demand(Right.EPISODE_CREATE, group)
-    _set_audience(connection, header, groups)
-    audit(connection, caller.name, "publish_episode", f"{uri} in {group}")
+def publish(connection: Connection, caller: Caller, filter: BaseFilter | None, group: str) -> int:
+    """Lets a group see the caller's own episodes that a filter is true of: all, or none; done twice, nothing changes.
+
+    Returns:
+        How many they are.
+    """
+    found = _own_first(connection, caller, filter)
+    for header in found:
+        if header.created_by != caller.name:
+            raise DeniedError(f"episode {header.id} is somebody else's; only its owner may publish it")
+        groups = published_in(header.published_in, group)
+        caller.demand(Right.EPISODE_CREATE, group)
+        _set_audience(connection, header, groups)
+        audit(connection, caller.name, "publish_episode", f"{header.id} in {group}")
+    _tally(connection, found)
+    return len(found)
 
 
-def unpublish(connection: Connection, caller: Caller, uri: str, group: str) -> None:
-    """Takes an episode away from a group: the owner may, and who has the right to delete there."""
-    header = _one(connection, caller, uri)
-    if header.created_by != caller.name:
-        caller.demand(Right.EPISODE_DELETE, group)
-    _set_audience(connection, header, [name for name in header.published_in if name != group])
-    audit(connection, caller.name, "unpublish_episode", f"{uri} from {group}")
+def unpublish(connection: Connection, caller: Caller, filter: BaseFilter | None, group: str) -> int:
+    """Takes episodes away from a group: the owner may, and who has the right to delete there.
+
+    Returns:
+        How many they are.
+    """
+    found = _own_first(connection, caller, filter)
+    for header in found:
+        if header.created_by != caller.name:
+            caller.demand(Right.EPISODE_DELETE, group)
+        _set_audience(connection, header, [name for name in header.published_in if name != group])
+        audit(connection, caller.name, "unpublish_episode", f"{header.id} from {group}")
+    _tally(connection, found)
+    return len(found)
 
 
 def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
@@ -230,6 +245,7 @@ def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) 
         known = connection.execute(select(FILE.c.deleted).where(FILE.c.path == name)).scalar_one()
         deleted = json.dumps(sorted({*json.loads(known), *numbers}))
         connection.execute(update(FILE).where(FILE.c.path == name).values(deleted=deleted))
+        tally(connection, recording)
         left = select(EPISODE.c.id).where(EPISODE.c.recording_id == recording).limit(1)
         if not connection.execute(left).first():
             empty.append(_forget(connection, path))
@@ -237,15 +253,13 @@ def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) 
     return sum(map(len, doomed.values())), empty
 
 
-def _one(connection: Connection, caller: Caller, uri: str) -> EpisodeHeader:
-    """A readable episode, the caller's own one first."""
-    found = sorted(
-        find_episodes(connection, caller, FilterEQ(key="id", value=uri)),
-        key=lambda header: header.created_by != caller.name,
-    )
-    if not found:
-        raise no_episode(uri)
-    return found[0]
+def _own_first(connection: Connection, caller: Caller, filter: BaseFilter | None) -> list[EpisodeHeader]:
+    """The readable episodes that a filter is true of; of one that several people have stored, the caller's own."""
+    found: dict[str, EpisodeHeader] = {}
+    for header in find_episodes(connection, caller, filter):
+        if header.id not in found or header.created_by == caller.name:
+            found[header.id] = header
+    return list(found.values())
 
 
 def no_episode(uri: str) -> NotFoundError:
@@ -258,6 +272,13 @@ def _set_audience(connection: Connection, header: EpisodeHeader, groups: Sequenc
     row = and_(EPISODE.c.recording_id == of, EPISODE.c.episode == header.episode)
     values: dict[str, Any] = {"published_in": audience(connection, groups)}
     connection.execute(update(EPISODE).where(row).values(**values))
+
+
+def _tally(connection: Connection, changed: Sequence[EpisodeHeader]) -> None:
+    """Makes the sums of the recordings of changed episodes anew."""
+    for path in dict.fromkeys(header.recording for header in changed):
+        of = select(RECORDING.c.id).where(RECORDING.c.path == escape_text(path))
+        tally(connection, connection.execute(of).scalar_one())
 
 
 def _forget(connection: Connection, path: str) -> str:

@@ -76,10 +76,7 @@ def publish_episodes(library: Served, caller: Writer, told: Annotated[Shown, Bod
     """Lets a group see the episodes that a filter is true of, or no more: all, or none; `{"episodes": how many}`."""
     change = episodes.publish if told.published else episodes.unpublish
     with library.database.writing() as connection:
-        found = [header.id for header in episodes.find_episodes(connection, caller, told.filter)]
-        for uri in found:
-            change(connection, caller, uri, told.group)
-    return answer({"episodes": len(found)})
+        return answer({"episodes": change(connection, caller, told.filter, told.group)})
 
 
 @router.post("/keys")
@@ -100,14 +97,16 @@ def delete_episode(library: Served, caller: Writer, uri: str) -> None:
 def publish_episode(library: Served, caller: Writer, uri: str, group: str) -> None:
     """Lets a group see an episode."""
     with library.database.writing() as connection:
-        episodes.publish(connection, caller, uri, group)
+        if not episodes.publish(connection, caller, FilterEQ(key="id", value=uri), group):
+            raise episodes.no_episode(uri)
 
 
 @router.delete("/{uri}/published")
 def unpublish_episode(library: Served, caller: Writer, uri: str, group: str) -> None:
     """Takes an episode away from a group."""
     with library.database.writing() as connection:
-        episodes.unpublish(connection, caller, uri, group)
+        if not episodes.unpublish(connection, caller, FilterEQ(key="id", value=uri), group):
+            raise episodes.no_episode(uri)
 
 
 def _cursor(recording: str, episode: int) -> str:

@@ -389,14 +389,16 @@ def list_episodes(library: Served, caller: Reader, told: _Filter = None) -> Resp
 def publish_episode(library: Served, caller: Changing, episode_id: str, publish_in: str) -> None:
     """Lets a group see an episode."""
     with _hidden(caller, "Episode not found"), library.database.writing() as connection:
-        episodes.publish(connection, caller, episode_id, publish_in)
+        if not episodes.publish(connection, caller, FilterEQ(key="id", value=episode_id), publish_in):
+            raise episodes.no_episode(episode_id)
 
 
 @router.put("/episodes/unpublish")
 def unpublish_episode(library: Served, caller: Changing, episode_id: str, unpublish_from: str) -> None:
     """Takes an episode away from a group."""
     with _hidden(caller, "Episode not found"), library.database.writing() as connection:
-        episodes.unpublish(connection, caller, episode_id, unpublish_from)
+        if not episodes.unpublish(connection, caller, FilterEQ(key="id", value=episode_id), unpublish_from):
+            raise episodes.no_episode(episode_id)
 
 
 @router.delete("/episodes/delete")

@@ -8,9 +8,9 @@ from __future__ import annotations
 import itertools
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from sqlalchemy import Connection, Select, Table, and_, delete, func, insert, or_, select, true
+from sqlalchemy import Connection, Select, Table, and_, delete, func, insert, select, true
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap import jsonvalue
@@ -19,6 +19,7 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import bound_predicate
 from tupli_mcap.storage.catalog.filter_sql import Narrowed, merged, narrowed
+from tupli_mcap.storage.catalog.order import After, Place, Sort, beyond, places
 from tupli_mcap.storage.catalog.rows import (
     EpisodeRow,
     StoredRow,
@@ -31,17 +32,20 @@ from tupli_mcap.storage.catalog.rows import (
 from tupli_mcap.storage.catalog.tables import (
     DECLARED,
     EPISODE,
-    EPISODE_BITS,
     RECORDING,
+    TALLY,
     VALUE,
+    episodes_of,
     in_order,
     of_one_recording,
 )
+from tupli_mcap.storage.catalog.tallies import tally
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = [
     "After",
+    "Sort",
     "count_episodes",
     "declare_key",
     "declared_keys",
@@ -53,13 +57,6 @@ __all__ = [
 
 _ROWS_AT_ONCE: Final = 20_000
 _COLUMNS: Final = tuple(EPISODE.c[name] for name in StoredRow._fields)
-
-
-class After(NamedTuple):
-    """The last episode of a page: the path of its recording, and its number there."""
-
-    recording: str
-    episode: int
 
 
 def put_recording(
@@ -83,6 +80,7 @@ def put_recording(
     while chunk := [store_row(number, row) for row in itertools.islice(remaining, _ROWS_AT_ONCE)]:
         _insert_all(connection, EPISODE, StoredRow._fields, chunk)
         _index(connection, chunk, indexed)
+    tally(connection, number)
 
 
 def find_episodes(
@@ -93,37 +91,52 @@ def find_episodes(
     offset: int = 0,
     after: After | None = None,
     only: ColumnElement[bool] | None = None,
+    sort: Sort | None = None,
+    backwards: bool = False,
 ) -> Iterator[EpisodeHeader]:
-    """The episodes that a filter is true of, ordered by recording (path) and episode number.
+    """The episodes that a filter is true of, by default ordered by recording (path) and episode number.
 
     after: where to go on. only: a condition on rows of EPISODE and RECORDING that holds besides the filter.
+    backwards: in the opposite order; `after` is then the episode before which they lie.
 
     Raises:
-        FilterError: The filter names an unknown top-level key, or compares a fact with what it can never be.
+        FilterError: The filter names an unknown top-level key, or compares a fact with what it can never be; or
+            the key to sort by is unknown.
+        NotFoundError: The episode to go on after is gone.
     """
-    meant = _bound(filter)
-    found = _narrowed(connection, meant, only, after)
+    meant, order = _bound(filter), places(sort, few=filter is not None, backwards=backwards)
+    found = _narrowed(connection, meant, only)
+    if after is not None:
+        found = found._replace(condition=and_(found.condition, beyond(connection, order, after)))
     if found.exact:
-        return _headers(connection, meant, found, limit, offset)
-    headers = _headers(connection, meant, found, None, 0)
+        return _headers(connection, meant, found, order, limit, offset)
+    headers = _headers(connection, meant, found, order, None, 0)
     return itertools.islice(headers, offset, None if limit is None else min(offset + limit, sys.maxsize))
 
 
 def count_episodes(
-    connection: Connection, filter: BaseFilter | None, *, only: ColumnElement[bool] | None = None
+    connection: Connection,
+    filter: BaseFilter | None,
+    *,
+    only: ColumnElement[bool] | None = None,
+    most: int | None = None,
 ) -> int:
-    """How many episodes a filter is true of. Raises as `find_episodes` does."""
+    """How many episodes a filter is true of, counted up to `most`. Raises as `find_episodes` does."""
     meant = _bound(filter)
-    found = _narrowed(connection, meant, only, None)
-    if found.exact:
+    found = _narrowed(connection, meant, only)
+    if found.exact and most is None:
         return int(connection.execute(_query(meant, found, func.count())).scalar_one())
-    return sum(1 for _ in _headers(connection, meant, found, None, 0))
+    if found.exact:
+        some = _query(meant, found, EPISODE.c.id).limit(most).subquery()
+        return int(connection.execute(select(func.count()).select_from(some)).scalar_one())
+    headers = _headers(connection, meant, found, places(None, few=True), None, 0)
+    return sum(1 for _ in itertools.islice(headers, most))
 
 
 def plan_of(connection: Connection, filter: BaseFilter | None) -> str:
     """The SQL of a filter, its parameters, SQLite's plan for it, and whether Python looks at what that finds."""
     meant = _bound(filter)
-    found = _narrowed(connection, meant, None, None)
+    found = _narrowed(connection, meant, None)
     compiled = _query(meant, found, EPISODE.c.id).compile(
         connection, compile_kwargs={"render_postcompile": True}
     )
@@ -166,10 +179,9 @@ def remove_recording(connection: Connection, relpath: str) -> None:
     ).scalar()
     if number is None:
         return
-    first = number << EPISODE_BITS
+    connection.execute(delete(TALLY).where(TALLY.c.recording_id == number))
     for episodes in (VALUE.c.episode_id, EPISODE.c.id):
-        of = and_(episodes >= first, episodes < first + (1 << EPISODE_BITS))
-        connection.execute(delete(episodes.table).where(of))
+        connection.execute(delete(episodes.table).where(episodes_of(number, episodes)))
     connection.execute(delete(RECORDING).where(RECORDING.c.id == number))
 
 
@@ -182,18 +194,10 @@ def _bound(filter: BaseFilter | None) -> BaseFilter | None:
 
 
 def _narrowed(
-    connection: Connection,
-    filter: BaseFilter | None,
-    only: ColumnElement[bool] | None,
-    after: After | None,
+    connection: Connection, filter: BaseFilter | None, only: ColumnElement[bool] | None
 ) -> Narrowed:
     found = _EVERYTHING if filter is None else narrowed(filter, _indexed(connection))
-    conditions = [found.condition] if only is None else [found.condition, only]
-    if after is not None:
-        path = escape_text(after.recording)
-        same = and_(RECORDING.c.path == path, EPISODE.c.episode > after.episode)
-        conditions.append(or_(RECORDING.c.path > path, same))
-    return found if len(conditions) == 1 else found._replace(condition=and_(*conditions))
+    return found if only is None else found._replace(condition=and_(found.condition, only))
 
 
 def _query(filter: BaseFilter | None, found: Narrowed, *columns: Any) -> Select[Any]:
@@ -202,13 +206,21 @@ def _query(filter: BaseFilter | None, found: Narrowed, *columns: Any) -> Select[
 
 
 def _headers(
-    connection: Connection, filter: BaseFilter | None, found: Narrowed, limit: int | None, offset: int
+    connection: Connection,
+    filter: BaseFilter | None,
+    found: Narrowed,
+    order: Sequence[Place],
+    limit: int | None,
+    offset: int,
 ) -> Iterator[EpisodeHeader]:
     """The episodes that a filter is true of; `limit` and `offset` count those that SQL finds."""
-    # Given the bare path to sort by, SQLite may walk all episodes in order for the few that match.
-    path = RECORDING.c.path if filter is None else func.coalesce(RECORDING.c.path, "")
-    query = _query(filter, found, *_COLUMNS, *_OF_RECORDING).order_by(path, EPISODE.c.id)
-    rows = connection.execute(query.limit(limit).offset(offset or None))
+    by = [value.desc() if descending else value for value, descending in order]
+    query = _query(filter, found, *_COLUMNS, *_OF_RECORDING).order_by(*by)
+    if limit is None:
+        rows = connection.execute(query.offset(offset or None))
+    else:  # first which ones they are: a database puts ids in order quicker than whole rows
+        few = _query(filter, found, EPISODE.c.id).order_by(*by).limit(limit).offset(offset or None)
+        rows = connection.execute(query.where(EPISODE.c.id.in_(few)))
     matches = None if filter is None or found.exact else bound_predicate(filter)
     width = len(_COLUMNS)
     runs: dict[int, list[dict[str, Any]]] = {}
@@ -256,11 +268,21 @@ def _add_recording(
     """Adds a recording without episodes, in place of what was known of it; returns its id."""
     remove_recording(connection, relpath)
     values = {
-        "path": escape_text(relpath), "uuid": uuid, "benchmark_id": escape_text(benchmark_id), "runs": runs
-    }  # fmt: skip
+        "path": escape_text(relpath),
+        "uuid": uuid,
+        "benchmark_id": escape_text(benchmark_id),
+        "environment": escape_text(_environment(runs)),
+        "runs": runs,
+    }
     added = connection.execute(insert(RECORDING).values(**values, **stamp._asdict()))
     (number,) = added.inserted_primary_key or (0,)
     return int(number)
+
+
+def _environment(runs: str) -> str:
+    """The environment that the first of some runs names."""
+    named = jsonvalue.loads(runs)[0].get("environment", "")
+    return named if isinstance(named, str) else ""
 
 
 def _insert_all(

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.predicate import MISSING, look_up
@@ -60,6 +61,7 @@ class StoredRow(NamedTuple):
     created_by: str
     published_in: str
     metadata: str
+    success: int | None
     run: int
     exact: str | None
 
@@ -83,6 +85,8 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
         exact["episode_return"], number = number, None
     if seed is not None and nearest_float(seed) != seed:
         exact["seed"] = seed
+    metadata = _searchable(row.metadata)
+    succeeded = success_of(load_metadata(metadata)) if 'success"' in metadata else None
     return StoredRow(
         id=(recording_id << EPISODE_BITS) + row.episode,
         recording_id=recording_id,
@@ -95,7 +99,8 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
         created_at=max(row.created_at // 1000 * 1000, _INT64_MIN),
         created_by=escape_text(row.created_by),
         published_in=row.published_in,
-        metadata=_searchable(row.metadata),
+        metadata=metadata,
+        success=None if succeeded is None else int(succeeded),
         run=row.run,
         exact=json.dumps(exact) if exact else None,
     )

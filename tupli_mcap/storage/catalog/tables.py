@@ -14,14 +14,16 @@ __all__ = [
     "EPISODE_BITS",
     "METADATA",
     "RECORDING",
+    "TALLY",
     "VALUE",
     "VERSION",
+    "episodes_of",
     "in_order",
     "of_one_recording",
 ]
 
 APPLICATION_ID: Final = 0x7475_706C  # "tupl": how SQLite tells whose file this is
-VERSION: Final = 5
+VERSION: Final = 6
 
 EPISODE_BITS: Final = 32
 """An episode's row id is its recording's id shifted left by this, plus its number: rows lie in file order."""
@@ -42,6 +44,7 @@ RECORDING: Final = Table(
     Column("mixed", BigInteger, nullable=False),
     Column("uuid", Text, nullable=False, index=True),
     Column("benchmark_id", Text, nullable=False, index=True),
+    Column("environment", Text, nullable=False),  # that of its first run, "" if it does not say
     Column("runs", Text, nullable=False),  # JSON: those that its episodes are of
 )
 
@@ -60,8 +63,29 @@ EPISODE: Final = Table(
     Column("created_by", Text, nullable=False),
     Column("published_in", Text, nullable=False),
     Column("metadata", Text, nullable=False),
+    Column("success", Integer),  # 0 or 1 where the metadata say it
     Column("run", Integer, nullable=False),  # its place among the recording's
     Column("exact", Text),  # JSON of the fields of which the columns do not say all
+)
+
+# Sums over the episodes of a recording that the same people see: what is shown of many recordings looks at no episode.
+# They are made anew, by `tallies.tally`, in each transaction that changes episodes of the recording.
+TALLY: Final = Table(
+    "tally",
+    METADATA,
+    Column("recording_id", _ID, ForeignKey("recording.id"), primary_key=True),
+    Column("created_by", Text, primary_key=True),
+    Column("published_in", Text, primary_key=True),
+    Column("episodes", BigInteger, nullable=False),
+    Column("steps", BigInteger, nullable=False),
+    Column("returns", BigInteger, nullable=False),  # how many are numbers
+    Column("return_sum", Float),  # of those
+    Column("return_least", Float),
+    Column("return_most", Float),
+    Column("told", BigInteger, nullable=False),  # how many say whether they succeeded
+    Column("succeeded", BigInteger, nullable=False),
+    Column("first", BigInteger, nullable=False),  # the least and greatest `created_at`
+    Column("last", BigInteger, nullable=False),
 )
 
 DECLARED: Final = Table(
@@ -82,6 +106,12 @@ VALUE: Final = Table(
     Index("ix_value", "key", "number", "text", "episode_id"),
     sqlite_with_rowid=False,
 )
+
+
+def episodes_of(recording_id: int, row_id: ColumnElement[int]) -> ColumnElement[bool]:
+    """Where a column of row ids names an episode of a recording."""
+    first = recording_id << EPISODE_BITS
+    return and_(row_id >= first, row_id < first + (1 << EPISODE_BITS))
 
 
 def of_one_recording() -> ColumnElement[bool]:

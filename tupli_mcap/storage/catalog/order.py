@@ -1,0 +1,104 @@
+"""The order of episodes: by a fact or a value of their metadata, and where a page of them goes on."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple, Self
+
+from sqlalchemy import ColumnElement, Connection, and_, case, false, func, or_, select
+
+from tupli_mcap.errors import FilterError, NotFoundError
+from tupli_mcap.schema import EpisodeHeader, join_key
+from tupli_mcap.schema.facts import path_in
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
+from tupli_mcap.storage.texts import escape_text
+
+__all__ = ["After", "Place", "Sort", "beyond", "places"]
+
+_FACTS: Final = {
+    name: EPISODE.c[name] for name in ("created_at", "n_tuples", "env", "episode", "end", "created_by")
+}
+_MAYBE: Final = {name: EPISODE.c[name] for name in ("episode_return", "seed")}
+_OF_RECORDING: Final = {"recording": RECORDING.c.path, "benchmark_id": RECORDING.c.benchmark_id}
+_SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
+
+
+class After(NamedTuple):
+    """The last episode of a page: the path of its recording, and its number there."""
+
+    recording: str
+    episode: int
+
+
+class Sort(NamedTuple):
+    """What episodes are put in the order of: a key as filters name it, such as `return` or `metadata.score`.
+
+    What has no value comes last, also where the order falls. Episodes with the same value follow each other by
+    recording (path) and number.
+    """
+
+    key: str
+    descending: bool = False
+
+    @classmethod
+    def parse(cls, text: str) -> Self | None:
+        """`-return` is a falling order; None for an empty text."""
+        return cls(text.removeprefix("-"), text.startswith("-")) if text else None
+
+
+class Place(NamedTuple):
+    """One of the values that decide on the place of an episode; none is NULL."""
+
+    value: ColumnElement[Any]
+    descending: bool
+
+
+def places(sort: Sort | None, *, few: bool, backwards: bool = False) -> list[Place]:
+    """What episodes are ordered by, the most important first.
+
+    few: whether they are few among many. Given the bare path to sort by, SQLite walks all episodes in order.
+
+    Raises:
+        FilterError: there is no such key, or it cannot be sorted by.
+    """
+    path = func.coalesce(RECORDING.c.path, "") if few else RECORDING.c.path
+    found = [*([] if sort is None else _of_key(sort)), Place(path, False), Place(EPISODE.c.id, False)]
+    return [Place(value, not falling) for value, falling in found] if backwards else found
+
+
+def beyond(connection: Connection, order: Sequence[Place], after: After) -> ColumnElement[bool]:
+    """What comes after an episode.
+
+    Raises:
+        NotFoundError: it is not there any more.
+    """
+    this = and_(RECORDING.c.path == escape_text(after.recording), EPISODE.c.episode == after.episode)
+    query = select(*(value for value, _ in order)).select_from(EPISODE.join(RECORDING, of_one_recording()))
+    values = connection.execute(query.where(this)).first()
+    if values is None:
+        raise NotFoundError("the episode after which the page begins is gone; list from the beginning")
+    condition: ColumnElement[bool] = false()
+    for (value, descending), reached in zip(reversed(order), reversed(values), strict=True):
+        further = value < reached if descending else value > reached
+        condition = or_(further, and_(value == reached, condition))
+    return condition
+
+
+def _of_key(sort: Sort) -> list[Place]:
+    name, *inside = path_in(sort.key, EpisodeHeader)
+    if not inside and (name in _FACTS or name in _OF_RECORDING):
+        return [Place({**_FACTS, **_OF_RECORDING}[name], sort.descending)]
+    if not inside and name in _MAYBE:
+        return _last_where_missing(_MAYBE[name], sort.descending)
+    if name != "metadata" or not inside or not all(map(_SEARCHABLE.fullmatch, inside)):
+        raise FilterError(
+            f"cannot sort by {join_key([name, *inside])!r}; sort by return, steps, ended, end, seed, env, episode, "
+            "recording, or a key of the metadata such as metadata.score"
+        )
+    value = func.json_extract(EPISODE.c.metadata, "$" + "".join(f'."{segment}"' for segment in inside))
+    return _last_where_missing(value, sort.descending)
+
+
+def _last_where_missing(value: ColumnElement[Any], descending: bool) -> list[Place]:
+    return [Place(case((value.is_(None), 1), else_=0), False), Place(func.coalesce(value, 0), descending)]

@@ -1,0 +1,96 @@
+"""What is known of recordings without a look at their episodes: how many, how long, how good, since when."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from sqlalchemy import ColumnElement, Connection, case, delete, func, insert, select, true
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, episodes_of
+from tupli_mcap.storage.texts import unescape_text
+
+__all__ = ["Tally", "tallies", "tally"]
+
+
+class Tally(NamedTuple):
+    """A recording, and sums over its episodes that may be seen.
+
+    returns, return_sum, return_least, return_most: of the episodes whose return is a number; None where there is none.
+    told, succeeded: how many episodes say whether they succeeded, and how many did. first, last: when the first
+    and the last of them ended (ns since 1970, UTC). runs: what the episodes are of, as `EpisodeHeader.run`.
+    """
+
+    recording: str
+    uuid: str
+    benchmark_id: str
+    environment: str
+    size: int
+    mixed: int
+    runs: list[dict[str, Any]]
+    episodes: int
+    steps: int
+    returns: int
+    return_sum: float | None
+    return_least: float | None
+    return_most: float | None
+    told: int
+    succeeded: int
+    first: int
+    last: int
+
+
+def tally(connection: Connection, recording_id: int) -> None:
+    """Makes the sums of a recording anew."""
+    connection.execute(delete(TALLY).where(TALLY.c.recording_id == recording_id))
+    groups = (EPISODE.c.recording_id, EPISODE.c.created_by, EPISODE.c.published_in)
+    sums = (
+        func.count(),
+        func.sum(EPISODE.c.n_tuples),
+        func.count(EPISODE.c.episode_return),
+        func.sum(EPISODE.c.episode_return),
+        func.min(EPISODE.c.episode_return),
+        func.max(EPISODE.c.episode_return),
+        func.count(EPISODE.c.success),
+        func.sum(case((EPISODE.c.success == 1, 1), else_=0)),
+        func.min(EPISODE.c.created_at),
+        func.max(EPISODE.c.created_at),
+    )
+    summed = select(*groups, *sums).where(episodes_of(recording_id, EPISODE.c.id)).group_by(*groups)
+    connection.execute(insert(TALLY).from_select([column.name for column in TALLY.c], summed))
+
+
+def tallies(
+    connection: Connection,
+    seen: ColumnElement[bool] | None = None,
+    of: ColumnElement[bool] | None = None,
+) -> Iterator[Tally]:
+    """The recordings of which some episodes may be seen, by their paths.
+
+    seen: a condition on TALLY.c.created_by and .published_in. of: one on RECORDING.
+    """
+    recording = [RECORDING.c[name] for name in Tally._fields[:7] if name != "recording"]
+    sums = [
+        func.sum(TALLY.c.episodes),
+        func.sum(TALLY.c.steps),
+        func.sum(TALLY.c.returns),
+        func.sum(TALLY.c.return_sum),
+        func.min(TALLY.c.return_least),
+        func.max(TALLY.c.return_most),
+        func.sum(TALLY.c.told),
+        func.sum(TALLY.c.succeeded),
+        func.min(TALLY.c.first),
+        func.max(TALLY.c.last),
+    ]
+    query = (
+        select(RECORDING.c.path, *recording, *sums)
+        .join(TALLY, TALLY.c.recording_id == RECORDING.c.id)
+        .where(true() if seen is None else seen, true() if of is None else of)
+        .group_by(RECORDING.c.id)
+        .order_by(RECORDING.c.path)
+    )
+    for path, uuid, benchmark_id, environment, size, mixed, runs, *summed in connection.execute(query):
+        counts: list[Any] = [int(value) if i not in (3, 4, 5) else value for i, value in enumerate(summed)]
+        named = unescape_text(path), uuid, unescape_text(benchmark_id), unescape_text(environment)
+        yield Tally(*named, size, mixed, jsonvalue.loads(runs), *counts)
