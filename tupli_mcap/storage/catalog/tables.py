@@ -77,7 +77,7 @@ TALLY: Final = Table(
     Column("created_by", Text, primary_key=True),
     Column("published_in", Text, primary_key=True),
     Column("episodes", BigInteger, nullable=False),
-    Column("steps", BigInteger, nullable=False),
+    Column("steps", Float, nullable=False),  # a file may claim more than an integer of a database holds
     Column("returns", BigInteger, nullable=False),  # how many are numbers
     Column("return_sum", Float),  # of those
     Column("return_least", Float),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, Connection, case, delete, func, insert, select, true
+from sqlalchemy import ColumnElement, Connection, Float, case, cast, delete, func, insert, select, true
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, episodes_of
@@ -47,7 +47,7 @@ def tally(connection: Connection, recording_id: int) -> None:
     groups = (EPISODE.c.recording_id, EPISODE.c.created_by, EPISODE.c.published_in)
     sums = (
         func.count(),
-        func.sum(EPISODE.c.n_tuples),
+        func.sum(cast(EPISODE.c.n_tuples, Float)),
         func.count(EPISODE.c.episode_return),
         func.sum(EPISODE.c.episode_return),
         func.min(EPISODE.c.episode_return),
