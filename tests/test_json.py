@@ -108,6 +108,7 @@ record: record CartPole-v1 -o new.mcap --steps 20
 list-benchmarks: list-benchmarks --storage lab
 list-artifacts: list-artifacts --storage lab
 list-episodes: list-episodes --storage lab
+rename: rename {pole} pole2 --description standing --storage lab --dry-run
 compact: compact --storage lab --dry-run
 reindex: reindex --storage lab
 trust --key: trust --key key.pub --name me

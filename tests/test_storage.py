@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from sqlalchemy.exc import OperationalError
+from test_schemas import validator
 
 from tupli_mcap import EpisodeWriter, TupliDataset, TupliEnvWrapper
 from tupli_mcap.environment import capture
@@ -54,6 +55,7 @@ from tupli_mcap.storage.bundles import from_recording
 from tupli_mcap.storage.catalog import database
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.place import catalog_path
+from tupli_mcap.storage.exchange import copy_benchmark
 from tupli_mcap.storage.from_values import conform, infer_space
 from tupli_mcap.storage.listing import list_recordings
 from tupli_mcap.storage.verify import verify_storage
@@ -839,6 +841,37 @@ class TestFileStorage(StorageContract):
             env.step(0)
         with pytest.raises(StorageError, match="recorded outside a storage"):
             storage.import_bundle(tmp_path / "plain.mcap")
+
+    def test_another_name_is_shown_and_the_benchmark_stays_the_same(
+        self, storage: FileStorage, tmp_path: Path
+    ) -> None:
+        header = storage.store_benchmark(query("pole"))
+        storage.record_episode(episode(header.id))
+        storage.edit_benchmark(header.id, name="cart pole", description="wind")
+        storage.publish_benchmark(header.id, "lab")
+        edited = storage.edit_benchmark(header.id, name="cart pole, windy")
+        assert edited.id == header.id
+        assert edited.stored_metadata == header.metadata
+        for found in (edited, storage.load_benchmark(header.id), *storage.list_benchmarks()):
+            assert (found.metadata.name, found.metadata.description) == ("cart pole, windy", "wind")
+        assert storage.list_benchmarks(F("metadata.name") == "pole") == []
+        assert storage.store_benchmark(query("pole")).metadata.name == "cart pole, windy"
+        storage.bundle(header.id, tmp_path / "b.mcap")
+        other = FileStorage(tmp_path / "other")
+        assert other.import_bundle(tmp_path / "b.mcap") == header.id
+        assert other.load_benchmark(header.id).metadata == edited.metadata
+        assert copy_benchmark(storage, FileStorage(tmp_path / "third"), header.id).episodes == 1
+        assert verify_storage(other.root).ok
+        document = json.loads((storage.root / "benchmarks" / f"{header.id}.json").read_text())
+        validator("benchmark.schema.json").validate(document)
+        assert storage.undo_benchmark_edit(header.id, dry_run=True).metadata.name == "cart pole"
+        assert storage.undo_benchmark_edit(header.id).metadata.name == "cart pole"
+        assert storage.undo_benchmark_edit(header.id).metadata == header.metadata
+        with pytest.raises(StorageError, match="nothing was edited"):
+            storage.undo_benchmark_edit(header.id)
+        for nothing in ({}, {"name": " "}):
+            with pytest.raises(StorageError, match="expected a name or a description"):
+                storage.edit_benchmark(header.id, **nothing)
 
     def test_a_plain_recording_gets_a_benchmark_of_its_environment(
         self, storage: FileStorage, tmp_path: Path

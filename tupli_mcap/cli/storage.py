@@ -1,4 +1,4 @@
-"""Commands on storages: delete, restore, compact, list-benchmarks, list-artifacts, list-episodes, reindex."""
+"""Commands on storages: delete, restore, compact, list-benchmarks, list-artifacts, list-episodes, rename, reindex."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from tupli_mcap.cli.options import (
     StoragePath,
     any_storage,
     filter_of,
+    full_id,
     local_path,
     open_storage,
 )
@@ -28,6 +29,7 @@ from tupli_mcap.cli.output import (
     bytes_of,
     counted,
     number,
+    print_facts,
     print_json,
     print_table,
     short_ids,
@@ -36,7 +38,16 @@ from tupli_mcap.cli.output import (
 from tupli_mcap.cli.terminal import say, terminal_width
 from tupli_mcap.errors import RecordingError
 
-__all__ = ["compact", "delete", "list_artifacts", "list_benchmarks", "list_episodes", "reindex", "restore"]
+__all__ = [
+    "compact",
+    "delete",
+    "list_artifacts",
+    "list_benchmarks",
+    "list_episodes",
+    "reindex",
+    "rename",
+    "restore",
+]
 
 _ROOMY = 100  # columns of a terminal on which benchmarks and their environments fit side by side
 
@@ -237,6 +248,38 @@ def compact(
         if recordings or left
         else "nothing to compact"
     )
+
+
+def rename(
+    benchmark: Annotated[str, typer.Argument(metavar="BENCHMARK_ID", help="4 digits may do.")],
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="The new name.")] = None,
+    description: Annotated[str | None, typer.Option(help="The new description.")] = None,
+    undo: Annotated[bool, typer.Option("--undo", help="Take back the last change.")] = False,
+    storage_path: StoragePath = DEFAULT_STORAGE,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be written.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Give a benchmark another name or description.
+
+    It keeps its id and its episodes; lists, filters and bundles show the new name. A run has its name changed by edit.
+    """
+    if Path(benchmark).is_file():
+        raise typer.BadParameter(
+            f"{benchmark} is a recording; its run: tupli-mcap edit {benchmark} --name NAME"
+        )
+    if undo == (name is not None or description is not None):
+        raise typer.BadParameter("give a name or --description, or --undo")
+    with open_storage(storage_path) as storage:
+        uri = full_id(storage, benchmark)
+        if undo:
+            header = storage.undo_benchmark_edit(uri, dry_run=dry_run)
+        else:
+            header = storage.edit_benchmark(uri, name=name, description=description, dry_run=dry_run)
+    if as_json:
+        print_json({"dry_run": dry_run, "benchmark": header.model_dump()})
+        return
+    facts = {"benchmark": uri, "name": header.metadata.name, "description": header.metadata.description}
+    print_facts([(key, text) for key, text in facts.items() if text])
 
 
 def reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) -> None:

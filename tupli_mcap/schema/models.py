@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, Self
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, PrivateAttr
 
 from tupli_mcap.errors import StorageError
 
@@ -78,6 +78,18 @@ class BenchmarkHeader(DBItem):
     hash: str
     metadata: BenchmarkMetadata
     environment: str = ""
+    _stored_metadata: BenchmarkMetadata | None = PrivateAttr(None)
+
+    @property
+    def stored_metadata(self) -> BenchmarkMetadata:
+        """The metadata that it was stored with, which its id is made of; `metadata` may have been edited since."""
+        return self._stored_metadata or self.metadata
+
+    def edited(self, changes: Mapping[str, Any]) -> Self:
+        """The same benchmark with other metadata, by name of the field."""
+        made = self.model_copy(update={"metadata": self.metadata.model_copy(update=dict(changes))})
+        made._stored_metadata = self.stored_metadata
+        return made
 
 
 class Benchmark(BenchmarkHeader):

@@ -102,7 +102,9 @@ class Library:
                 self.store_artifact(admin, storage.load_artifact(item.id), told)
             for header in storage.list_benchmarks():
                 found = storage.load_benchmark(header.id)
-                query = BenchmarkQuery(hash=found.hash, serialized=found.serialized, metadata=found.metadata)
+                query = BenchmarkQuery(
+                    hash=found.hash, serialized=found.serialized, metadata=found.stored_metadata
+                )
                 with self.database.writing() as connection:
                     self.items.store_benchmark(connection, admin, query)
         pending = set(self._pending(seconds=0))

@@ -23,7 +23,9 @@ __all__ = [
     "benchmark_entry",
     "benchmark_hash",
     "declared_spaces",
+    "edits_of",
     "facts_about",
+    "header_of",
     "pack",
     "plain",
     "recording_attachments",
@@ -34,6 +36,7 @@ __all__ = [
 PICKLE_NAME = "env.cloudpickle"
 DOCUMENT_NAME = "benchmark.json"
 ARTIFACT_PREFIX = "artifacts/"
+EDITABLE = ("name", "description")  # of a benchmark's metadata
 
 
 class BenchmarkContent(NamedTuple):
@@ -59,6 +62,34 @@ def plain(model: BaseModel) -> dict[str, Any]:
 def benchmark_entry(header: BenchmarkHeader) -> dict[str, Any]:
     """A header as the `benchmark` entry of a document, whose `environment` entry has the name."""
     return {key: value for key, value in plain(header).items() if key != "environment"}
+
+
+def header_of(entry: Any) -> BenchmarkHeader:
+    """The header in the `benchmark` entry of a document, with the name and the description that it was given last.
+
+    Raises:
+        FormatError, ValidationError: It is none.
+    """
+    header = BenchmarkHeader.model_validate(restored(entry))
+    for edit in edits_of(entry):
+        header = header.edited({key: edit[key] for key in EDITABLE if key in edit})
+    return header
+
+
+def edits_of(entry: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What a benchmark was called after it was stored, in this order.
+
+    Raises:
+        FormatError: The entry says something else.
+    """
+    said = entry.get("edits", [])
+    if not isinstance(said, list) or not all(map(_is_edit, said)):
+        raise FormatError(f"expected edits with a name or a description, found {said!r:.100}")
+    return said
+
+
+def _is_edit(said: Any) -> bool:
+    return isinstance(said, dict) and all(isinstance(said.get(key, ""), str) for key in EDITABLE)
 
 
 def restored(value: Any) -> Any:

@@ -4,22 +4,26 @@ environment if it has no spec."""
 from __future__ import annotations
 
 import json
+import time
 import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from pydantic import ValidationError
 
 from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
-from tupli_mcap.schema.times import time_ns
+from tupli_mcap.schema.times import iso_utc, time_ns
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
 from tupli_mcap.storage.base import LOCAL_USER, published_in
 from tupli_mcap.storage.benchmark_json import (
     artifacts_of,
     benchmark_entry,
     benchmark_hash,
+    edits_of,
+    header_of,
     pack,
     plain,
     restored,
@@ -28,6 +32,8 @@ from tupli_mcap.storage.benchmark_json import (
 from tupli_mcap.storage.texts import first_defect, is_hash, to_json
 
 __all__ = ["BenchmarkFiles", "document_of", "name_in"]
+
+_Edits: TypeAlias = Sequence[Mapping[str, Any]]
 
 
 class BenchmarkFiles:
@@ -60,7 +66,10 @@ class BenchmarkFiles:
             serialized = str(document.get("serialized", ""))
         else:
             serialized = self._serialized(uri, header)
-        return Benchmark(**header.model_dump(), serialized=serialized)
+        stored = Benchmark(
+            **{**header.model_dump(), "metadata": header.stored_metadata}, serialized=serialized
+        )
+        return stored.edited(dict(header.metadata))
 
     def header(self, uri: str) -> BenchmarkHeader:
         return self._header(uri, self._read(uri))
@@ -92,6 +101,35 @@ class BenchmarkFiles:
             with os_errors("cannot publish the benchmark", self._path(uri)):
                 write_bytes(self._path(uri), to_json(document))
 
+    def edit(self, uri: str, changes: Mapping[str, str], by: str, *, dry_run: bool) -> BenchmarkHeader:
+        """Shows other metadata from now on. What it was stored with, and its id, stay."""
+        if not changes or not changes.get("name", "x").strip():
+            raise StorageError(
+                f"expected a name or a description of the benchmark, found {dict(changes)!r:.100}"
+            )
+        edit = {**changes, "by": by, "at": iso_utc(time.time_ns())}
+        return self._say(uri, lambda edits: (*edits, edit), dry_run)
+
+    def undo_edit(self, uri: str, *, dry_run: bool) -> BenchmarkHeader:
+        """Takes the last edit back."""
+
+        def shortened(edits: _Edits) -> _Edits:
+            if not edits:
+                raise StorageError(f"benchmark {uri}: nothing was edited that could be taken back")
+            return edits[:-1]
+
+        return self._say(uri, shortened, dry_run)
+
+    def _say(self, uri: str, change: Callable[[_Edits], _Edits], dry_run: bool) -> BenchmarkHeader:
+        with self._lock:
+            document = self._read(uri)
+            self._header(uri, document)  # refuses a damaged one
+            document["benchmark"]["edits"] = [*change(edits_of(document["benchmark"]))]
+            if not dry_run:
+                with os_errors("cannot edit the benchmark", self._path(uri)):
+                    write_bytes(self._path(uri), to_json(document))
+            return self._header(uri, document)
+
     def artifacts(self, uri: str) -> tuple[str, ...]:
         """The ids of the artifacts a benchmark needs."""
         entry = self._read(uri).get("benchmark")
@@ -109,7 +147,7 @@ class BenchmarkFiles:
         facts = dict(record.benchmark or {})
         artifacts = artifacts_of(record, str(path))
         serialized = pack(record, artifacts, facts)
-        identity = benchmark_hash(unpack(serialized, where=str(path)), header.metadata)
+        identity = benchmark_hash(unpack(serialized, where=str(path)), header.stored_metadata)
         if identity != uri:
             raise FormatError(f"{path}: expected the content of benchmark {uri}, found that of {identity}")
         return serialized
@@ -128,7 +166,7 @@ class BenchmarkFiles:
 
     def _header(self, uri: str, document: dict[str, Any]) -> BenchmarkHeader:
         try:
-            header = BenchmarkHeader.model_validate(restored(document.get("benchmark")))
+            header = header_of(document.get("benchmark"))
         except FormatError as err:
             raise FormatError(f"{self._path(uri)}: expected a benchmark: {err}") from err
         except ValidationError as err:

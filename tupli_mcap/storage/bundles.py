@@ -41,6 +41,7 @@ from tupli_mcap.storage.benchmark_json import (
     benchmark_entry,
     benchmark_hash,
     declared_spaces,
+    header_of,
     pack,
     plain,
     restored,
@@ -288,9 +289,9 @@ def incoming(recording: Recording, path: Path) -> tuple[EnvironmentRecord, Bench
     query = BenchmarkQuery(
         hash=header.hash,
         serialized=pack(record, artifacts_of(record, str(path)), record.benchmark),
-        metadata=header.metadata,
+        metadata=header.stored_metadata,
     )
-    if benchmark_hash(unpack(query.serialized), header.metadata) != header.id:
+    if benchmark_hash(unpack(query.serialized), query.metadata) != header.id:
         raise FormatError(f"{path}: expected the content of benchmark {header.id}, found something else")
     return record, header, query
 
@@ -427,7 +428,7 @@ def _header(record: EnvironmentRecord, path: Path) -> BenchmarkHeader:
             "of it (tupli-mcap bundle), or copy it into the storage's directory, where its episodes are found"
         )
     try:
-        return BenchmarkHeader.model_validate(restored(record.benchmark))
+        return header_of(record.benchmark)
     except ValidationError as err:
         raise FormatError(f"{path}: {DOCUMENT_NAME}: {first_defect(err)}") from err
 

@@ -38,7 +38,9 @@ def copy_benchmark(
     benchmark = source.load_benchmark(uri)
     artifacts = _copy_artifacts(source, target, benchmark.serialized)
     target.store_benchmark(
-        BenchmarkQuery(hash=benchmark.hash, serialized=benchmark.serialized, metadata=benchmark.metadata)
+        BenchmarkQuery(
+            hash=benchmark.hash, serialized=benchmark.serialized, metadata=benchmark.stored_metadata
+        )
     )
     of_benchmark = FilterEQ(key="benchmark_id", value=uri)
     headers = source.list_episodes(of_benchmark if filter is None else of_benchmark & filter)

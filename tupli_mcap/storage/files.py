@@ -23,6 +23,7 @@ from pydantic import BaseModel, ValidationError
 
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording, write_recording
+from tupli_mcap.recording.edit.annotate import user_name
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -112,6 +113,30 @@ class FileStorage(TupliStorage):
 
     def load_benchmark(self, uri: str) -> Benchmark:
         return self._benchmarks.load(uri)
+
+    def edit_benchmark(
+        self, uri: str, *, name: str | None = None, description: str | None = None, dry_run: bool = False
+    ) -> BenchmarkHeader:
+        """Gives a benchmark another name or description, which lists, filters and bundles show from now on.
+
+        Its id, its episodes and the metadata that it was stored with stay; who edited it and when is kept.
+
+        Raises:
+            NotFoundError: There is no such benchmark.
+            StorageError: Nothing is given, or it cannot be written.
+        """
+        given = {"name": name, "description": description}
+        changes = {key: value for key, value in given.items() if value is not None}
+        return self._benchmarks.edit(uri, changes, user_name(), dry_run=dry_run)
+
+    def undo_benchmark_edit(self, uri: str, *, dry_run: bool = False) -> BenchmarkHeader:
+        """Takes the last edit of a benchmark back.
+
+        Raises:
+            NotFoundError: There is no such benchmark.
+            StorageError: There is no edit, or it cannot be written.
+        """
+        return self._benchmarks.undo_edit(uri, dry_run=dry_run)
 
     def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
         return self._benchmarks.list(filter)

@@ -26,7 +26,7 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
 
-__all__ = ["annotate_episodes", "edit_run", "undo_annotation", "undo_edit"]
+__all__ = ["annotate_episodes", "edit_run", "undo_annotation", "undo_edit", "user_name"]
 
 _MOST_EDITS = 20  # that can be taken back
 
@@ -67,7 +67,7 @@ def annotate_episodes(
                 f"expected episodes and values to give them, found {chosen!r:.60}, {values!r:.60}"
             )
         said = Annotations()
-        added = Annotation(chosen, dict(values), _user(), iso_utc(time.time_ns()))
+        added = Annotation(chosen, dict(values), user_name(), iso_utc(time.time_ns()))
         said.said = [*recording.annotations.said, added]
         say(ANNOTATIONS_NAME, ANNOTATIONS_MEDIA_TYPE, said.to_json())
     return chosen
@@ -170,7 +170,8 @@ def _changing(
         yield recording, say
 
 
-def _user() -> str:
+def user_name() -> str:
+    """The name of this process's user, empty where there is none."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):  # a user without a name, as in a container
