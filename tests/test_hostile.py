@@ -42,6 +42,7 @@ from tupli_mcap.storage.listing import list_recordings
 SEEDS = {seed.name: seed for seed in load_seeds()}
 CAP, MULTIPLE = 64 << 20, 40  # bytes to open and list a file: as schemas/README.md has it
 BIG = 2**64 - 1
+REPEATED = b"tupli_mcap.recording.repeated"
 
 
 def model(name: str = "constant_none") -> Model:
@@ -459,20 +460,24 @@ def test_chunks_of_one_size_are_not_swapped(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", [b"created_ns", b"uuid", b"benchmark_id", b"crc"])
 def test_damaged_metadata_is_seen(key: bytes, tmp_path: Path) -> None:
+    """Of the record at the end, which readers go by, and of the first one, by verification."""
     data = bytearray(SEEDS["constant_zstd"].data)
-    at = data.index(key) + len(key) + 4 + 3
-    for place in (at, data.index(key) + 1):  # in the value, in the key
-        damaged = data.copy()
-        damaged[place] ^= 1
-        path = tmp_path / "hostile.mcap"
-        path.write_bytes(damaged)
-        with pytest.raises(FormatError, match="is damaged|expected a key 'crc'"):
-            Recording(path)
+    path = tmp_path / "hostile.mcap"
+    for first in (True, False):
+        at = data.index(key, 0 if first else data.index(REPEATED))
+        for place in (at + len(key) + 4 + 3, at + 1):  # in the value, in the key
+            damaged = data.copy()
+            damaged[place] ^= 1
+            path.write_bytes(damaged)
+            assert any(problem.kind == "metadata" for problem in verify_recording(path).errors)
+            if not first:
+                with pytest.raises(FormatError, match="is damaged|expected a key 'crc'"):
+                    Recording(path)
 
 
 def test_a_length_that_swallows_the_checksum(tmp_path: Path) -> None:
     data = bytearray(SEEDS["vector_same_step"].data)
-    at = data.index(b"benchmark_id") + len(b"benchmark_id")
+    at = data.index(b"benchmark_id", data.index(REPEATED)) + len(b"benchmark_id")
     assert data[at : at + 4] == bytes(4)
     data[at] = 4 + len("crc") + 4 + 8
     path = tmp_path / "hostile.mcap"
@@ -532,18 +537,17 @@ class Zeros(gym.Env[Any, Any]):
 
 
 def test_lengths_of_maps_are_looked_at(tmp_path: Path) -> None:
-    """Every bit of the length of the map in the first metadata record, and in a channel outside of chunks."""
+    """Every bit of the length of the map in the last metadata record, and in a channel outside of chunks."""
     data = SEEDS["constant_zstd"].data
-    name = data.index(b"tupli_mcap.recording")
     for bit in range(8):
         damaged = bytearray(data)
-        damaged[name + len("tupli_mcap.recording")] ^= 1 << bit
+        damaged[data.index(REPEATED) + len(REPEATED)] ^= 1 << bit
         path = tmp_path / "a.mcap"
         path.write_bytes(damaged)
         with pytest.raises(FormatError, match="damaged|expected|has \\d+ bytes"):
             Recording(path)
         assert not verify_recording(path).ok
-    channel = data.index(b"/step", name)
+    channel = data.index(b"/step")
     at = channel + len("/step") + 4 + len("cdr")
     assert data[channel + len("/step") : at] == b"\3\0\0\0cdr"
     for bit in range(8):

@@ -212,10 +212,11 @@ def test_a_later_format_is_neither_recovered_nor_judged(finished: bool, tmp_path
             roll(env, 300)
     else:
         abandon(path, cart_pole, 300)
-    metadata, data = dict(Recording(path).metadata), bytearray(path.read_bytes())
-    data[data.index(b"format_version") + len("format_version") + 4] = ord("3")
+    metadata, data = dict(Recording(path).metadata), path.read_bytes()
     old, new = (with_crc({**metadata, "format_version": n})["crc"].encode() for n in "13")
-    path.write_bytes(data.replace(old, new, 1))
+    key = b"format_version" + (1).to_bytes(4, "little")
+    assert data.count(key + b"1") == 1 + finished  # at both ends
+    path.write_bytes(data.replace(key + b"1", key + b"3").replace(old, new))
     for place in (path, tmp_path / "header.mcap"):  # in the second one the header is damaged
         if place != path:
             data = path.read_bytes()

@@ -59,7 +59,7 @@ def server(large: Path) -> Iterator[WebServer]:
 
 def test_a_file_is_opened_by_its_tail(server: WebServer, large: Path) -> None:
     recording = Recording(server.url())
-    assert sorted(asked.range or "" for asked in server.asked) == ["bytes=-131072", "bytes=0-16383"]
+    assert [asked.range for asked in server.asked] == ["bytes=-131072"]
     assert len(recording) == EPISODES and recording.uuid == Recording(large).uuid
 
 
@@ -157,7 +157,7 @@ def test_weak_tags_are_compared_and_not_sent(server: WebServer) -> None:
 def test_a_server_that_knows_no_suffixes(server: WebServer) -> None:
     server.suffixes = False
     assert Recording(server.url()).num_steps == EPISODES * STEPS
-    assert sorted(asked.method for asked in server.asked) == ["GET", "GET", "GET", "HEAD"]
+    assert [asked.method for asked in server.asked] == ["GET", "HEAD", "GET"]
 
 
 def test_a_server_that_knows_no_ranges(server: WebServer, large: Path) -> None:

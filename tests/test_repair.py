@@ -329,13 +329,13 @@ def test_what_else_is_damaged_is_said(tmp_path: Path) -> None:
         wanted = steps_of(recording)
     everything = places(path)
     attachment = next(i for i in everything if i.attachment is not None and i.attachment.name == "note")
-    metadata = next(item for item in everything if item.opcode == 12)
+    metadata = [item.offset + 1 for item in everything if item.opcode == 12]
     indexes = [item for item in everything if item.opcode == 7]
     hit(path, attachment)
     report = recover_recording(path, dry_run=True)
     assert [place.why for place in report.damaged] == ["the attachment 'note' is damaged (its CRC differs)"]
     hit(path, indexes[0])
-    flip(path, metadata.offset + 1, path.stat().st_size - 20)
+    flip(path, *metadata, path.stat().st_size - 20)
     report, recording = recovered(path)
     with recording:
         assert steps_of(recording) == wanted
@@ -351,7 +351,7 @@ def test_damaged_metadata_are_made_anew(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap")
     with Recording(path) as recording:
         wanted, uuid = steps_of(recording), recording.uuid
-    flip(path, path.read_bytes().index(uuid.encode()) + 5)
+    flip(path, path.read_bytes().index(uuid.encode()) + 5, path.read_bytes().rindex(uuid.encode()) + 5)
     with pytest.raises(FormatError, match="'tupli_mcap.recording' is damaged: expected crc"):
         Recording(path)
     with tallied(zlib, "crc32", lambda data, *_: len(data)) as sizes:
@@ -361,8 +361,37 @@ def test_damaged_metadata_are_made_anew(tmp_path: Path) -> None:
         assert steps_of(recording) == wanted
         assert recording.uuid != uuid
     assert report.notes == ["the recording's metadata are lost: it has a new uuid and names no benchmark"]
-    assert ["metadata" in place.why for place in report.damaged] == [True]
+    assert ["metadata" in place.why for place in report.damaged] == [True, True]
     assert verify_recording(report.target or "").problems == []
+
+
+def test_metadata_are_at_both_ends_and_either_is_enough(tmp_path: Path) -> None:
+    whole = record(tmp_path / "a.mcap").read_bytes()
+    path = tmp_path / "b.mcap"
+    path.write_bytes(whole)
+    with Recording(path) as recording:
+        wanted, uuid = steps_of(recording), recording.uuid
+    for find in (bytes.index, bytes.rindex):
+        path.write_bytes(whole)
+        flip(path, find(whole, uuid.encode()) + 5)
+        said = [(problem.kind, problem.message) for problem in verify_recording(path).errors]
+        assert any(kind == "metadata" and "expected crc" in message for kind, message in said)
+        report, recording = recovered(path)
+        with recording:
+            assert (steps_of(recording), recording.uuid) == (wanted, uuid)
+        assert ["metadata" in place.why for place in report.damaged] == [True]
+
+
+def test_metadata_at_the_ends_that_differ_are_found(tmp_path: Path) -> None:
+    """Both are whole, and one of them is another recording's."""
+    path, other = record(tmp_path / "a.mcap"), record(tmp_path / "b.mcap")
+    last = [item for item in places(path) if item.opcode == 12][-1]
+    data, (_, stranger) = path.read_bytes(), (item for item in places(other) if item.opcode == 12)
+    end = other.read_bytes()[stranger.offset : stranger.offset + stranger.length]
+    path.write_bytes(data[: last.offset] + end + data[last.offset + last.length :])
+    assert [problem.message for problem in verify_recording(path).errors] == [
+        "expected what 'tupli_mcap.recording' says"
+    ]
 
 
 @pytest.mark.parametrize("name", ["unfinished", "unfinished_frames"])

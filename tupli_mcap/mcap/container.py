@@ -39,10 +39,12 @@ from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.mcap.crc import crc32
 from tupli_mcap.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, with_crc
 
-__all__ = ["CHUNK_ROWS", "MAGIC", "Compression", "Container"]
+__all__ = ["CHUNK_ROWS", "MAGIC", "REPEATED", "Compression", "Container"]
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "tupli_mcap"
+REPEATED = ".repeated"
+"""What the name of metadata at the end of a file ends in: viewers warn of two records of one name."""
 Compression = str  # "zstd", "lz4" or "none"
 
 CHUNK_ROWS = np.dtype(
@@ -123,6 +125,7 @@ class Container:
         self.chunk_indexes: list[bytes] = []
         self.attachment_indexes: list[AttachmentIndex] = []
         self.metadata_indexes: list[MetadataIndex] = []
+        self.metadata: dict[str, Mapping[str, str]] = {}  # by name; written again at the end
         self.counts: dict[int, int] = {}
         self.start_time: int | None = None
         self.end_time = 0
@@ -169,6 +172,7 @@ class Container:
         self.write(MAGIC + _built(builder))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        self.metadata[name] = values
         builder = RecordBuilder()
         Metadata(name, with_crc(values)).write(builder)
         data = _built(builder)
@@ -364,7 +368,9 @@ class Container:
         self.end_time = max(self.end_time, end)
 
     def finish(self) -> None:
-        """DataEnd, summary, footer, magic, in one write."""
+        """The metadata once more; then DataEnd, summary, footer, magic, in one write."""
+        for name, values in list(self.metadata.items()):
+            self.add_metadata(name + REPEATED, values)
         builder = RecordBuilder()
         DataEnd(0).write(builder)
         data_end = _built(builder)

@@ -10,7 +10,7 @@ import numpy as np
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
+from tupli_mcap.mcap.container import CHUNK_ROWS, REPEATED, Rows
 from tupli_mcap.mcap.records import check_crc
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.topics import FINAL_STATE, INFO, Topic, parse
@@ -23,6 +23,7 @@ __all__ = [
 ]
 
 RECORDING_METADATA = "tupli_mcap.recording"
+REPEATED_METADATA = RECORDING_METADATA + REPEATED
 RECORDING_KEYS = (
     "uuid", "format_version", "library", "created_ns", "benchmark_id", "journal", "replaced", "rewritten",
     "next_episode",

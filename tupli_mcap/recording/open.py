@@ -9,7 +9,7 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.records import read_attachment, read_metadata
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import check_magic, foreign, has_summary, read_summary
-from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, check_metadata
+from tupli_mcap.recording.contents import RECORDING_METADATA, REPEATED_METADATA, Contents, check_metadata
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeIndex
 from tupli_mcap.recording.limits import check_chunks
 
@@ -41,8 +41,8 @@ def read_contents(source: Source) -> Contents:
 
 
 def _read_contents(source: Source) -> Contents:
-    check_magic(source)
     if not has_summary(source):
+        check_magic(source)
         from tupli_mcap.recording.recover.find_journal import find_journal
         from tupli_mcap.recording.recover.unfinished import recover_contents
 
@@ -50,9 +50,11 @@ def _read_contents(source: Source) -> Contents:
         if not has_summary(source):
             return recover_contents(source, journal)
     summary = read_summary(source)
-    if RECORDING_METADATA not in summary.metadata:
+    # the one at the end where it is there, so that all that is read here lies at the end of the file
+    place = summary.metadata.get(REPEATED_METADATA, summary.metadata.get(RECORDING_METADATA))
+    if place is None:
         raise foreign(source, f"it has no metadata {RECORDING_METADATA!r}")
-    metadata = check_metadata(source, read_metadata(source, summary.metadata[RECORDING_METADATA]))
+    metadata = check_metadata(source, read_metadata(source, place))
     if INDEX_NAME not in summary.attachments:
         raise FormatError(
             f"{source.name}: the recording has no episode index {INDEX_NAME!r}; recover it into a new file"
@@ -69,7 +71,7 @@ def _read_contents(source: Source) -> Contents:
         summary.schemas,
         summary.channels,
         summary.attachments,
-        list(summary.metadata.values()),
+        [place for place in summary.metadata.values() if place.offset < attachment.offset],
         index.chunks,
         index=index,
         data_end=attachment.offset,

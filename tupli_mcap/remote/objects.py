@@ -28,7 +28,7 @@ class NoRangesError(Exception):
 
 
 class End(NamedTuple):
-    """Bytes of one end of an object, its size, and its version: a text that differs when its content does."""
+    """The last bytes of an object, its size, and its version: a text that differs when its content does."""
 
     data: memoryview
     size: int
@@ -40,10 +40,6 @@ class RemoteObject(Protocol):
 
     def tail(self, length: int) -> End:
         """Its last `length` bytes, or all of them; NoRangesError."""
-        ...
-
-    def head(self, length: int) -> End:
-        """Its first `length` bytes."""
         ...
 
     def get(self, start: int, stop: int, version: str) -> memoryview:
@@ -147,12 +143,6 @@ class _StoredObject:
                 found = self._ask({"range": (max(0, size - length), size)})
             except (_RefusedError, NotSupportedError) as err:
                 raise NoRangesError from err
-        return self._end(found)
-
-    def head(self, length: int) -> End:
-        return self._end(self._ask({"range": (0, length)}))
-
-    def _end(self, found: Any) -> End:
         return End(memoryview(_asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
 
     def get(self, start: int, stop: int, version: str) -> memoryview:
@@ -236,9 +226,6 @@ class _FsspecObject:
             return End(memoryview(b""), 0, "")
         data = self._asked(lambda: self._system.cat_file(self._path, start=max(0, size - length), end=size))
         return End(memoryview(data), size, f"{info.get('ETag') or info.get('mtime') or ''} {size}")
-
-    def head(self, length: int) -> End:
-        raise RecordingError(f"{shown(self._url)}: the head is not fetched before it is needed")
 
     def get(self, start: int, stop: int, version: str) -> memoryview:
         return memoryview(self._asked(lambda: self._system.cat_file(self._path, start=start, end=stop)))

@@ -22,9 +22,9 @@ from tupli_mcap.remote.plan import Range, pieces_of
 __all__ = ["BLOCK_BYTES", "RemoteSource", "copied", "open_url"]
 
 BLOCK_BYTES: Final = 256 << 20  # of all files of this process
-# What is fetched when a file is opened. The tail has the summary and the index, unless the file is huge; the head has
-# what a recording says of itself: its metadata, and mostly its run and its environment.
+# What is fetched when a file is opened: the summary and the index, unless the file is huge.
 _TAIL = 128 << 10
+# What is fetched together when something of it is asked for: what a recording says of its run and its environment.
 _HEAD = 16 << 10
 _AT_ONCE = 8
 
@@ -90,15 +90,15 @@ _fetchers = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="tupli-remote")
 class RemoteSource:
     """One version of a file on a server. Safe from several threads; a copy in another process fetches for itself.
 
-    It was opened with the tail and the head of the file, which stay in memory. When the file on the server changes,
+    It was opened with the tail of the file, which stays in memory. When the file on the server changes,
     reading raises RecordingError: bytes of two versions are never mixed.
     """
 
-    def __init__(self, url: str, remote: RemoteObject, tail: End, head: memoryview) -> None:
+    def __init__(self, url: str, remote: RemoteObject, tail: End) -> None:
         self.path: Path | None = None
         self.name = shown(url)
         self.size = tail.size
-        self._url, self._remote, self._tail, self._head = url, remote, tail, head
+        self._url, self._remote, self._tail = url, remote, tail
         self._file = f"{tail.version} {url}"
         self._lock = threading.Lock()
         self._planned: list[Range] = []  # not yet asked for, the next one last
@@ -119,8 +119,6 @@ class RemoteSource:
         first = self.size - len(self._tail.data)
         if offset >= first:
             return self._tail.data[offset - first : stop - first]
-        if stop <= len(self._head):
-            return self._head[offset:stop]
         check_process(self._url)
         block = _blocks.find(self._file, offset, stop) or self._ask_for(offset, stop)
         try:
@@ -137,7 +135,7 @@ class RemoteSource:
         missing = [
             (start, min(stop, self.size))
             for start, stop in ranges
-            if len(self._head) < stop and start < first and not _blocks.find(self._file, start, stop)
+            if start < first and not _blocks.find(self._file, start, stop)
         ]
         with self._lock:
             self._planned = pieces_of(missing)[::-1]
@@ -151,6 +149,8 @@ class RemoteSource:
                 if first <= start and stop <= last:
                     del self._planned[i]
                     return self._begin(first, last)
+            if stop <= _HEAD:
+                start, stop = 0, min(_HEAD, self.size)
             return self._begin(start, stop)
 
     def _go_on(self, block: _Block) -> None:
@@ -182,13 +182,13 @@ class RemoteSource:
     def close(self) -> None:
         """Nothing is held open."""
 
-    def __reduce__(self) -> tuple[Callable[..., RemoteSource], tuple[str, bytes, bytes, int, str]]:
+    def __reduce__(self) -> tuple[Callable[..., RemoteSource], tuple[str, bytes, int, str]]:
         tail = self._tail
-        return _again, (self._url, bytes(self._head), bytes(tail.data), tail.size, tail.version)
+        return _again, (self._url, bytes(tail.data), tail.size, tail.version)
 
 
-def _again(url: str, head: bytes, tail: bytes, size: int, version: str) -> RemoteSource:
-    return RemoteSource(url, find(url), End(memoryview(tail), size, version), memoryview(head))
+def _again(url: str, tail: bytes, size: int, version: str) -> RemoteSource:
+    return RemoteSource(url, find(url), End(memoryview(tail), size, version))
 
 
 def open_url(url: str) -> RemoteSource | BinaryIO:
@@ -199,10 +199,8 @@ def open_url(url: str) -> RemoteSource | BinaryIO:
         MissingExtraError: what reads such URLs is not installed.
     """
     remote = find(url)
-    coming = _fetchers.submit(remote.head, _HEAD)  # side by side: it takes no time of its own
     try:
-        tail = remote.tail(_TAIL)
-        return RemoteSource(url, remote, tail, _head(url, tail, coming))
+        return RemoteSource(url, remote, remote.tail(_TAIL))
     except NoRangesError:
         warnings.warn(
             f"{shown(url)}: the server sends whole files only, so all of it is downloaded into a temporary file; "
@@ -216,16 +214,6 @@ def open_url(url: str) -> RemoteSource | BinaryIO:
         file.close()
         raise
     return file
-
-
-def _head(url: str, tail: End, coming: Future[End]) -> memoryview:
-    """The head of the file that the tail is of; empty where it did not come, or the tail is all."""
-    if len(tail.data) == tail.size or coming.exception() is not None:
-        return memoryview(b"")
-    head = coming.result()
-    if head.version != tail.version:
-        raise changed(url)
-    return head.data
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
     RECORDING_KEYS,
     RECORDING_METADATA,
+    REPEATED_METADATA,
     check_version,
     is_ours,
 )
@@ -67,6 +68,7 @@ class Structure:
         self._chunk_indexes: list[ChunkIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
+        self._said: dict[str, str] = {}  # the recording's metadata
         self._counts: dict[int, int] = {}
         self._latest: dict[int, int] = {}
         self._waiting: _Waiting | None = None
@@ -106,7 +108,8 @@ class Structure:
     def _damaged(self, damage: Damage) -> None:
         self._waiting = None
         self._behind_damage = True
-        if not self._tail.finished and damage.end == self._source.size and self._is_cut(damage):
+        unfinished = self._findings.report.state != "complete"
+        if unfinished and damage.end == self._source.size and self._is_cut(damage):
             what = f"the last record is cut off, {damage.end - damage.offset} bytes are left of it"
             if not (self._journal_lost and self.channels):
                 self._findings.note("record", what, "nothing to be done", offset=damage.offset)
@@ -176,10 +179,15 @@ class Structure:
             metadata = parse_record(record.opcode, record.body, record.offset, self._source.name)
             self._metadata.append(MetadataIndex(record.offset, record.length, metadata.name))
             self._name(Opcode.METADATA, metadata.name)
-            if metadata.name == RECORDING_METADATA:
+            if metadata.name in (RECORDING_METADATA, REPEATED_METADATA):
                 if self._crc(metadata.metadata, RECORDING_KEYS, "metadata", record.offset):
                     check_version(metadata.metadata, self._source.name)
-            elif self._records == 2:
+                self._said = self._said or metadata.metadata
+                if metadata.metadata != self._said:
+                    self._findings.error(
+                        "metadata", f"expected what {RECORDING_METADATA!r} says", offset=record.offset
+                    )
+            if self._records == 2 and metadata.name != RECORDING_METADATA:
                 self._findings.error(
                     "metadata", f"expected {RECORDING_METADATA!r} first", offset=record.offset
                 )

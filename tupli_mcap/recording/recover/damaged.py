@@ -18,6 +18,7 @@ from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
     RECORDING_KEYS,
     RECORDING_METADATA,
+    REPEATED_METADATA,
     check_version,
     is_ours,
 )
@@ -86,7 +87,7 @@ def _take(evidence: Evidence, record: Found) -> None:
         evidence.profile = parse_record(record.opcode, record.body, record.offset, name).profile
     elif record.opcode == Opcode.METADATA:
         metadata: Metadata = parse_record(record.opcode, record.body, record.offset, name)
-        if metadata.name == RECORDING_METADATA and evidence.metadata is None:
+        if metadata.name in (RECORDING_METADATA, REPEATED_METADATA):
             _take_metadata(evidence, metadata.metadata, record)
     elif record.opcode == Opcode.SCHEMA:
         schema: Schema = parse_record(record.opcode, record.body, record.offset, name)
@@ -99,11 +100,12 @@ def _take(evidence: Evidence, record: Found) -> None:
 
 def _take_metadata(evidence: Evidence, values: dict[str, str], record: Found) -> None:
     try:
-        evidence.metadata = check_crc(values, RECORDING_KEYS, "the recording's metadata")
+        whole = check_crc(values, RECORDING_KEYS, "the recording's metadata")
     except FormatError as err:
         _add_damage(evidence, record, str(err))
     else:
-        check_version(evidence.metadata, evidence.source.name)
+        check_version(whole, evidence.source.name)
+        evidence.metadata = evidence.metadata or whole
 
 
 def _is_whole(evidence: Evidence, channel: Channel, record: Found) -> bool:

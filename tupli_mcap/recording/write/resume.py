@@ -20,7 +20,7 @@ from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
-from tupli_mcap.recording.contents import Contents, step_channels
+from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, step_channels
 from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.recover.find_journal import belongs, misplaced_journal
 from tupli_mcap.recording.recover.prefix import head, metadata_at
@@ -221,6 +221,7 @@ def restore_container(container: Container, contents: Contents, source: Source) 
     container.counts = dict.fromkeys(container.channels, 0)
     container.attachment_indexes = list(contents.attachments.values())
     container.metadata_indexes = contents.metadata_indexes
+    container.metadata = {RECORDING_METADATA: contents.metadata}
     for row in contents.table[contents.table["offset"] < IN_MEMORY].tolist():
         head = source.read(row[0], CHUNK_HEAD.size)
         _, _, start, end, *_ = CHUNK_HEAD.unpack(head)
