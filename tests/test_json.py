@@ -1,4 +1,4 @@
-"""What --json prints is what docs/json.md says: each field, of its type, and each field of the page was seen."""
+"""What --json prints is what docs/reference/json.md says, of its type; each field on the page was printed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tupli_mcap.cli.output import JSON_VERSION
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.wrappers.rollout import record_rollouts
 
-PAGE = (Path(__file__).parents[1] / "docs" / "json.md").read_text()
+PAGE = (Path(__file__).parents[1] / "docs" / "reference" / "json.md").read_text()
 WITHOUT_JSON = {"view", "serve", "help", "version"}
 
 

@@ -101,7 +101,7 @@ def print_wrapped(text: str, first: str, others: str) -> None:
     say(*(lines or [""]))
 
 
-# --- JSON, as docs/json.md describes it ---
+# --- JSON, as docs/reference/json.md describes it ---
 
 
 @dataclass

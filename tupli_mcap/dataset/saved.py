@@ -1,6 +1,6 @@
 """Saved columns: the steps of a dataset as a directory of plain `.npy` files, which are read mapped into memory.
 
-`docs/columns.md` says what the directory holds. It takes its place as a whole, and is never changed afterwards.
+`docs/howto/columns.md` says what the directory holds. It takes its place as a whole, and is never changed afterwards.
 """
 
 from __future__ import annotations

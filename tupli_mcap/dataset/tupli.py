@@ -170,9 +170,9 @@ class TupliDataset(RandomAccess):
     def save_columns(self, directory: str | os.PathLike[str]) -> None:
         """Write the steps to a new directory as plain `.npy` files, which `open_columns` reads mapped into memory.
 
-        The directory also holds `manifest.json`; see docs/columns.md. It is there as a whole or not at all: a process
-        that is killed leaves none. It keeps the steps as they are listed now, whatever becomes of their recordings, and
-        no infos. Steps are read a few at a time, within the budget of `with_cache`.
+        The directory also holds `manifest.json`; see docs/howto/columns.md. It is there as a whole or not at all: a
+        process that is killed leaves none. It keeps the steps as they are listed now, whatever becomes of their
+        recordings, and no infos. Steps are read a few at a time, within the budget of `with_cache`.
 
         Args:
             directory: where nothing is yet.

@@ -58,9 +58,7 @@ class EpisodeWriter:
         observation_space, action_space, reward_space: Gymnasium spaces of one step; by default a reward is a number.
         num_envs: None for one stream of episodes; a number for as many streams in one file, as a vector environment has
             sub-environments. Each has an episode of its own, and `env` says which of them is meant.
-        labels, attachments, compression, flush_seconds, journal_dir, chunk_size, durability, image_format, stack_size,
-            benchmark_id, max_bytes, max_seconds, name, metadata, tags, split, capture: those of
-            `tupli_mcap.RecordEpisodes`.
+        labels: this and every other argument is as `tupli_mcap.RecordEpisodes` takes it.
 
     Raises:
         SpaceError: a space that cannot be recorded, with the path of the leaf.
