@@ -106,6 +106,22 @@ def test_a_file_object_has_no_place(runs: Path) -> None:
         tupli_mcap.open(recording)
 
 
+def test_seeds_of_any_size_are_compared_exactly(tmp_path: Path) -> None:
+    seeds = [None, 3, 2**127 - 1, 2**127 - 2, 2**64]
+    with tupli_mcap.RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "seeds.mcap") as env:
+        for seed in seeds:
+            env.reset(seed=seed)
+            env.step(0)
+    drawn = Recording(tmp_path / "seeds.mcap")[0].seed
+    assert drawn is not None and drawn >= 2**64  # as NumPy draws them: it is a seed, too
+    for opened in (tupli_mcap.open(tmp_path), tupli_mcap.open(FileStorage(tmp_path))):
+        assert opened.to_pandas("episodes")["seed"].tolist() == [drawn, *seeds[1:]]
+        for seed in seeds[1:]:
+            assert [episode.seed for episode in opened.filter(f"seed = {seed}")] == [seed]
+        assert len(opened.filter(f"seed > {2**127 - 2} and seed < {2**127}")) == 1
+        assert opened.sort("seed")[0].seed == 3
+
+
 def test_an_index_gives_an_episode_or_a_dataset(dataset: Dataset) -> None:
     everything = ids(dataset)
     assert isinstance(dataset[3], Episode) and dataset[3].id == everything[3]

@@ -464,6 +464,21 @@ def handmade(path: Path) -> list[Log]:
     ]
 
 
+def large_seeds(path: Path) -> list[Log]:
+    """Seeds beyond 64 bits, as NumPy draws them, and one within."""
+    env = Played(POLE, pole, [(3, "terminal")])
+    roll(env, env, [3, 2, 2], action)
+    episodes = [
+        {**episode, "seed": seed, "options": None, "reset_info": {}}
+        for episode, seed in zip(expected(env), (2**127 - 1, 2**64, 3), strict=True)
+    ]
+    data = [
+        EpisodeData(*(episode[name] for name in COLUMNS[:5]), seed=episode["seed"]) for episode in episodes
+    ]
+    write_recording(path, data, observation_space=POLE, action_space=env.action_space, compression="none")
+    return [{**e, "final_state": None, "infos": [None] * len(e["states"])} for e in episodes]
+
+
 def bundle(path: Path) -> list[Log]:
     """A recording that carries its environment, pickled, and an artifact."""
     env = Played(POLE, pole, [(3, "terminal")])
@@ -622,6 +637,7 @@ FEATURES: dict[str, Callable[[Path], list[Log]]] = {
     "unfinished_streams": lambda path: unfinished_streams(path, POLE, pole),
     "unfinished_streams_variable": lambda path: unfinished_streams(path, spaces.Text(20), words),
     "described": described,
+    "large_seeds": large_seeds,
 }
 
 

@@ -275,12 +275,10 @@ def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
 def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:
     """Headers as a storage would list them; `recording` of each is the name the file was opened by."""
     index = recording.index
-    columns: list[Any] = [
-        index[field].tolist() for field in ("episode", "env", "length", "end", "return", "has_seed", "seed")
-    ]
-    columns.append(iso_utc_each(index["end_time"]))
+    columns: list[Any] = [index[field].tolist() for field in ("episode", "env", "length", "end", "return")]
+    columns += [recording.seeds, iso_utc_each(index["end_time"])]
     uuid, benchmark_id = recording.uuid, recording.benchmark_id
-    for number, env, length, end, total, has_seed, seed, ended, metadata, run in zip(
+    for number, env, length, end, total, seed, ended, metadata, run in zip(
         *columns, recording.all_metadata(), recording.listed_runs(), strict=True
     ):
         if number in deleted:
@@ -298,7 +296,7 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
                 "timeout": END_NAMES[end] == "timeout",
                 "end": END_NAMES[end],
                 "episode_return": total,
-                "seed": seed if has_seed else None,
+                "seed": seed,
                 "env": env,
                 "episode": number,
                 "recording": name,

@@ -15,6 +15,7 @@ from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
 from tupli_mcap.recording.description import state_of
+from tupli_mcap.recording.index import HAS_SEED
 
 __all__ = [
     "FinalStates",
@@ -103,7 +104,7 @@ def repeated_seed(measured: Measurements, *, least: int = 3, part: float = 0.5) 
     every episode start alike. Else information: evaluations use the same seeds for several policies, but a test set
     must not share them with a training set.
     """
-    seeded = measured.rows["has_seed"] != 0
+    seeded = measured.rows["has_seed"] == HAS_SEED
     seeds, counts = np.unique(measured.rows["seed"][seeded], return_counts=True)
     repeated = int((counts > 1).sum())
     if not repeated:

@@ -199,11 +199,9 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
 
 
 def _seeds(recording: Recording, positions: Array) -> list[int]:
-    """Each seed once: those of the index, and those beyond 64 bits, which only the starts of episodes hold."""
-    rows = recording.index[positions]
-    known = rows["has_seed"] != 0
-    starts = (recording.episode_start(int(position)).seed_number for position in positions[~known])
-    return sorted({*rows["seed"][known].tolist(), *(seed for seed in starts if seed is not None)})
+    """Each seed once."""
+    seeds = recording.seeds
+    return sorted({seed for i in positions.tolist() if (seed := seeds[i]) is not None})
 
 
 def _random_episodes(positions: Array, lengths: Array, most: int) -> Array:

@@ -26,6 +26,8 @@ _MAX_METADATA = 1 << 26
 # Rows differ, in the numbers of episodes and the checksums of chunks: they compress far less than this.
 _MAX_ROW_RATIO = 256
 
+NO_SEED, HAS_SEED, LARGE_SEED = range(3)  # `has_seed`: a large one is in `/episode_start`, and here it is 0
+
 EPISODE_ROWS = np.dtype(
     [
         ("first_row", "<u8"), ("length", "<u8"), ("return", "<f8"), ("start_time", "<i8"), ("end_time", "<i8"),
@@ -56,6 +58,13 @@ class EpisodeRow(NamedTuple):
 _ROW = struct.Struct("<QQdqqqQQqQIIIBB2x")
 
 
+def indexed_seed(seed: int | None) -> tuple[int, int]:
+    """The fields `seed` and `has_seed` of an episode."""
+    if seed is None:
+        return 0, NO_SEED
+    return (seed, HAS_SEED) if -(2**63) <= seed < 2**63 else (0, LARGE_SEED)
+
+
 class IndexBuilder:
     """Collects rows while recording: 96 bytes an episode, plus its metadata text."""
 
@@ -82,10 +91,10 @@ class IndexBuilder:
     ) -> None:
         """Adds an episode: the fields of an `EpisodeRow`, and its metadata as JSON."""
         text = b"" if metadata == "{}" else metadata.encode()
-        has_seed = seed is not None and -(2**63) <= seed < 2**63  # larger ones are in `/episode_start`
+        indexed, has_seed = indexed_seed(seed)
         try:
             self.rows += _ROW.pack(
-                first_row, length, total, start_time, end_time, seed if has_seed else 0, start_row, end_row,
+                first_row, length, total, start_time, end_time, indexed, start_row, end_row,
                 final_row, len(self.metadata), len(text), number, env, end, has_seed,
             )  # fmt: skip
         except struct.error as err:  # only what was read from a damaged journal

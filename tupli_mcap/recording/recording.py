@@ -19,6 +19,7 @@ from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
 from tupli_mcap.recording.columns.runs import Runs, runs_of
 from tupli_mcap.recording.episode import Episode, Episodes
 from tupli_mcap.recording.frames import Frames
+from tupli_mcap.recording.index import LARGE_SEED
 from tupli_mcap.recording.verbs import DatasetVerbs
 
 if TYPE_CHECKING:
@@ -100,6 +101,19 @@ class Recording(DescribedRecording, DatasetVerbs):
                 f"{self.name}: expected the start of episode {row['episode']}, found {start.episode}"
             )
         return start
+
+    @property
+    def seeds(self) -> list[int | None]:
+        """The seed of each episode, None where it has none; one beyond 64 bits is read from its start.
+
+        Earlier writers said nothing of such a seed in the index; there, only `Episode.seed` has it.
+        """
+        rows = self.index
+        fields = zip(rows["has_seed"].tolist(), rows["seed"].tolist(), strict=True)
+        seeds = [seed if has_seed else None for has_seed, seed in fields]
+        for i in np.flatnonzero(rows["has_seed"] == LARGE_SEED).tolist():
+            seeds[i] = self.episode_start(i).seed_number
+        return seeds
 
     def episode_starts(self, episodes: Sequence[int] | np.ndarray[Any, Any]) -> list[EpisodeStart]:
         """The `/episode_start` messages of some episodes (positions or a mask), read together."""

@@ -20,7 +20,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.index import EpisodeIndex
+from tupli_mcap.recording.index import LARGE_SEED, NO_SEED, EpisodeIndex, indexed_seed
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.leaves import Leaf
@@ -217,14 +217,11 @@ class _Checker:
                 continue  # a reset without a step
             seen.add(start.episode)
             entry = self._rows[i]
-            seed = start.seed_number
-            if seed is not None and not -(2**63) <= seed < 2**63:
-                seed = None
-            facts = (start.env, start.first_row, time, seed)
-            index = (
-                int(entry["env"]), int(entry["first_row"]), int(entry["start_time"]),
-                int(entry["seed"]) if entry["has_seed"] else None,
-            )  # fmt: skip
+            seed, has_seed = indexed_seed(start.seed_number)
+            if not entry["has_seed"] and has_seed == LARGE_SEED:  # as earlier writers had it
+                has_seed = NO_SEED
+            facts = (start.env, start.first_row, time, seed, has_seed)
+            index = tuple(int(entry[name]) for name in ("env", "first_row", "start_time", "seed", "has_seed"))
             if facts != index or bytes(body[16:18]) not in (b"\0\0", b"\1\0", b"\0\1", b"\1\1"):
                 self._error("episode", f"its start and the index differ: {facts} and {index}", **place)
         for number in sorted(self._at.keys() - seen):

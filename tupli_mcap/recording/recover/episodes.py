@@ -14,7 +14,7 @@ from typing import NamedTuple
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.index import EpisodeIndex
+from tupli_mcap.recording.index import HAS_SEED, EpisodeIndex
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.step_runs import Ranges, StepRun, step_runs
 
@@ -309,7 +309,7 @@ class _Planner:
         index = self._evidence.tail.index
         if index is not None and number in self._records.index:
             row = index.episodes[self._records.index[number]]
-            seed, time = str(int(row["seed"])) if row["has_seed"] else "", int(row["start_time"])
+            seed, time = str(int(row["seed"])) if row["has_seed"] == HAS_SEED else "", int(row["start_time"])
         return Start(time, EpisodeStart(number, run.env, 0, False, False, seed, "", "{}"))
 
     def _end(

@@ -28,7 +28,7 @@ from tupli_mcap.messages.episodes import (
     record,
     start_texts,
 )
-from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder
+from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder, indexed_seed
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels
@@ -208,8 +208,7 @@ class EpisodeLog(EventLog):
         for i in np.flatnonzero(~here).tolist():
             _, _, _, time_ns, seed, start_row = self._running.pop(int(ended["episode"][i]))
             rows["start_time"][i], rows["start_row"][i] = time_ns, start_row
-            if seed is not None and -(2**63) <= seed < 2**63:
-                rows["seed"][i], rows["has_seed"][i] = seed, 1
+            rows["seed"][i], rows["has_seed"][i] = indexed_seed(seed)
         self._index.extend(rows)
         goes_on = np.ones(len(begun), np.bool_)
         goes_on[at[here]] = False

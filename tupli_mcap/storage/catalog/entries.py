@@ -151,14 +151,10 @@ def rows_of(
     """The rows of a recording, without deleted episodes and those a live writer is in the middle of."""
     index = recording.index
     columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return", "end_time")]
-    seeds = [
-        seed if has else None
-        for has, seed in zip(index["has_seed"].tolist(), index["seed"].tolist(), strict=True)
-    ]
     running = _running(columns[1], columns[3]) if live else set()
     private = json.dumps([created_by])
     for i, (number, env, length, end, total, created_at, seed, metadata, run) in enumerate(
-        zip(*columns, seeds, recording.all_metadata(), _places(recording), strict=True)
+        zip(*columns, recording.seeds, recording.all_metadata(), _places(recording), strict=True)
     ):
         if number in sidecar.deleted or i in running:
             continue
