@@ -11,7 +11,15 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FilterError, FormatError, NotFoundError, SpaceError, StorageError, TupliError
+from tupli_mcap.errors import (
+    FilterError,
+    FormatError,
+    MissingExtraError,
+    NotFoundError,
+    SpaceError,
+    StorageError,
+    TupliError,
+)
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.people.accounts import ConflictError
@@ -33,6 +41,7 @@ _STATUS: Final[dict[type[TupliError], int]] = {
     SpaceError: 400,
     FormatError: 400,
     StorageError: 400,
+    MissingExtraError: 501,
 }
 
 
@@ -87,5 +96,5 @@ def tell_errors(app: FastAPI) -> None:
         if isinstance(err, TooManyError):
             headers["Retry-After"] = str(math.ceil(err.seconds))
         kind = next(c.__name__ for c in type(err).__mro__ if c.__module__ == "tupli_mcap.errors")
-        text = str(err) if status < 500 else "the server has failed; its log says more"
+        text = str(err) if status != 500 else "the server has failed; its log says more"
         return JSONResponse({"detail": text, "error": kind}, status, headers)

@@ -5,5 +5,6 @@ accounts     signing in, users, groups, roles, tokens
 items        benchmarks and artifacts
 episodes     episodes: listed, counted, published, deleted
 recordings   recordings: sent, fetched
+viewers      what viewers open
 pytupli      PyTupli's own routes
 """

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
-from fastapi import Depends, Request
+from fastapi import Depends, Query, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from tupli_mcap.server.library import Library
@@ -12,7 +12,7 @@ from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError
 from tupli_mcap.server.people.tokens import SignInError
 
-__all__ = ["Address", "AnyCaller", "Reader", "Served", "Writer"]
+__all__ = ["Address", "AnyCaller", "Holder", "Reader", "Served", "TicketHolder", "Writer"]
 
 _BEARER = HTTPBearer(auto_error=False, description="An access token of `POST /v1/tokens`, or an API token.")
 
@@ -62,3 +62,32 @@ def _writer(caller: AnyCaller) -> Caller:
 
 
 Writer = Annotated[Caller, Depends(_writer)]
+
+
+class Holder(NamedTuple):
+    """Who reads what an address shows: somebody who is signed in, or was given a ticket for one `recording`."""
+
+    caller: Caller
+    recording: str | None
+
+    def of(self, recording: str) -> Caller:
+        """Who reads a recording. Raises SignInError if the ticket is for another one."""
+        if self.recording not in (None, recording):
+            raise SignInError("the ticket is for another recording; open it again")
+        return self.caller
+
+
+def _holder(
+    library: Served, caller: AnyCaller, ticket: Annotated[str | None, Query(max_length=4096)] = None
+) -> Holder:
+    if ticket is None:
+        return Holder(_reader(library, caller), None)
+    user, recording = library.tokens.of_ticket(ticket)
+    with library.database.reading() as connection:
+        found = accounts.caller_named(connection, user) or accounts.guest(connection)
+    if found.is_guest and not library.settings.guests:
+        raise SignInError("the ticket is not valid any more")
+    return Holder(found, recording)
+
+
+TicketHolder = Annotated[Holder, Depends(_holder)]

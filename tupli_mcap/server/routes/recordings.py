@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
 
-from fastapi import APIRouter, Body, Header, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Body, Header, HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
 from starlette.background import BackgroundTask
@@ -21,10 +21,8 @@ from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema import FilterEQ
 from tupli_mcap.server import episodes
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Right
-from tupli_mcap.server.people.tokens import SignInError
-from tupli_mcap.server.routes.callers import Reader, Served, Writer
+from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder, Writer
 from tupli_mcap.server.uploads import Upload
 from tupli_mcap.storage.texts import is_hash
 
@@ -152,21 +150,13 @@ def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body(
 
 @router.get("/files/{name:path}")
 @router.head("/files/{name:path}")
-def read_recording(
-    library: Served,
-    name: str,
-    ticket: Annotated[str, Query()],
-    request: Request,
-) -> Response:
+def read_recording(library: Served, holder: TicketHolder, name: str, request: Request) -> Response:
     """The bytes of a recording, or ranges of them; their SHA-256 is the `ETag`, and `If-Match` is heeded.
 
     Where some episodes may not be read by who was given the ticket, a recording of the others is made.
     """
-    user = library.tokens.user_of_ticket(ticket, name)
+    caller = holder.of(name)
     with library.database.reading() as connection:
-        caller = accounts.caller_named(connection, user) or accounts.guest(connection)
-        if caller.is_guest and not library.settings.guests:
-            raise SignInError("the ticket is not valid any more")
         found = episodes.file_of(connection, caller, name)
         kept = [
             header.episode
