@@ -115,7 +115,8 @@ def test_seeds_of_any_size_are_compared_exactly(tmp_path: Path) -> None:
     drawn = Recording(tmp_path / "seeds.mcap")[0].seed
     assert drawn is not None and drawn >= 2**64  # as NumPy draws them: it is a seed, too
     for opened in (tupli_mcap.open(tmp_path), tupli_mcap.open(FileStorage(tmp_path))):
-        assert opened.to_pandas("episodes")["seed"].tolist() == [drawn, *seeds[1:]]
+        table = opened.to_pandas("episodes")
+        assert table["seed"].tolist() == [drawn, *seeds[1:]]
         for seed in seeds[1:]:
             assert [episode.seed for episode in opened.filter(f"seed = {seed}")] == [seed]
         assert len(opened.filter(f"seed > {2**127 - 2} and seed < {2**127}")) == 1
@@ -331,7 +332,7 @@ def test_statistics_are_those_of_numpy(dataset: Dataset) -> None:
     for q, values in state.quantiles.items():
         np.testing.assert_allclose(values, np.quantile(states, q, axis=0), rtol=1e-6, atol=1e-9)
     assert found["rewards"].mean.shape == ()
-    assert set(dataset.stats(["observations"])) == {"states"}
+    assert dataset.stats(["observations"])["states"] is state  # kept
     with pytest.raises(TupliError, match="found none"):
         dataset.head(0).stats()
 
@@ -350,10 +351,27 @@ def test_pandas(dataset: Dataset) -> None:
     assert episodes["id"].tolist() == ids(found)
     assert episodes["metadata.side"].tolist() == [episode.metadata["side"] for episode in found]
     assert set(steps["id"]) == set(ids(found))
+    assert episodes["run.id"].tolist() == [episode.run.id for episode in found]
+    assert [str(time) for time in episodes["run.started"]] == [
+        episode.run.started.removesuffix("+00:00").replace("T", " ") for episode in found
+    ]
+    assert set(episodes["environment"]) == {"CartPole-v1"}
     infos = [info or {} for episode in found for info in episode.infos or []]
     assert steps["info.tag"].tolist() == [info["tag"] for info in infos]
     with pytest.raises(TupliError, match="expected the level"):
         found.to_pandas("rows")  # type: ignore[arg-type]
+
+
+def test_whole_numbers_of_a_table_stay_whole(tmp_path: Path) -> None:
+    for name, metadata in (("a", {"n": 2**60 + 1}), ("b", {})):
+        with tupli_mcap.RecordEpisodes(
+            gym.make("CartPole-v1"), tmp_path / f"{name}.mcap", metadata=metadata
+        ) as env:
+            env.reset()
+            env.step(0)
+    table = tupli_mcap.open(tmp_path).to_pandas("episodes")
+    assert table["run.metadata.n"].dropna().tolist() == [2**60 + 1]
+    assert table["run.metadata.n"].isna().tolist() == [False, True]
 
 
 def test_arrow(dataset: Dataset) -> None:

@@ -9,19 +9,25 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.dataset.items import (
+    BESIDE,
+    FRAMES,
     INFOS,
     DeltaWindows,
+    FrameValues,
+    InfoValues,
     Pad,
     SamplingError,
     Steps,
-    StepsWithInfos,
+    StepsWith,
     Transitions,
     Unit,
     Windows,
+    checked_fields,
     info_columns,
 )
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.dataset.items.windows import FIVE
+from tupli_mcap.recording.frames import Frames
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
@@ -59,12 +65,12 @@ class RandomAccess:
 
         See `Windows`: an index gives one window, an array of numbers gives a batch of them. The fields "infos", for all
         keys, and "info.<key>" give a dict of columns by key; all of them are put into memory. Numbers are arrays, with
-        NaN where a step has no such info.
+        NaN where a step has no such info. The field "frames" gives the pictures that were recorded of the states.
 
         Raises:
             SamplingError: no episode is long enough, or the arguments mean nothing.
         """
-        steps, fields = self._with_infos(fields)
+        steps, fields = self._with_more(fields)
         made = Windows(steps, length, stride, pad, history, fields=fields)
         return made.of_episodes(self._values_now())
 
@@ -74,28 +80,38 @@ class RandomAccess:
         """The transition (s, a, r, s') that starts at each step, by its number; an array of numbers gives a batch.
 
         See `Transitions` for several steps, and `Transition` for what to bootstrap with. Fields are those of
-        `Transition`; "infos" and "info.<key>" are as for `windows`.
+        `Transition`; "infos", "info.<key>" and "frames" are as for `windows`.
 
         Raises:
             SamplingError: the dataset is empty, or the arguments mean nothing.
         """
-        steps, fields = self._with_infos(fields)
+        steps, fields = self._with_more(fields)
         return Transitions(steps, n_step, discount, fields=fields).of_episodes(self._values_now())
 
-    def _with_infos(self, fields: Sequence[str]) -> tuple[Steps, Sequence[str]]:
-        """The steps, and the names of what is read of them; infos are put into memory where a field names them."""
+    def _with_more(self, fields: Sequence[str]) -> tuple[Steps, Sequence[str]]:
+        """The steps with infos and frames where fields name them, and the names of what is read of them."""
+        steps = self.steps
         given = list(fields) if isinstance(fields, Sequence) and not isinstance(fields, str) else [fields]
         keys = [name for name in given if isinstance(name, str) and name.partition(".")[0] in (INFOS, "info")]
+        rest = checked_fields([name for name in given if name not in keys], (*steps.fields, *BESIDE))
+        if FRAMES in rest:
+            steps = StepsWith(steps, FRAMES, FrameValues(steps.episode_lengths, self._frames_of))
         if not keys:
-            return self.steps, fields
+            return steps, rest
         wanted = [name.partition(".")[2] for name in keys]
         columns = info_columns(self._infos(), wanted if all(wanted) else None)
-        return StepsWithInfos(self.steps, columns), [name for name in given if name not in keys] + [INFOS]
+        return StepsWith(steps, INFOS, InfoValues(columns, len(steps))), [*rest, INFOS]
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:
         """The info of each step."""
         raise SamplingError(
             "infos are read out of recordings; open these with tupli_mcap.open, and take windows of that"
+        )
+
+    def _frames_of(self, place: int) -> Frames:
+        """The frames of an episode."""
+        raise SamplingError(
+            "frames are read out of recordings; open these with tupli_mcap.open, and take windows of that"
         )
 
     def episode_values(self, expression: F | BaseFilter) -> np.ndarray[Any, np.dtype[np.float64]]:

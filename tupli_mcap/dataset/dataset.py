@@ -30,6 +30,7 @@ from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
 from tupli_mcap.recording.columns.read import Columns
+from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate, parse_filter
 from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
@@ -123,6 +124,7 @@ class Dataset(RandomAccess):
         self._listed = None if headers is None else list(headers)
         self._recordings = OpenRecordings(source.open)
         self._steps: RecordedSteps | None = None
+        self._stats: dict[str, Mapping[str, FieldStatistics]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_recordings": None}
@@ -357,8 +359,8 @@ class Dataset(RandomAccess):
         """Columns of all steps, episode after episode; `episode_lengths` says where each ends.
 
         Args:
-            fields: of states, actions, rewards, terminals, timeouts, next_states, times, infos; Gymnasium's names
-                (observations, terminations, truncations) mean the same.
+            fields: of states, actions, rewards, terminals, timeouts, next_states, times, infos, frames; Gymnasium's
+                names (observations, terminations, truncations) mean the same.
 
         Raises:
             DatasetError: an unknown field.
@@ -392,6 +394,9 @@ class Dataset(RandomAccess):
     def _infos(self) -> Sequence[Mapping[str, Any]]:
         infos: Sequence[Mapping[str, Any]] = self.read(["infos"]).infos
         return infos
+
+    def _frames_of(self, place: int) -> Frames:
+        return self._episode(self.headers[place]).frames
 
     def _step_seconds(self) -> float | None:
         names = dict.fromkeys(header.recording for header in self.headers)
@@ -443,12 +448,16 @@ class Dataset(RandomAccess):
     ) -> Mapping[str, FieldStatistics]:
         """Count, mean, std, min, max and quantiles of each leaf (`states`, or `states['arm']`; `actions`, `rewards`).
 
-        Steps are read a block at a time. Images, and leaves of variable size (texts, graphs), have no statistics.
+        Steps are read a block at a time, once; what was found is kept. Images, and leaves of variable size (texts,
+        graphs), have no statistics.
 
         Raises:
             DatasetError: a field without numbers, or there is no step.
         """
-        return statistics_of(self, field_names(fields, STATISTICAL, DatasetError))
+        names = field_names(fields, STATISTICAL, DatasetError)
+        if missing := [name for name in names if name not in self._stats]:
+            self._stats |= statistics_of(self, missing)
+        return {leaf: found for name in names for leaf, found in self._stats[name].items()}
 
     # ---- out
 

@@ -15,7 +15,7 @@ from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.sources import Source
 from tupli_mcap.dataset.tuples import Tuples
-from tupli_mcap.errors import FilterError, memory_for
+from tupli_mcap.errors import FilterError, SpaceError, memory_for
 from tupli_mcap.messages.shared_dtypes import check_layouts, common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
@@ -112,7 +112,8 @@ class _Reader:
             check_layouts(self._layout, self._first_name, layout, recording.name)
         listed = ListedEpisodes.of(recording.name, headers)
         positions, lengths = positions_of(recording, listed), listed.lengths
-        for block in whole_episodes(lengths, max(1, _BLOCK_BYTES // step_bytes(layout))):
+        most = 1 if "frames" in self._needed else _BLOCK_BYTES // step_bytes(layout)  # frames are large
+        for block in whole_episodes(lengths, max(1, most)):
             columns = _read_block(recording, positions[block], lengths[block], self._needed)
             steps = int(lengths[block].sum())
             keep = self._keep(columns, steps, layout)
@@ -149,6 +150,8 @@ def _empty_column(field: str) -> Any:
     """The column of no episodes at all, whose spaces nobody knows."""
     if field == "infos":
         return []
+    if field == "frames":
+        return np.empty((0, 0, 0, 3), np.uint8)
     dtypes: dict[str, Any] = {
         "terminals": np.bool_,
         "timeouts": np.bool_,
@@ -221,6 +224,9 @@ class _LeafBuilder:
             self._array = np.empty((self._capacity, *rows.shape[1:]), rows.dtype)
         elif self._array.dtype != rows.dtype:
             self._widen(common_dtype(self._array.dtype, rows.dtype))
+        if rows.shape[1:] != self._array.shape[1:]:  # other columns are checked by their layouts
+            sizes = f"{self._array.shape[1:3]} and {rows.shape[1:3]}"
+            raise SpaceError(f"expected frames of one size, found {sizes}; choose episodes by a filter")
         self._array[self._filled : self._filled + len(rows)] = rows
         self._filled += len(rows)
 

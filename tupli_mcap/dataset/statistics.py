@@ -45,8 +45,8 @@ class FieldStatistics:
     quantiles: dict[float, Array]
 
 
-def statistics_of(dataset: Dataset, fields: Sequence[str]) -> dict[str, FieldStatistics]:
-    """See `Dataset.stats`."""
+def statistics_of(dataset: Dataset, fields: Sequence[str]) -> dict[str, dict[str, FieldStatistics]]:
+    """The statistics of each leaf, by field. See `Dataset.stats`."""
     steps = dataset.steps
     if steps.layout is None or not len(steps):
         raise DatasetError("expected steps to take statistics of, found none")
@@ -68,10 +68,10 @@ def statistics_of(dataset: Dataset, fields: Sequence[str]) -> dict[str, FieldSta
             values = leaf.get(columns[field]).reshape(len(rows), leaf.size)
             known[name].add(np.ascontiguousarray(values.T))
             samples[name].append(values[here])
-    return {
-        name: _of(leaf, known[name], np.concatenate(samples[name]))
-        for name, (_, leaf) in zip(names, leaves, strict=True)
-    }
+    found: dict[str, dict[str, FieldStatistics]] = {field: {} for field in fields}
+    for name, (field, leaf) in zip(names, leaves, strict=True):
+        found[field][name] = _of(leaf, known[name], np.concatenate(samples[name]))
+    return found
 
 
 def _name(field: str, leaf: Leaf) -> str:

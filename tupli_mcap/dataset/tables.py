@@ -58,6 +58,7 @@ def _episode_columns(dataset: Dataset) -> dict[str, Any]:
         "episode": np.arange(len(headers)),  # as in the table of steps
         "run": [header.run.get("name", "") for header in headers],
         "split": [header.run.get("split", "") for header in headers],
+        "environment": [header.run.get("environment", "") for header in headers],
         "recording": [header.recording for header in headers],
         "number": np.array([header.episode for header in headers], np.int64),
         "env": np.array([header.env for header in headers], np.int64),
@@ -65,23 +66,38 @@ def _episode_columns(dataset: Dataset) -> dict[str, Any]:
         "return": dataset.returns,
         "end": [header.end for header in headers],
         "seed": _whole_numbers([header.seed for header in headers]),
-        "ended": np.array([header.created_at.removesuffix("+00:00") for header in headers], "datetime64[ns]"),
+        "ended": _times([header.created_at for header in headers]),
         "benchmark_id": [header.benchmark_id for header in headers],
+        "run.id": [header.run.get("id", "") for header in headers],
+        "run.started": _times([header.run.get("started", "") for header in headers]),
+        "run.tags": [list(header.run.get("tags", ())) for header in headers],
     }
     columns |= _columns_of("run.metadata", [header.run.get("metadata", {}) for header in headers])
     return columns | _columns_of("metadata", [header.metadata for header in headers])
 
 
-def _whole_numbers(values: list[int | None]) -> Any:
+def _times(texts: Sequence[str]) -> Any:
+    """Times (ISO 8601 in UTC), NaT where there is none."""
+    return np.array([text.removesuffix("+00:00") or "NaT" for text in texts], "datetime64[ns]")
+
+
+def _whole_numbers(values: Sequence[int | None]) -> Any:
     """Integers, some of which are not known; without a loss, which floats would be."""
     fits = all(value is None or -(2**63) <= value < 2**63 for value in values)
-    return import_pandas().array(values, dtype="Int64") if fits else values
+    return (
+        import_pandas().array(values, dtype="Int64") if fits else import_pandas().Series(values, dtype=object)
+    )
 
 
-def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """A column for each key that one of the items has, None where another one has it not."""
     keys = dict.fromkeys(key for item in items for key in item)
-    return {f"{root}.{key}": [item.get(key) for item in items] for key in keys}
+    columns: dict[str, Any] = {}
+    for key in keys:
+        values = [item.get(key) for item in items]
+        some_whole = None in values and {type(value) for value in values} == {int, type(None)}
+        columns[f"{root}.{key}"] = _whole_numbers(values) if some_whole else values
+    return columns
 
 
 def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:

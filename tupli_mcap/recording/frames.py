@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple, overload
 
 import numpy as np
@@ -28,7 +28,7 @@ from tupli_mcap.recording.contents import Contents
 if TYPE_CHECKING:
     from tupli_mcap.recording.recording import Recording
 
-__all__ = ["Cameras", "Frames"]
+__all__ = ["Cameras", "Frames", "gathered"]
 
 _SHAPES = ((CAMERA_NAME, CAMERA_SCHEMA), (FRAME_NAME, FRAME_SCHEMA))
 
@@ -167,10 +167,37 @@ class Frames(Sequence[Picture]):
         found = np.flatnonzero(self.steps == step)
         if not len(found):
             told = ", ".join(map(str, self.steps[:8].tolist())) + (", ..." if len(self) > 8 else "")
-            raise RecordingError(
-                f"{self._recording.name}: the episode has no frame of step {step}; it has {told or 'none'}"
+            has = (
+                f"it has {told}"
+                if told
+                else "it has none: record with frames=True, or tupli-mcap render makes them"
             )
+            raise RecordingError(f"{self._recording.name}: the episode has no frame of step {step}; {has}")
         return self[int(found[0])]
 
     def __repr__(self) -> str:
         return f"<{len(self)} frames of camera {self.camera!r}>"
+
+
+def gathered(parts: Iterable[tuple[Frames, Array, Array]], total: int) -> Array:
+    """The frames of some steps as one column: uint8 (total, height, width, 3).
+
+    Args:
+        parts: of each episode its frames, and of which states they are wanted, as in `of_step`, at which places.
+
+    Raises:
+        RecordingError: one was not recorded, or they differ in size.
+    """
+    column: Array = np.empty((0, 0, 0, 3), np.uint8)
+    for frames, steps, places in parts:
+        for step in np.unique(steps).tolist():
+            picture = frames.of_step(step)
+            if not len(column):
+                column = np.empty((total, *picture.shape), np.uint8)
+            if picture.shape != column.shape[1:]:
+                sizes = f"{column.shape[1:3]} and {picture.shape[:2]}"
+                raise RecordingError(
+                    f"expected frames of one size, found {sizes}; choose episodes by a filter"
+                )
+            column[places[steps == step]] = picture
+    return column

@@ -18,7 +18,7 @@ from tupli_mcap.recording.columns.fields import FIVE, field_names
 from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
 from tupli_mcap.recording.columns.runs import Runs, runs_of
 from tupli_mcap.recording.episode import Episode, Episodes
-from tupli_mcap.recording.frames import Frames
+from tupli_mcap.recording.frames import Frames, gathered
 from tupli_mcap.recording.index import LARGE_SEED
 from tupli_mcap.recording.verbs import DatasetVerbs
 
@@ -238,8 +238,8 @@ class Recording(DescribedRecording, DatasetVerbs):
 
         Args:
             episodes: positions in `self.episodes`, or a bool for each of them.
-            fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states", "times" and "infos";
-                the first five by default. Gymnasium's names (observations, terminations, …) mean the same.
+            fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states", "times", "infos" and
+                "frames"; the first five by default. Gymnasium's names (observations, terminations, …) mean the same.
             threads: how many threads decompress; by default as many as there are cores, at most 4.
             images: False reads no image of a state: the columns of image leaves are empty. Not for `next_states`.
 
@@ -258,7 +258,7 @@ class Recording(DescribedRecording, DatasetVerbs):
             return columns
         threads = threads or _THREADS
         keep = episodes is not None
-        needed = [field for field in fields if field not in ("next_states", "infos")]
+        needed = [field for field in fields if field not in ("next_states", "infos", "frames")]
         if "next_states" in fields and "states" not in needed:
             needed.append("states")
         with memory_for(lambda: f"{self.name}: reading {', '.join(fields)} of {total} steps"):
@@ -269,9 +269,17 @@ class Recording(DescribedRecording, DatasetVerbs):
         for field in fields:
             if field in found:
                 setattr(columns, field, found[field])
+        positions = np.arange(len(self.index)) if episodes is None else self._positions(episodes)
         if "infos" in fields:
-            positions = np.arange(len(self.index)) if episodes is None else self._positions(episodes)
             columns.infos = [info for i in positions.tolist() for info in self._infos_of(i)]
+        if "frames" in fields:
+            ends = np.cumsum(lengths)
+            parts = (
+                (self.frames(i), np.arange(end - start), np.arange(start, end))
+                for i, start, end in zip(positions.tolist(), ends - lengths, ends, strict=True)
+            )
+            with memory_for(lambda: f"{self.name}: decoding {total} frames"):
+                columns.frames = gathered(parts, total)
         return columns
 
     def _infos_of(self, i: int) -> list[dict[str, Any]]:

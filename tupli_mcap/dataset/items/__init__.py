@@ -1,7 +1,7 @@
 """Steps by number, and what is made of them: windows, transitions, the values around a step.
 
 steps                          what all of these read from; steps in memory
-infos                          steps with their infos as columns
+beside, infos                  steps with infos and frames; infos as columns
 recorded, index, kept          steps read out of recordings; where they lie; those kept decoded
 items                          what windows, transitions and delta windows have in common
 windows, transitions, deltas   the three kinds of items
@@ -10,23 +10,28 @@ batches                        items read in batches, some of them ahead
 """
 
 from tupli_mcap.dataset.items.batches import Batches
+from tupli_mcap.dataset.items.beside import BESIDE, FRAMES, INFOS, FrameValues, InfoValues, StepsWith
 from tupli_mcap.dataset.items.deltas import DeltaWindow, DeltaWindows, Unit
 from tupli_mcap.dataset.items.draws import Sampler
 from tupli_mcap.dataset.items.index import ListedEpisodes
-from tupli_mcap.dataset.items.infos import INFOS, StepsWithInfos, info_columns
+from tupli_mcap.dataset.items.infos import info_columns
 from tupli_mcap.dataset.items.items import Items
 from tupli_mcap.dataset.items.order import Numbers, Order
 from tupli_mcap.dataset.items.recorded import RecordedSteps, steps_of
-from tupli_mcap.dataset.items.steps import FIELDS, MemorySteps, SamplingError, Steps
+from tupli_mcap.dataset.items.steps import FIELDS, MemorySteps, SamplingError, Steps, checked_fields
 from tupli_mcap.dataset.items.transitions import Transition, Transitions
 from tupli_mcap.dataset.items.windows import Pad, Window, Windows
 
 __all__ = [
+    "BESIDE",
     "FIELDS",
+    "FRAMES",
     "INFOS",
     "Batches",
     "DeltaWindow",
     "DeltaWindows",
+    "FrameValues",
+    "InfoValues",
     "Items",
     "ListedEpisodes",
     "MemorySteps",
@@ -37,12 +42,13 @@ __all__ = [
     "Sampler",
     "SamplingError",
     "Steps",
-    "StepsWithInfos",
+    "StepsWith",
     "Transition",
     "Transitions",
     "Unit",
     "Window",
     "Windows",
+    "checked_fields",
     "info_columns",
     "steps_of",
 ]

@@ -1,4 +1,4 @@
-"""Infos of steps as columns, beside the fields that are read out of recordings."""
+"""Infos of steps as columns."""
 
 from __future__ import annotations
 
@@ -7,49 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_fields, following, pick, rows_of_runs
+from tupli_mcap.dataset.items.steps import SamplingError
 from tupli_mcap.errors import did_you_mean
 
-__all__ = ["INFOS", "StepsWithInfos", "info_columns"]
-
-INFOS = "infos"
-
-
-class StepsWithInfos:
-    """Steps that have one more field, `infos`: a dict of columns by key, all of them in memory."""
-
-    def __init__(self, rest: Steps, columns: Mapping[str, Any]) -> None:
-        self._rest, self._columns = rest, dict(columns)
-        self.layout, self.fields = rest.layout, (*rest.fields, INFOS)
-        self.episode_lengths, self.breaks = rest.episode_lengths, rest.breaks
-        self.open_ends, self.identity = rest.open_ends, rest.identity
-
-    def __reduce__(self) -> tuple[type[StepsWithInfos], tuple[Steps, dict[str, Any]]]:
-        return StepsWithInfos, (self._rest, self._columns)
-
-    def __len__(self) -> int:
-        return len(self._rest)
-
-    def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
-        fields = checked_fields(fields, self.fields)
-        plain = [field for field in fields if field != INFOS]
-        return self._joined(fields, self._rest.read(plain, rows) if plain else {}, rows)
-
-    def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
-        fields = checked_fields(fields, self.fields)
-        plain = [field for field in fields if field != INFOS]
-        found = self._rest.read_runs(plain, starts, length) if plain else {}
-        return self._joined(fields, found, rows_of_runs(starts, length))
-
-    def _joined(self, fields: Sequence[str], found: dict[str, Any], rows: Array) -> dict[str, Any]:
-        if INFOS in fields:
-            where = following(rows, len(self))
-            found[INFOS] = {key: pick(column, where) for key, column in self._columns.items()}
-        return {field: found[field] for field in fields}
-
-    def blocks(self, rows: Array) -> Array:
-        return self._rest.blocks(rows)
+__all__ = ["info_columns"]
 
 
 def info_columns(infos: Sequence[Mapping[str, Any]], keys: Sequence[str] | None = None) -> dict[str, Any]:

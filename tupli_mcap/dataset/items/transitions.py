@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items.infos import INFOS
+from tupli_mcap.dataset.items.beside import BESIDE
 from tupli_mcap.dataset.items.items import Parts, StepItems
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
 
@@ -31,7 +31,7 @@ class Transition(Parts):
     mask: False where the state after the last step was not recorded, and matters: `next_states` repeats the last state
         that was, and the transition is better left out.
     steps: the number of the step it starts at (int64), `episodes` the place of its episode in the query.
-    infos: of the step it starts at, a dict of columns by key.
+    infos, frames: of the step it starts at, a dict of columns by key, and the picture (uint8, height x width x 3).
     """
 
     mask: Any
@@ -45,6 +45,7 @@ class Transition(Parts):
     terminals: Any = None
     timeouts: Any = None
     infos: Any = None
+    frames: Any = None
 
 
 class Transitions(StepItems[Transition]):
@@ -71,7 +72,7 @@ class Transitions(StepItems[Transition]):
         if not isinstance(discount, int | float | np.number) or not 0 <= discount <= 1:
             raise SamplingError(f"expected a discount from 0 to 1, found {discount!r:.80}")
         self.discount = float(discount)
-        known = [field for field in steps.fields if field in (*TRANSITION_FIELDS, INFOS)]
+        known = [field for field in steps.fields if field in (*TRANSITION_FIELDS, *BESIDE)]
         self.fields = tuple(checked_fields(fields, known))
         varying = steps.layout is not None and any(leaf.kind == "variable" for leaf in steps.layout.reward)
         if self.n_step > 1 and varying and "rewards" in self.fields:

@@ -32,7 +32,7 @@ class Window(Parts):
     They are nested as the space is; values that differ in size are in a list (of B lists). `mask` (bool, (B, T)) is
     False where there was no step and the columns are filled up. `steps` (int64, (B,)) is the number of the step the
     window starts at (its history lies before), `episodes` (int64, (B,)) the place of its episode in the query.
-    `infos` is a dict of columns by key.
+    `infos` is a dict of columns by key, `frames` the recorded pictures: uint8 (B, T, height, width, 3).
     """
 
     mask: Array
@@ -46,6 +46,7 @@ class Window(Parts):
     next_states: Any = None
     times: Any = None
     infos: Any = None
+    frames: Any = None
 
 
 class Windows(Items[Window]):

@@ -11,7 +11,7 @@ from tupli_mcap.errors import RecordingError, did_you_mean
 __all__ = ["FIELDS", "FIVE", "GymnasiumNames", "field_names"]
 
 FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
-FIELDS = (*FIVE, "next_states", "times", "infos")
+FIELDS = (*FIVE, "next_states", "times", "infos", "frames")
 _OTHER_NAMES = MappingProxyType(
     {
         "observations": "states",

@@ -30,7 +30,8 @@ class Columns(GymnasiumNames):
 
     A constant leaf is an array of shape (steps, *leaf shape), a leaf of variable size a list; both are nested as the
     space is. `episode_lengths` (int64) says where episodes end. `times` (int64, ns) is the wall clock when each step
-    returned. `infos` has a dict a step, which is empty where none was recorded.
+    returned. `infos` has a dict a step, which is empty where none was recorded. `frames` are the pictures of the
+    states: uint8 (steps, height, width, 3).
     """
 
     episode_lengths: Array
@@ -42,6 +43,7 @@ class Columns(GymnasiumNames):
     next_states: Any = None
     times: Any = None
     infos: Any = None
+    frames: Any = None
 
     def __len__(self) -> int:
         return int(self.episode_lengths.sum())

@@ -1,0 +1,166 @@
+"""Infos and frames as fields of windows, transitions, loaders and whole columns."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import Scripted
+
+import tupli_mcap
+from tupli_mcap import F, RecordEpisodes, Recording, RecordingError, SpaceError, TupliDataset
+from tupli_mcap.dataset import open_columns
+from tupli_mcap.dataset.items import SamplingError
+
+
+def info(step: int) -> dict[str, Any]:
+    found: dict[str, Any] = {"step": step, "force": np.array([step, -step], np.float32), "name": f"at {step}"}
+    return found | ({"rare": step / 2} if step % 3 == 0 else {})
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> tupli_mcap.Dataset:
+    env = Scripted(
+        lambda n: np.array([n], np.float32), gym.spaces.Box(-1e3, 1e3, (1,), np.float32), info=info, length=5
+    )
+    with RecordEpisodes(env, tmp_path / "r.mcap", record_info=True) as recorded:
+        for seed in range(3):
+            recorded.reset(seed=seed)
+            for _ in range(5):
+                recorded.step(0)
+    return tupli_mcap.open(tmp_path / "r.mcap")
+
+
+def test_of_windows(dataset: tupli_mcap.Dataset) -> None:
+    batch = dataset.windows(2, fields=["states", "infos"])[[0, 5]]
+    assert batch.infos["step"].tolist() == [[1, 2], [2, 3]]
+    assert batch.infos["step"].dtype == np.int64
+    assert batch.infos["force"].shape == (2, 2, 2)
+    assert batch.infos["force"].dtype == np.float32
+    assert batch.infos["name"] == [["at 1", "at 2"], ["at 2", "at 3"]]
+    np.testing.assert_array_equal(batch.infos["rare"], [[np.nan, np.nan], [np.nan, 1.5]])
+    one = dataset.windows(2, history=1, pad="zero", fields="info.force")[0]
+    assert set(one.infos) == {"force"}
+    np.testing.assert_array_equal(one.infos["force"], [[0, 0], [1, -1], [2, -2]])
+    assert one.states is None
+
+
+def test_of_transitions(dataset: tupli_mcap.Dataset) -> None:
+    items = dataset.sort("seed", descending=True).head(2).transitions(2, fields=["rewards", "info.step"])
+    assert items[:].infos["step"].tolist() == [1, 2, 3, 4, 5] * 2
+    assert items[3].infos["step"] == 4
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_of_a_loader(dataset: tupli_mcap.Dataset, workers: int) -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is not installed")
+    fields = ["states", "info.step", "infos.force"]
+    loader = dataset.loader(3, batch_size=4, seed=1, num_workers=workers, fields=fields)
+    batches = list(loader)
+    assert sum(len(batch["states"]) for batch in batches) == 9
+    for batch in batches:
+        # the info of a step tells how many steps were taken, and its state how many had been
+        assert torch.equal(batch["infos"]["step"], batch["states"][..., 0].long() + 1)
+        assert batch["infos"]["force"].shape[1:] == (3, 2)
+
+
+def test_a_copy_in_another_process_has_them(dataset: tupli_mcap.Dataset) -> None:
+    windows = dataset.windows(2, fields=["states", "infos"])
+    copied = pickle.loads(pickle.dumps(windows))
+    np.testing.assert_array_equal(copied[3].infos["step"], windows[3].infos["step"])
+    np.testing.assert_array_equal(copied[3].states, windows[3].states)
+
+
+def test_says_what_there_is(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None:
+    with pytest.raises(SamplingError, match="did you mean 'force'"):
+        dataset.windows(2, fields=["infos.forse"])
+    later = TupliDataset(tmp_path).with_tuple_filter(F("info.step") > 2)
+    assert later.windows(3, fields=["info.step"])[0].infos["step"].tolist() == [3, 4, 5]
+    later.save_columns(tmp_path / "columns")
+    with pytest.raises(SamplingError, match=r"tupli_mcap\.open"):
+        open_columns(tmp_path / "columns").windows(2, fields=["infos"])
+    with pytest.raises(SamplingError, match="expected fields"):
+        dataset.transitions(fields=["inform"])
+
+
+class Counting(gym.Env[Any, int]):
+    """Its picture shows how many steps were taken."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+    render_mode = "rgb_array"
+    observation_space, action_space = gym.spaces.Box(0, 99, (), np.float32), gym.spaces.Discrete(2)
+
+    def __init__(self, size: int = 8) -> None:
+        self.count, self.size = 0, size
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.count = 0 if seed is None else seed
+        return np.array(self.count, np.float32), {}
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.count += 1
+        return np.array(self.count, np.float32), 1.0, self.count % 10 == 5, False, {}
+
+    def render(self) -> Any:
+        return np.full((self.size, self.size, 3), self.count, np.uint8)
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> tupli_mcap.Dataset:
+    """Two files, of which the pictures show the state."""
+    for name, seeds in (("a", (0, 10)), ("b", (20,))):
+        with RecordEpisodes(Counting(), tmp_path / f"{name}.mcap", frames=True, frame_format="png") as env:
+            for seed in seeds:
+                env.reset(seed=seed)
+                while not env.step(0)[2]:
+                    pass
+    return tupli_mcap.open(tmp_path)
+
+
+def test_frames_are_a_field(pictures: tupli_mcap.Dataset) -> None:
+    mixed = pictures.sort("seed", descending=True)
+    columns = mixed.read(["frames", "observations"])
+    assert (columns.frames.shape, columns.frames.dtype) == ((15, 8, 8, 3), np.uint8)
+    np.testing.assert_array_equal(columns.frames[:, 0, 0, 0], columns.states)
+    windows = mixed.windows(3, pad="repeat", fields=["frames", "states", "infos"])
+    copied = pickle.loads(pickle.dumps(windows))
+    for items in (windows, copied):
+        batch = items[[4, 0, 7]]
+        np.testing.assert_array_equal(batch.frames[..., 0, 0, 0], batch.states)
+        assert items[5].frames.shape == (3, 8, 8, 3)
+    step = mixed.transitions(fields=["frames", "states"])[3]
+    assert step.frames[0, 0, 0] == step.states
+    with Recording(pictures[0].recording.name) as recording:
+        np.testing.assert_array_equal(recording.read([1], "frames").frames[:, 0, 0, 0], range(10, 15))
+    assert pictures.head(0).read("frames").frames.shape == (0, 0, 0, 3)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_frames_of_a_loader(pictures: tupli_mcap.Dataset, workers: int) -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is not installed")
+    for batch in pictures.loader(2, batch_size=4, num_workers=workers, fields=["frames", "states"]):
+        assert torch.equal(batch["frames"][..., 0, 0, 0].float(), batch["states"])
+
+
+def test_frames_that_are_not_there(pictures: tupli_mcap.Dataset, tmp_path: Path) -> None:
+    with RecordEpisodes(Counting(4), tmp_path / "c.mcap", frames=True, frame_format="png") as env:
+        env.reset(seed=4)
+        env.step(0)
+    with pytest.raises(RecordingError, match="frames of one size"):
+        tupli_mcap.open(tmp_path).windows(1, fields=["frames"])[[0, 15]]
+    with pytest.raises(SpaceError, match="frames of one size"):
+        tupli_mcap.open([tmp_path / "a.mcap", tmp_path / "c.mcap"]).read(["frames"])
+    with RecordEpisodes(Counting(), tmp_path / "d.mcap") as env:
+        env.reset()
+        env.step(0)
+    with pytest.raises(RecordingError, match="it has none: record with frames=True"):
+        tupli_mcap.open(tmp_path / "d.mcap").read("frames")
+    with pytest.raises(SamplingError, match=r"did you mean 'frames'"):
+        pictures.windows(2, fields=["frame"])
+    pictures_of_a_storage = TupliDataset(tmp_path)
+    with pytest.raises(SamplingError, match=r"tupli_mcap\.open"):
+        pictures_of_a_storage.windows(2, fields=["frames"])[0]
