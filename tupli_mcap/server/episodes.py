@@ -73,13 +73,14 @@ def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
     Raises:
         NotFoundError: there is none, or none of its episodes may be read.
     """
-    found = connection.execute(select(FILE).where(FILE.c.path == escape_text(name))).first()
-    visible = 0
-    if found is not None:
-        visible = count_episodes(connection, caller, FilterEQ(key="recording", value=name))
-    if found is None or not visible:
-        raise NotFoundError(f"there is no recording {name[:200]!r}")
-    return StoredFile(name, unescape_text(found.place), found.digest, found.size, visible == found.episodes)
+    for each in dict.fromkeys((name, _whole(name))):  # which has taken the place of its parts
+        found = connection.execute(select(FILE).where(FILE.c.path == escape_text(each))).first()
+        if found is not None:
+            seen = count_episodes(connection, caller, FilterEQ(key="recording", value=each))
+            if seen:
+                place = unescape_text(found.place)
+                return StoredFile(each, place, found.digest, found.size, seen == found.episodes)
+    raise NotFoundError(f"there is no recording {name[:200]!r}")
 
 
 def _seen(caller: Caller) -> ColumnElement[bool]:
@@ -110,16 +111,18 @@ def register(
     digest: str,
     *,
     deleted: Collection[int] = (),
+    sent_before: int = 0,
 ) -> tuple[str, list[str]]:
     """Lists the episodes of a recording whose file is kept at `place`, but those that are `deleted`; returns the
     name of the recording, and the places of files to forget.
 
-    A recording that the caller has stored before, and that has grown since, takes the place of what was there:
-    its deleted episodes stay deleted, its published ones published.
+    A recording that goes on may come in parts: files with some of its episodes, each in one of them. A file that has
+    all episodes of earlier ones takes their place: what was published stays published, and what was deleted deleted.
+    Deleted are, too, those with numbers below `sent_before` that are not there any more: the caller has sent them.
 
     Raises:
         NotFoundError: its benchmark is not stored, or the caller may not read it.
-        ConflictError: episodes that are stored are not in it any more.
+        ConflictError: it has some episodes of a file that is stored, but lacks others.
         StorageError: it has no episodes.
     """
     caller.demand(Right.EPISODE_CREATE, caller.name)
@@ -127,23 +130,73 @@ def register(
     if not numbers:
         raise StorageError("expected a recording with episodes, found one without any")
     _demand_benchmark(connection, caller, recording.benchmark_id)
-    sidecar = Sidecar(uuid=recording.uuid, deleted=set(deleted))
-    own = select(FILE).where(FILE.c.created_by == caller.name, FILE.c.uuid == recording.uuid)
-    earlier = connection.execute(own).all()
-    name = unescape_text(earlier[0].path) if earlier else place  # who has listed it opens it again
-    for row in earlier:
-        sidecar.deleted |= set(json.loads(row.deleted))
-        for header in queries.find_episodes(
-            connection, FilterEQ(key="recording", value=unescape_text(row.path))
-        ):
-            if header.episode not in numbers and header.episode not in sidecar.deleted:
-                raise ConflictError(
-                    f"the recording {recording.uuid} is stored with episode {header.episode}, which this file lacks; "
-                    "delete what is stored first"
-                )
-            sidecar.published_in[header.episode] = header.published_in
-        _forget(connection, unescape_text(row.path))
+    earlier = _parts(connection, caller, recording.uuid)
+    replaced = [part for part in earlier if part.seen_by.keys() <= numbers]
+    sidecar = Sidecar(uuid=recording.uuid)
+    for part in earlier:
+        if part in replaced:
+            sidecar.published_in |= part.seen_by
+        elif numbers & part.seen_by.keys():
+            raise ConflictError(
+                f"the recording {recording.uuid} is stored with episode {min(part.seen_by.keys() - numbers)}, which "
+                "this file lacks; delete what is stored first"
+            )
+    stored = {number for part in earlier for number in part.seen_by}
+    gone_since = {number for number in numbers - stored if number < sent_before}
+    sidecar.deleted = gone_since.union(deleted, *(part.deleted for part in earlier))
+    gone = [_forget(connection, part.name) for part in replaced]
+    name = _name_of(place, min(numbers), [part.name for part in earlier], [part.name for part in replaced])
+    if numbers <= sidecar.deleted:
+        return name, [*gone, place]
     settle(connection, place)
+    _put(connection, caller, recording, name, sidecar)
+    told = {"path": escape_text(name), "place": escape_text(place), "created_by": caller.name}
+    told |= {"uuid": recording.uuid, "digest": digest, "deleted": json.dumps(sorted(sidecar.deleted))}
+    connection.execute(insert(FILE).values(**told, size=recording.size, episodes=len(numbers)))
+    audit(connection, caller.name, "store_recording", name)
+    return name, [each for each in gone if each != place]
+
+
+class _Part(NamedTuple):
+    """A file that is stored of a recording: who sees each of its episodes, and which of them were deleted."""
+
+    name: str
+    seen_by: dict[int, list[str]]
+    deleted: set[int]
+
+
+def _parts(connection: Connection, caller: Caller, uuid: str) -> list[_Part]:
+    own = select(FILE.c.path, FILE.c.deleted).where(FILE.c.created_by == caller.name, FILE.c.uuid == uuid)
+    listed = select(EPISODE.c.episode, EPISODE.c.published_in).join(
+        RECORDING, RECORDING.c.id == EPISODE.c.recording_id
+    )
+    parts = []
+    for path, deleted in connection.execute(own.order_by(FILE.c.path)).all():
+        found = connection.execute(listed.where(RECORDING.c.path == path))
+        seen_by = {number: json.loads(groups) for number, groups in found}
+        parts.append(_Part(unescape_text(path), seen_by, set(json.loads(deleted))))
+    return parts
+
+
+def _name_of(place: str, first: int, earlier: Sequence[str], replaced: Sequence[str]) -> str:
+    """The name of a file, with episodes from `first` on, among those of its recording: that of the whole where it is
+    free, so that who has listed a part opens what has taken its place."""
+    if not earlier:
+        return place
+    whole = _whole(earlier[0])
+    if whole in replaced or whole not in earlier:
+        return whole
+    return replaced[0] if replaced else f"{whole}/{first:010}-{secrets.token_hex(6)}.mcap"
+
+
+def _whole(name: str) -> str:
+    """The name of the recording that a file is a part of."""
+    stem, part, _ = name.partition(".mcap/")
+    return f"{stem}.mcap" if part else name
+
+
+def _put(connection: Connection, caller: Caller, recording: Recording, name: str, sidecar: Sidecar) -> None:
+    """Lists a recording in the catalog."""
     audience(connection, [caller.name])
     queries.put_recording(
         connection,
@@ -154,21 +207,6 @@ def register(
         rows=rows_of(recording, sidecar, created_by=caller.name),
         runs=runs_of(recording),
     )
-    told = {
-        "path": escape_text(name),
-        "place": escape_text(place),
-        "created_by": caller.name,
-        "uuid": recording.uuid,
-        "digest": digest,
-    }
-    counts = {
-        "size": recording.size,
-        "episodes": len(numbers),
-        "deleted": json.dumps(sorted(sidecar.deleted)),
-    }
-    connection.execute(insert(FILE).values(**told, **counts))
-    audit(connection, caller.name, "store_recording", name)
-    return name, [unescape_text(row.place) for row in earlier if row.place != escape_text(place)]
 
 
 def _demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) -> None:

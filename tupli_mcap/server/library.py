@@ -161,7 +161,7 @@ class Library:
         try:
             with self.database.reading() as connection:
                 known = episodes.stored_already(connection, caller, upload.digest)
-            return known or self._keep(caller, upload.path, upload.digest)
+            return known or self._keep(caller, upload.path, upload.digest, upload.sent_before)
         finally:
             self.uploads.forget(upload)
 
@@ -193,7 +193,7 @@ class Library:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             return self._keep(caller, path, digest)
 
-    def _keep(self, caller: Caller, path: Path, digest: str) -> str:
+    def _keep(self, caller: Caller, path: Path, digest: str, sent_before: int = 0) -> str:
         """Moves a recording to where it stays, and lists its episodes; returns its name."""
         with Recording(path) as recording:
             if not recording.complete:
@@ -204,7 +204,9 @@ class Library:
             self.blobs.take(place, path)
             try:
                 with self.database.writing() as connection:
-                    name, replaced = episodes.register(connection, caller, recording, place, digest)
+                    name, replaced = episodes.register(
+                        connection, caller, recording, place, digest, sent_before=sent_before
+                    )
             except BaseException:
                 self.sweep([place])
                 raise

@@ -18,7 +18,7 @@ from tupli_mcap.errors import StorageError
 from tupli_mcap.server.people.access import Caller
 from tupli_mcap.storage.atomic import write_bytes
 
-__all__ = ["BusyError", "GoneError", "Upload", "Uploads"]
+__all__ = ["BusyError", "ChecksumError", "GoneError", "Upload", "Uploads"]
 
 _ID = re.compile("[0-9a-f]{32}")
 _KEPT_SECONDS = 7 * 24 * 3600
@@ -32,15 +32,20 @@ class GoneError(StorageError):
     """There is no such upload: it was finished, given up, or is somebody else's."""
 
 
+class ChecksumError(StorageError):
+    """The bytes that have come are not those that were announced."""
+
+
 class Upload(NamedTuple):
     """id: what it goes by. path: the file that holds what has come. length, digest: its bytes and their SHA-256 in the
-    end."""
+    end. sent_before: episodes with lower numbers were sent before, in parts."""
 
     id: str
     path: Path
     user: str
     length: int
     digest: str
+    sent_before: int = 0
 
     @property
     def offset(self) -> int:
@@ -56,7 +61,7 @@ class Uploads:
         self._busy: set[str] = set()
         self._turn = threading.Lock()
 
-    def begin(self, caller: Caller, length: int, digest: str) -> Upload:
+    def begin(self, caller: Caller, length: int, digest: str, sent_before: int = 0) -> Upload:
         """A new upload, or the one of the same bytes that this user has begun."""
         for path in self._directory.glob("*.json"):
             known = self._read(path.stem)
@@ -67,11 +72,11 @@ class Uploads:
             ):
                 return known
         upload = secrets.token_hex(16)
-        told = {"user": caller.name, "length": length, "digest": digest}
+        told = {"user": caller.name, "length": length, "digest": digest, "sent_before": sent_before}
         self._directory.mkdir(parents=True, exist_ok=True)
         (self._directory / upload).touch()
         write_bytes(self._directory / f"{upload}.json", json.dumps(told).encode())
-        return Upload(upload, self._directory / upload, caller.name, length, digest)
+        return Upload(upload, self._directory / upload, caller.name, length, digest, sent_before)
 
     def find(self, caller: Caller, upload: str) -> Upload:
         """An upload of this user. GoneError if there is none."""
@@ -97,14 +102,14 @@ class Uploads:
         """Checks the bytes of an upload that is whole, and makes them durable.
 
         Raises:
-            StorageError: they are not those that were announced; the upload is forgotten.
+            ChecksumError: they are not those that were announced; the upload is forgotten.
         """
         with upload.path.open("rb") as file:
             found = hashlib.file_digest(file, "sha256").hexdigest()
             os.fsync(file.fileno())
         if found != upload.digest:
             self.forget(upload)
-            raise StorageError(
+            raise ChecksumError(
                 f"expected bytes with the SHA-256 {upload.digest}, found {found}; send them again"
             )
 
@@ -126,4 +131,6 @@ class Uploads:
             told = json.loads((self._directory / f"{upload}.json").read_bytes())
         except (OSError, ValueError):
             return None
-        return Upload(upload, path, told["user"], told["length"], told["digest"]) if path.exists() else None
+        if not path.exists():
+            return None
+        return Upload(upload, path, told["user"], told["length"], told["digest"], told.get("sent_before", 0))

@@ -25,7 +25,7 @@ from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError
-from tupli_mcap.server.uploads import BusyError, GoneError
+from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError
 
 __all__ = ["Error", "Found", "Listing", "answer", "listed", "tell_errors"]
 
@@ -37,6 +37,7 @@ _STATUS: Final[dict[type[TupliError], int]] = {
     ConflictError: 409,
     GoneError: 410,
     BusyError: 423,
+    ChecksumError: 460,  # as tus has it
     FilterError: 400,
     SpaceError: 400,
     FormatError: 400,

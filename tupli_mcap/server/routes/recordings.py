@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import os
+import re
 import tempfile
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -56,7 +58,13 @@ def begin_upload(
     library: Served,
     caller: Writer,
     upload_length: Annotated[int, Header(ge=1)],
-    upload_metadata: Annotated[str, Header(description="`sha256` and the hex digits in base64")],
+    upload_metadata: Annotated[
+        str,
+        Header(
+            description="`sha256` and the hex digits in base64; also `sent_before` and a number, where episodes "
+            "with lower numbers were sent before, in parts: of these, what is not there any more stays deleted"
+        ),
+    ],
 ) -> Response:
     """Begins an upload, or goes on with the one of the same bytes; says where if they are stored already."""
     caller.demand(Right.EPISODE_CREATE, caller.name)
@@ -64,14 +72,17 @@ def begin_upload(
         raise HTTPException(
             413, f"expected at most {library.settings.max_upload} bytes, found {upload_length}"
         )
-    digest = _digest(upload_metadata)
+    told = _metadata(upload_metadata)
+    digest = told.get("sha256", "")
+    if not is_hash(digest):
+        raise StorageError("expected Upload-Metadata with `sha256`: 64 lower-case hex digits, in base64")
     with library.database.reading() as connection:
         known = episodes.stored_already(connection, caller, digest)
     if known is not None:
         return Response(status_code=200, headers={**_TUS, "Recording": known})
-    upload = library.uploads.begin(caller, upload_length, digest)
-    told = {**_TUS, "Location": f"/v1/uploads/{upload.id}", "Upload-Offset": str(upload.offset)}
-    return Response(status_code=201, headers=told)
+    upload = library.uploads.begin(caller, upload_length, digest, _number(told.get("sent_before", "0")))
+    headers = {**_TUS, "Location": f"/v1/uploads/{upload.id}", "Upload-Offset": str(upload.offset)}
+    return Response(status_code=201, headers=headers)
 
 
 @router.head("/uploads/{upload_id}")
@@ -122,17 +133,20 @@ async def _append(upload: Upload, pieces: AsyncIterator[bytes]) -> None:
             file.write(piece)
 
 
-def _digest(metadata: str) -> str:
-    for pair in metadata.split(","):
+def _metadata(text: str) -> dict[str, str]:
+    """The pairs of an `Upload-Metadata` header; without those that have none in base64."""
+    found = {}
+    for pair in text.split(","):
         key, _, value = pair.strip().partition(" ")
-        if key == "sha256":
-            try:
-                found = base64.b64decode(value, validate=True).decode("ascii")
-            except ValueError:
-                break
-            if is_hash(found):
-                return found
-    raise StorageError("expected Upload-Metadata with `sha256`: 64 lower-case hex digits, in base64")
+        with contextlib.suppress(ValueError):
+            found[key] = base64.b64decode(value, validate=True).decode(errors="replace")
+    return found
+
+
+def _number(text: str) -> int:
+    if not re.fullmatch("[0-9]{1,10}", text):
+        raise StorageError(f"expected `sent_before` in Upload-Metadata to be a number, found {text[:40]!r}")
+    return int(text)
 
 
 # --- fetching ---
@@ -160,7 +174,9 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
         found = episodes.file_of(connection, caller, name)
         kept = [
             header.episode
-            for header in episodes.find_episodes(connection, caller, FilterEQ(key="recording", value=name))
+            for header in episodes.find_episodes(
+                connection, caller, FilterEQ(key="recording", value=found.name)
+            )
         ]
     file_name = name.rpartition("/")[2]
     if not found.whole:
