@@ -53,5 +53,6 @@ def pytest_configure() -> None:
     """Ctrl-C interrupts what tests start, too where this runs in the background of a shell, which ignores it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ["PYTHON_KEYRING_BACKEND"] = "keyring.backends.fail.Keyring"  # not the user's
     settings.register_profile("untimed", deadline=None)  # speed is measured in python -m tools.bench
     settings.load_profile("untimed")

@@ -11,6 +11,7 @@ from serving import PASSWORD, serving
 from test_storage import StorageContract
 
 from tupli_mcap import RecordEpisodes
+from tupli_mcap.schema import Group
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
 
@@ -31,7 +32,7 @@ def admin(url: str) -> Iterator[TupliAPIClient]:
 class TestContract(StorageContract):
     @pytest.fixture
     def storage(self, admin: TupliAPIClient) -> TupliAPIClient:
-        admin.create_group("lab")
+        admin.create_group(Group(name="lab"))
         return admin
 
 

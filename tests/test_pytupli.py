@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -10,33 +11,22 @@ from typing import Any
 
 import gymnasium as gym
 import httpx
-import keyring
-import keyring.backend
 import numpy as np
 import pytest
+from keyrings import Keyring, keyring_in_memory
 from serving import PASSWORD, serving
 
+from tupli_mcap.schema import (
+    RIGHT,
+    Group,
+    GroupMembership,
+    GroupMembershipQuery,
+    Membership,
+    UserOut,
+    UserRole,
+)
 from tupli_mcap.server.settings import Settings
-from tupli_mcap.storage import TupliAPIClient
-
-
-class Keyring(keyring.backend.KeyringBackend):
-    """A keyring in memory: where PyTupli keeps address and tokens."""
-
-    priority = 1  # type: ignore[assignment]
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.kept: dict[tuple[str, str], str] = {}
-
-    def get_password(self, service: str, username: str) -> str | None:
-        return self.kept.get((service, username))
-
-    def set_password(self, service: str, username: str, password: str) -> None:
-        self.kept[service, username] = password
-
-    def delete_password(self, service: str, username: str) -> None:
-        del self.kept[service, username]
+from tupli_mcap.storage import TupliAPIClient, TupliStorageError
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +40,8 @@ def pytupli() -> ModuleType:
 
 @pytest.fixture
 def kept() -> Iterator[Keyring]:
-    before, mine = keyring.get_keyring(), Keyring()
-    keyring.set_keyring(mine)
-    yield mine
-    keyring.set_keyring(before)
+    with keyring_in_memory() as kept:
+        yield kept
 
 
 @pytest.fixture
@@ -67,6 +55,65 @@ def admin(pytupli: ModuleType, kept: Keyring, url: str) -> Any:
     client = pytupli.TupliAPIClient()
     client.login("admin", PASSWORD, url)
     return client
+
+
+METHODS = [
+    name
+    for name, member in vars(importlib.import_module("pytupli.storage").TupliAPIClient).items()
+    if inspect.isfunction(member) and (not name.startswith("_") or name == "__init__")
+]
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_our_client_has_the_method_with_the_same_parameters(pytupli: ModuleType, name: str) -> None:
+    """What ours takes beyond them may be left out."""
+    theirs = list(inspect.signature(getattr(pytupli.TupliAPIClient, name)).parameters.values())
+    ours = list(inspect.signature(getattr(TupliAPIClient, name)).parameters.values())
+    assert [(p.name, p.default, p.kind) for p in ours[: len(theirs)]] == [
+        (p.name, p.default, p.kind) for p in theirs
+    ]
+    assert all(
+        p.default is not p.empty or p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL) for p in ours[len(theirs) :]
+    )
+    assert name == "__init__" or inspect.getdoc(getattr(TupliAPIClient, name))
+
+
+def test_our_client_takes_and_gives_what_pytupli_s_does(admin: Any, url: str) -> None:
+    """The calls of `test_users_and_groups_and_publication`, with the models of `tupli_mcap.schema`."""
+    with TupliAPIClient() as ours:
+        ours.login("admin", PASSWORD, url)
+        assert ours.signup("ann", "ann") == UserOut(
+            username="ann",
+            memberships=[
+                Membership(group="global", roles=["global_member", "contributor"]),
+                Membership(group="ann", roles=["user_admin", "contributor"]),
+            ],
+        )
+        assert [user.username for user in ours.list_users()] == ["admin", "ann"]
+        with pytest.raises(TupliStorageError, match="Signup failed"):
+            ours.signup("ann", "ann")
+        with pytest.raises(TupliStorageError, match="Login failed"):
+            ours.login("ann", "wrong")
+        lab = Group(name="lab", description="us")
+        assert ours.create_group(lab) == lab
+        query = GroupMembershipQuery(
+            group_name="lab", members=[GroupMembership(user="ann", roles=["member"])]
+        )
+        assert ours.add_group_members(query).members == ["admin", "ann"]
+        assert ours.read_group("lab").roles["ann"] == ["member"]
+        assert ours.remove_group_members(query).members == ["admin"]
+        assert ours.list_groups() == [lab]
+        ours.delete_group("lab")
+        role = UserRole(role="looker", rights=[RIGHT.EPISODE_READ], description=None)
+        assert ours.create_role(role) == role
+        assert role in ours.list_roles()
+        ours.delete_role("looker")
+        ours.change_password("ann", "new")
+        ours.login("ann", "new")
+        ours.change_password("ann", "newer", old="new")
+        ours.login("admin", PASSWORD)
+        ours.delete_user("ann")
+        assert [user.username for user in ours.list_users()] == ["admin"]
 
 
 def test_it_stores_records_filters_trains_and_deletes(pytupli: ModuleType, admin: Any, url: str) -> None:

@@ -19,7 +19,16 @@ from test_storage import episode, query
 
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
-from tupli_mcap.schema import ArtifactMetadata, EpisodeHeader, F
+from tupli_mcap.schema import (
+    RIGHT,
+    ArtifactMetadata,
+    EpisodeHeader,
+    F,
+    Group,
+    GroupMembership,
+    GroupMembershipQuery,
+    UserRole,
+)
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import FileStorage, TupliAPIClient
 
@@ -114,6 +123,11 @@ def users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Users]:
             each.close()
 
 
+def members(group: str, user: str, *roles: str) -> GroupMembershipQuery:
+    member = GroupMembership(user=user, roles=list(roles))
+    return GroupMembershipQuery(group_name=group, members=[member])
+
+
 def token_of(user: TupliAPIClient) -> dict[str, str]:
     return {"Authorization": f"Bearer {user._session._token()}"}
 
@@ -204,8 +218,8 @@ def test_what_may_not_be_read_is_not_there(users: Users, things: Things) -> None
 
 
 def test_what_is_published_in_a_group_is_read_there_and_nowhere_else(users: Users, things: Things) -> None:
-    users.ann.create_group("robots", "those with arms")
-    users.ann.add_group_members("robots", [{"user": "bob", "roles": ["member"]}])
+    users.ann.create_group(Group(name="robots", description="those with arms"))
+    users.ann.add_group_members(members("robots", "bob", "member"))
     users.ann.publish_benchmark(things.benchmark, "robots")
     users.ann.publish_artifact(things.artifact, "robots")
     users.ann.publish_episode(things.episodes[0].id, "robots")
@@ -217,9 +231,9 @@ def test_what_is_published_in_a_group_is_read_there_and_nowhere_else(users: User
     with pytest.raises(StorageError, match="only its owner may delete"):
         users.bob.delete_episodes(F("steps") > 0)
 
-    users.ann.remove_group_members("robots", ["bob"])
+    users.ann.remove_group_members(members("robots", "bob"))
     assert set(statuses(users, users.bob, things).values()) == {404}
-    users.ann.add_group_members("robots", [{"user": "bob", "roles": ["member"]}])
+    users.ann.add_group_members(members("robots", "bob", "member"))
     users.ann.unpublish_episodes(F("steps") > 0, "robots")
     assert users.bob.list_episodes() == []
 
@@ -256,8 +270,8 @@ def test_the_same_content_of_two_users(users: Users, things: Things) -> None:
 def test_users_and_groups_have_one_name_space(users: Users) -> None:
     for name in ("ann", "global", "$$GUEST$$"):
         with pytest.raises(StorageError, match="already exists"):
-            users.eve.create_group(name)
-    users.eve.create_group("lab")
+            users.eve.create_group(Group(name=name))
+    users.eve.create_group(Group(name="lab"))
     for name in ("lab", "global", "bob"):
         with pytest.raises(StorageError, match="already exists|expected a user name"):
             users.admin.signup(name, "password")
@@ -269,13 +283,13 @@ def test_users_and_groups_have_one_name_space(users: Users) -> None:
 
 
 def test_nobody_gives_rights_that_they_lack(users: Users) -> None:
-    users.eve.create_group("lab")
+    users.eve.create_group(Group(name="lab"))
     with pytest.raises(StorageError, match="Insufficient permissions in group: lab"):
-        users.eve.add_group_members("lab", [{"user": "eve", "roles": ["admin"]}])
+        users.eve.add_group_members(members("lab", "eve", "admin"))
     with pytest.raises(StorageError, match="Group not found|Insufficient permissions"):
-        users.eve.add_group_members("global", [{"user": "eve", "roles": ["admin"]}])
+        users.eve.add_group_members(members("global", "eve", "admin"))
     with pytest.raises(StorageError, match="Insufficient permissions"):
-        users.eve.create_role("mighty", ["role_management"])
+        users.eve.create_role(UserRole(role="mighty", rights=[RIGHT.ROLE_MANAGEMENT]))
     with pytest.raises(StorageError, match="cannot be deleted"):
         users.admin.delete_role("admin")
 
@@ -291,7 +305,7 @@ def test_a_new_password_ends_every_sign_in(users: Users) -> None:
     with pytest.raises(StorageError, match="tupli-mcap login"):
         users.ann.list_benchmarks()
     users.ann.login("ann", "new")
-    assert users.ann.whoami()["username"] == "ann"
+    assert users.ann.whoami().username == "ann"
 
 
 def test_a_refresh_token_that_is_used_twice_ends_the_sign_in(users: Users) -> None:
@@ -305,9 +319,9 @@ def test_a_refresh_token_that_is_used_twice_ends_the_sign_in(users: Users) -> No
 
 
 def test_an_expired_access_token_is_renewed_by_the_client(users: Users) -> None:
-    kept = users.ann._session._tokens
-    kept.put(users.url, {**kept.of(users.url), "access_token": "expired"})
-    assert users.ann.whoami()["username"] == "ann"
+    kept = users.ann._session.tokens
+    kept.put(users.url, "ann", {**kept.tokens(users.url), "access_token": "expired"})
+    assert users.ann.whoami().username == "ann"
 
 
 def test_forged_tokens(users: Users, tmp_path: Path) -> None:
@@ -379,10 +393,10 @@ def test_an_upload_goes_on_where_it_was_broken_off(users: Users, tmp_path: Path)
 
 def test_what_is_no_recording_is_not_kept(users: Users, tmp_path: Path) -> None:
     token = token_of(users.ann)
-    for sent, announced in ((b"nonsense" * 100, None), (b"x" * 800, b"y" * 800)):
+    for sent, announced, status in ((b"nonsense" * 100, None, 400), (b"x" * 800, b"y" * 800, 460)):
         place = begin(users.url, token, announced or sent)
         answer = patch(place, token, sent)
-        assert answer.status_code == 400, answer.text
+        assert answer.status_code == status, answer.text
         assert httpx.head(place, headers=token).status_code == 410
     place = begin(users.url, token, b"abc", length=3)
     assert patch(place, token, b"abcd").status_code == 413
@@ -437,6 +451,6 @@ def test_guests_see_what_is_published_where_they_may(tmp_path: Path, monkeypatch
             (header,) = guest.list_episodes()
             with guest.open_recording(header.recording) as recording:
                 assert len(recording) == 1
-            with pytest.raises(StorageError, match="guests may change nothing; sign in"):
+            with pytest.raises(StorageError, match="guests may change nothing .* sign in"):
                 guest.store_artifact(b"x", ArtifactMetadata(name="x"))
         admin.close()

@@ -20,7 +20,7 @@ from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
 from tupli_mcap.environment import Snapshot, build, capture, fingerprint
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError
 from tupli_mcap.recording.write.options import RecordOptions
-from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, RLTuple
+from tupli_mcap.schema import Benchmark, BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
 from tupli_mcap.storage.texts import first_defect
@@ -118,6 +118,9 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         self._recording = True
         self._recorder: RecordEpisodes | None = None
         self._path: Path | None = None
+        self._benchmark: Benchmark | None = (
+            None  # as it is stored: recording does not ask the storage for it again
+        )
         # resets that no step followed, each going on from the one before
         self._pending: list[PendingReset] = []
 
@@ -251,7 +254,9 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             # Where the file cannot go on (somebody else writes to it), another one is begun.
             with contextlib.suppress(RecordingError):
                 return RecordEpisodes(self._tap, self._path, **vars(going_on))
-        benchmark = self.storage.load_benchmark(benchmark_id)
+        benchmark = self._benchmark
+        if benchmark is None or benchmark.id != benchmark_id:
+            benchmark = self._benchmark = self.storage.load_benchmark(benchmark_id)
         self._path = self.storage.new_recording_path(benchmark_id, options.name or benchmark.metadata.name)
         options = replace(options, attachments=recording_attachments(benchmark.serialized))
         return RecordEpisodes(self._tap, self._path, **vars(options))
@@ -308,6 +313,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             self._finish()
             self._path = None
         self.id = stored.id
+        self._benchmark = Benchmark(**{**dict(stored), "serialized": serialized})
         return stored.id
 
     @classmethod
@@ -334,9 +340,11 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         if isinstance(benchmark_id, TupliStorage):
             raise StorageError("expected a storage and then a benchmark_id, found them the other way round")
         opened = storage_at(storage)
-        serialized = opened.load_benchmark(benchmark_id).serialized
-        env = cls.deserialize_env(serialized, opened, trust=trust)
-        return cls(env, opened, benchmark_id, metadata_callback, rl_tuple_cls, **recording_options)
+        benchmark = opened.load_benchmark(benchmark_id)
+        env = cls.deserialize_env(benchmark.serialized, opened, trust=trust)
+        loaded = cls(env, opened, benchmark_id, metadata_callback, rl_tuple_cls, **recording_options)
+        loaded._benchmark = benchmark
+        return loaded
 
     def publish(self, publish_in: str = "global") -> None:
         """Note that a group may see the benchmark."""

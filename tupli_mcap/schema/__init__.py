@@ -1,4 +1,4 @@
-"""What benchmarks, artifacts and episodes are described by, and the filters over them. No I/O."""
+"""What benchmarks, artifacts, episodes and people are described by, and the filters over them. No I/O."""
 
 from tupli_mcap.schema.facts import bound, check_keys, filter_keys
 from tupli_mcap.schema.field import F
@@ -33,9 +33,23 @@ from tupli_mcap.schema.models import (
     RLTuple,
 )
 from tupli_mcap.schema.parse import format_filter, parse_filter
+from tupli_mcap.schema.people import (
+    RIGHT,
+    ApiToken,
+    Group,
+    GroupMembership,
+    GroupMembershipQuery,
+    GroupWithMembers,
+    Membership,
+    Right,
+    UserOut,
+    UserRole,
+)
 from tupli_mcap.schema.predicate import compile_predicate, evaluate_columns
 
 __all__ = [
+    "RIGHT",
+    "ApiToken",
     "ArtifactMetadata",
     "ArtifactMetadataItem",
     "BaseFilter",
@@ -61,7 +75,15 @@ __all__ = [
     "FilterNOT",
     "FilterOR",
     "FilterType",
+    "Group",
+    "GroupMembership",
+    "GroupMembershipQuery",
+    "GroupWithMembers",
+    "Membership",
     "RLTuple",
+    "Right",
+    "UserOut",
+    "UserRole",
     "bound",
     "check_keys",
     "compile_predicate",

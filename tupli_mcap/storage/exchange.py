@@ -113,5 +113,5 @@ def unpublish_benchmark(client: TupliAPIClient, uri: str, group: str) -> int:
 
 
 def _own_episodes(client: TupliAPIClient, uri: str) -> BaseFilter:
-    me = client.whoami()["username"]
+    me = client.whoami().username
     return FilterEQ(key="benchmark_id", value=uri) & FilterEQ(key="created_by", value=me)

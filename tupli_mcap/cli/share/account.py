@@ -53,11 +53,13 @@ def whoami(url: Url = None, as_json: Json = False) -> None:
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
-        found: dict[str, Any] = {"url": client.url, **client.whoami()}
+        me = client.whoami()
+        memberships = {held.group: held.roles for held in me.memberships}
+        found: dict[str, Any] = {"url": client.url, "username": me.username, "memberships": memberships}
     if as_json:
         print_json(found)
         return
-    roles = [(group, ", ".join(held)) for group, held in found["memberships"].items()]
+    roles = [(group, ", ".join(held)) for group, held in memberships.items()]
     print_facts([("server", found["url"]), ("user", found["username"]), *roles])
 
 
@@ -85,7 +87,7 @@ def password(
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
-        me = client.whoami()["username"]
+        me = client.whoami().username
         own = username in (None, me)
         old = _password("Old password: ") if own else None
         new = _password("New password: ", "TUPLI_MCAP_NEW_PASSWORD")

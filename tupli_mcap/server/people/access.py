@@ -7,7 +7,6 @@ of their own, with their name. An item is read by who made it, and by who may re
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
@@ -15,6 +14,7 @@ from sqlalchemy import or_, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.errors import TupliError
+from tupli_mcap.schema import Right
 from tupli_mcap.server.tables import AUDIENCE
 from tupli_mcap.storage.texts import escape_text
 
@@ -28,29 +28,6 @@ GUEST: Final = "$$GUEST$$"
 
 class DeniedError(TupliError):
     """The caller has not the right to do this."""
-
-
-class Right(enum.StrEnum):
-    """What a role may allow."""
-
-    BENCHMARK_CREATE = "benchmark_create"
-    BENCHMARK_READ = "benchmark_read"
-    BENCHMARK_DELETE = "benchmark_delete"
-    ARTIFACT_CREATE = "artifact_create"
-    ARTIFACT_READ = "artifact_read"
-    ARTIFACT_DELETE = "artifact_delete"
-    EPISODE_CREATE = "episode_create"
-    EPISODE_READ = "episode_read"
-    EPISODE_DELETE = "episode_delete"
-    USER_CREATE = "user_create"
-    USER_READ = "user_read"
-    USER_UPDATE = "user_update"
-    USER_DELETE = "user_delete"
-    GROUP_CREATE = "group_create"
-    GROUP_READ = "group_read"
-    GROUP_UPDATE = "group_update"
-    GROUP_DELETE = "group_delete"
-    ROLE_MANAGEMENT = "role_management"
 
 
 def _content(*verbs: str) -> frozenset[Right]:

@@ -123,15 +123,15 @@ class Tokens:
     def create_api_token(
         self, connection: Connection, caller: Caller, name: str, scope: str, days: int | None
     ) -> dict[str, Any]:
-        """A token for a machine, shown this once: `id`, `token`, `name`, `scope`."""
+        """A token for a machine as they are listed, and, this once, the `token` itself."""
         if scope not in ("read", "write") or not name.isprintable() or not 1 <= len(name) <= 100:
             raise StorageError("expected a name, and the scope 'read' or 'write'")
         token, number = _API_PREFIX + secrets.token_urlsafe(32), secrets.token_hex(8)
         now = int(time.time())
-        row = {"id": number, "digest": _digest(token), "user": caller.name, "name": name, "scope": scope}
         expires = None if days is None else now + days * 24 * 3600
-        connection.execute(insert(API_TOKEN).values(**row, created_at=now, expires=expires))
-        return {"id": number, "token": token, "name": name, "scope": scope}
+        told = {"id": number, "name": name, "scope": scope, "created_at": now, "expires": expires}
+        connection.execute(insert(API_TOKEN).values(**told, digest=_digest(token), user=caller.name))
+        return {**told, "token": token}
 
     def list_api_tokens(self, connection: Connection, caller: Caller) -> list[dict[str, Any]]:
         """The caller's tokens for machines, without the tokens themselves."""

@@ -7,8 +7,9 @@ import re
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Final
-from urllib.parse import quote
+from typing import Any, Final, TypeVar
+
+from pydantic import BaseModel
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import sha256
@@ -28,9 +29,10 @@ from tupli_mcap.schema import (
     bound,
 )
 from tupli_mcap.schema.facts import path_in
-from tupli_mcap.storage.api.sending import Outbox, outbox_of, send_file
-from tupli_mcap.storage.api.session import Session, pages
-from tupli_mcap.storage.atomic import fill, os_errors
+from tupli_mcap.storage.api.outbox import Outbox, outbox_of
+from tupli_mcap.storage.api.people import People
+from tupli_mcap.storage.api.session import Session, as_told, pages
+from tupli_mcap.storage.api.upload import Tell, send_file
 from tupli_mcap.storage.base import TupliStorage, anew, published_in
 from tupli_mcap.storage.benchmark_json import declared_spaces, plain, recording_attachments
 from tupli_mcap.storage.from_values import episode_data, episode_spaces
@@ -39,23 +41,28 @@ from tupli_mcap.storage.texts import is_hash
 
 __all__ = ["TupliAPIClient"]
 
+_Model = TypeVar("_Model", bound=BaseModel)
 _EPISODE_ID: Final = re.compile(r"[0-9a-f]{32}-(0|[1-9][0-9]{0,9})")
 
 
-class TupliAPIClient(TupliStorage):
+class TupliAPIClient(People, TupliStorage):
     """A storage on the server at `url`: `tupli-mcap serve` starts one.
 
-    Without a URL it is that of TUPLI_MCAP_URL, of the last `login`, or of this machine. What is recorded is written
-    here first and sent behind (`flush` waits for it); every question waits for it too. What a process could not send
-    is sent by the next one. Usable from any thread; in another process it is opened anew.
+    Without a URL it is that of TUPLI_MCAP_URL, of the last `login` or `set_url`, or of this machine. What is recorded
+    is written here first, and sent behind for as long as it takes: recording neither waits for the server nor fails for
+    it. Every question waits until all that this process has recorded is there, of what goes on the episodes that have
+    ended; so does the end of the program. What it could not send is sent by the next one. Usable from any thread; in
+    another process it is opened anew.
 
     Raises:
-        StorageError: the URL is none of a web server; later, the server does not answer or refuses.
+        StorageError: the URL is none of a web server; later, the server does not answer, or refuses.
     """
 
     def __init__(self, url: str | None = None) -> None:
         self._session = Session(url)
-        self._outbox.send_left()
+        self._benchmarks: set[str] = set()  # that are known to be there
+        if self._session.known_user is not None:
+            outbox_of(self._session)
 
     @property
     def _outbox(self) -> Outbox:
@@ -72,16 +79,18 @@ class TupliAPIClient(TupliStorage):
         return self._session.username
 
     def set_url(self, url: str) -> None:
-        """Use another server from now on."""
-        self.flush()
+        """Use another server from now on, also in clients that are made without a URL. What was recorded for the one
+        before is sent there all the same."""
+        session = Session(url)
+        session.tokens.use(session.url)
         self.close()
         self.__init__(url)  # type: ignore[misc]
 
     def flush(self) -> None:
-        """Wait until everything that was recorded has been stored by the server.
+        """Wait until the server has all that was recorded; of what goes on, the episodes that have ended.
 
         Raises:
-            StorageError: something could not be sent; it stays on this machine, and is tried again.
+            StorageError: the server does not answer, or refuses some of it; that stays on this machine.
         """
         self._outbox.flush()
 
@@ -106,19 +115,22 @@ class TupliAPIClient(TupliStorage):
     def store_benchmark(self, benchmark_query: BenchmarkQuery) -> BenchmarkHeader:
         plain(benchmark_query.metadata)
         told = {**dict(benchmark_query), "metadata": benchmark_query.metadata.model_dump()}
-        return BenchmarkHeader.model_validate(self._session.ask("POST", "/v1/benchmarks", told, repeat=True))
+        stored = as_told(BenchmarkHeader, self._session.ask("POST", "/v1/benchmarks", told, repeat=True))
+        self._benchmarks.add(stored.id)
+        return stored
 
     def load_benchmark(self, uri: str) -> Benchmark:
-        return Benchmark.model_validate(self._session.ask("GET", f"/v1/benchmarks/{_hash(uri, 'benchmark')}"))
+        found = as_told(Benchmark, self._session.ask("GET", f"/v1/benchmarks/{_hash(uri, 'benchmark')}"))
+        self._benchmarks.add(found.id)
+        return found
 
     def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
-        told = _listing(filter, BenchmarkHeader)
-        return [BenchmarkHeader.model_validate(i) for i in pages(self._session, "/v1/benchmarks/list", told)]
+        return self._listed("/v1/benchmarks/list", BenchmarkHeader, _listing(filter, BenchmarkHeader))
 
     def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
         self.flush()
-        path = f"/v1/benchmarks/{_hash(uri, 'benchmark')}"
-        return int(self._session.ask("DELETE", path, episodes=episodes)["episodes"])
+        self._benchmarks.discard(uri)
+        return self._count("DELETE", f"/v1/benchmarks/{_hash(uri, 'benchmark')}", episodes=episodes)
 
     def publish_benchmark(self, uri: str, publish_in: str = "global") -> None:
         self._publish("benchmarks", _hash(uri, "benchmark"), publish_in)
@@ -134,10 +146,10 @@ class TupliAPIClient(TupliStorage):
             raise StorageError(f"expected the bytes of an artifact, found {type(artifact).__name__}")
         told = jsonvalue.dumps_plain(metadata.model_dump())
         headers = {"Artifact-Metadata": base64.b64encode(told.encode()).decode()}
-        response = self._session.send(
+        response = self._session.ask(
             "POST", "/v1/artifacts", content=bytes(artifact), headers=headers, repeat=True
         )
-        return ArtifactMetadataItem.model_validate(jsonvalue.loads(response.content))
+        return as_told(ArtifactMetadataItem, response)
 
     def load_artifact(self, uri: str, **kwargs: Any) -> bytes:
         data = self._session.send("GET", f"/v1/artifacts/{_hash(uri, 'artifact')}").content
@@ -146,14 +158,12 @@ class TupliAPIClient(TupliStorage):
         return data
 
     def list_artifacts(self, filter: BaseFilter | None = None) -> list[ArtifactMetadataItem]:
-        told = _listing(filter, ArtifactMetadataItem)
-        return [
-            ArtifactMetadataItem.model_validate(i) for i in pages(self._session, "/v1/artifacts/list", told)
-        ]
+        return self._listed(
+            "/v1/artifacts/list", ArtifactMetadataItem, _listing(filter, ArtifactMetadataItem)
+        )
 
     def artifact_users(self, uri: str) -> list[str]:
-        found: list[str] = self._session.ask("GET", f"/v1/artifacts/{_hash(uri, 'artifact')}/users")
-        return found
+        return as_told(list[str], self._session.ask("GET", f"/v1/artifacts/{_hash(uri, 'artifact')}/users"))
 
     def delete_artifact(self, uri: str, *, force: bool = False) -> None:
         self._session.ask("DELETE", f"/v1/artifacts/{_hash(uri, 'artifact')}", force=force)
@@ -188,10 +198,10 @@ class TupliAPIClient(TupliStorage):
         """Stores episodes of one benchmark as a recording; returns its name."""
         benchmark = self.load_benchmark(benchmark_id)
         spaces = episode_spaces(episodes, declared_spaces(benchmark.serialized))
-        path = self._outbox.new_path(benchmark_id, "")
-        with os_errors("cannot record", path), fill(path) as temporary:
+        with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
+            path = Path(folder) / "episodes.mcap"
             write_recording(
-                temporary,
+                path,
                 (episode_data(episode, spaces) for episode in episodes),
                 observation_space=spaces[0],
                 action_space=spaces[1],
@@ -199,9 +209,7 @@ class TupliAPIClient(TupliStorage):
                 benchmark_id=benchmark_id,
                 attachments=recording_attachments(benchmark.serialized),
             )
-        self._outbox.send(path)
-        self.flush()
-        return self._outbox.name_of(path)
+            return self.push(path)
 
     def list_episodes(
         self,
@@ -223,13 +231,12 @@ class TupliAPIClient(TupliStorage):
         self, filter: BaseFilter | None, limit: int | None = None, offset: int = 0
     ) -> list[EpisodeHeader]:
         told = {**_listing(filter, EpisodeHeader), "limit": limit, "offset": offset}
-        return [EpisodeHeader.model_validate(i) for i in pages(self._session, "/v1/episodes/list", told)]
+        return self._listed("/v1/episodes/list", EpisodeHeader, told)
 
     def count_episodes(self, filter: BaseFilter | None = None) -> int:
         self.flush()
-        return int(
-            self._session.ask("POST", "/v1/episodes/count", _listing(filter, EpisodeHeader), repeat=True)
-        )
+        told = _listing(filter, EpisodeHeader)
+        return as_told(int, self._session.ask("POST", "/v1/episodes/count", told, repeat=True))
 
     def delete_episode(self, uri: str) -> None:
         self.flush()
@@ -238,7 +245,7 @@ class TupliAPIClient(TupliStorage):
     def delete_episodes(self, filter: BaseFilter) -> int:
         self.flush()
         told = _listing(filter, EpisodeHeader)
-        return int(self._session.ask("POST", "/v1/episodes/delete", told)["episodes"])
+        return self._count("POST", "/v1/episodes/delete", told)
 
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:
         self.flush()
@@ -259,13 +266,15 @@ class TupliAPIClient(TupliStorage):
     def _publish_all(self, filter: BaseFilter, group: str, *, published: bool) -> int:
         self.flush()
         told = {**_listing(filter, EpisodeHeader), "group": group, "published": published}
-        return int(self._session.ask("POST", "/v1/episodes/publish", told)["episodes"])
+        return self._count("POST", "/v1/episodes/publish", told, repeat=True)
 
     # --- recordings ---
 
     def new_recording_path(self, benchmark_id: str, name: str = "") -> Path:
-        if not self.list_benchmarks(FilterEQ(key="id", value=_hash(benchmark_id, "benchmark"))):
+        known = _hash(benchmark_id, "benchmark") in self._benchmarks
+        if not known and not self.list_benchmarks(FilterEQ(key="id", value=benchmark_id)):
             raise _unknown("benchmark", benchmark_id)
+        self._benchmarks.add(benchmark_id)
         return self._outbox.new_path(benchmark_id, name)
 
     def ingest(self, path: Path) -> None:
@@ -284,100 +293,46 @@ class TupliAPIClient(TupliStorage):
             path.write_bytes(self._session.send("GET", ticket["path"]).content)
             return Recording(path)  # which stays readable when its name is gone
 
-    def push(self, path: str | Path) -> str:
-        """Store a recording that lies here; returns the name that `open_recording` takes.
+    def push(self, path: str | Path, tell: Tell = lambda _: None) -> str:
+        """Store a recording that lies here; returns the name that `open_recording` takes. `tell` is told of bytes sent.
 
         Stored twice, nothing changes; stored again after it has grown, it takes the place of the earlier one.
 
         Raises:
             StorageError: the server refuses it: it is unfinished or empty, or its benchmark is not stored.
         """
-        return send_file(self._session, Path(path))
+        return send_file(self._session, Path(path), tell=tell)
 
     def declare_key(self, key: str) -> None:
         path_in(key, EpisodeHeader)
         self._session.ask("POST", "/v1/episodes/keys", {"key": key})
 
-    # --- users, groups, roles ---
+    # --- signing in ---
 
     def login(self, username: str, password: str, url: str | None = None) -> None:
         """Sign in; this machine remembers it until `logout`."""
         if url is not None:
             self.set_url(url)
-        self._told("Login failed", lambda: self._session.sign_in(username, password))
-        self._outbox.send_left()
+        try:
+            self._session.sign_in(username, password)
+        except TupliError as err:
+            raise type(err)(f"Login failed: {err}") from err
+        outbox_of(self._session)
 
     def logout(self) -> None:
-        """Sign out, here and on the server."""
+        """Sign out, here and on the server, after everything was sent that was recorded."""
         self.flush()
         self._session.sign_out()
 
-    def whoami(self) -> dict[str, Any]:
-        """The name of who is signed in, and the roles held in each group."""
-        found: dict[str, Any] = self._session.ask("GET", "/v1/me")
-        return found
-
-    def signup(self, username: str, password: str) -> dict[str, Any]:
-        """Make a user."""
-        told = {"username": username, "password": password}
-        found: dict[str, Any] = self._told(
-            "Signup failed", lambda: self._session.ask("POST", "/v1/users", told)
-        )
-        return found
-
-    def list_users(self) -> list[dict[str, Any]]:
-        """All users, with the roles that each holds in each group."""
-        return list(self._session.ask("GET", "/v1/users"))
-
-    def change_password(self, username: str, password: str, *, old: str | None = None) -> None:
-        """Give a user another password; `old` is needed for one's own. All sign-ins with the old one end."""
-        told = {"password": password, "old": old}
-        self._session.ask("PUT", f"/v1/users/{_name(username)}/password", told)
-
-    def delete_user(self, username: str) -> None:
-        """Delete a user; what they made stays."""
-        self._session.ask("DELETE", f"/v1/users/{_name(username)}")
-
-    def create_group(self, name: str, description: str | None = None) -> dict[str, Any]:
-        """Make a group that you lead."""
-        told = {"name": name, "description": description}
-        return dict(self._session.ask("POST", "/v1/groups", told))
-
-    def list_groups(self) -> list[dict[str, Any]]:
-        """The groups that you may know of."""
-        return list(self._session.ask("GET", "/v1/groups"))
-
-    def read_group(self, group_name: str) -> dict[str, Any]:
-        """A group and its members."""
-        return dict(self._session.ask("GET", f"/v1/groups/{_name(group_name)}"))
-
-    def delete_group(self, group_name: str) -> None:
-        """Delete a group."""
-        self._session.ask("DELETE", f"/v1/groups/{_name(group_name)}")
-
-    def add_group_members(self, group_name: str, members: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """Give users roles in a group: `[{"user": "ann", "roles": ["member"]}]`."""
-        return dict(self._session.ask("PUT", f"/v1/groups/{_name(group_name)}/members", list(members)))
-
-    def remove_group_members(self, group_name: str, users: Sequence[str]) -> None:
-        """Take users out of a group."""
-        for user in users:
-            self._session.ask("DELETE", f"/v1/groups/{_name(group_name)}/members/{_name(user)}")
-
-    def create_role(self, role: str, rights: Sequence[str], description: str | None = None) -> dict[str, Any]:
-        """Make a role."""
-        told = {"role": role, "rights": list(rights), "description": description}
-        return dict(self._session.ask("POST", "/v1/roles", told))
-
-    def list_roles(self) -> list[dict[str, Any]]:
-        """All roles."""
-        return list(self._session.ask("GET", "/v1/roles"))
-
-    def delete_role(self, role_name: str) -> None:
-        """Delete a role, wherever it was given."""
-        self._session.ask("DELETE", f"/v1/roles/{_name(role_name)}")
-
     # --- helpers ---
+
+    def _listed(self, path: str, model: type[_Model], told: dict[str, Any]) -> list[_Model]:
+        return [as_told(model, item) for item in pages(self._session, path, told)]
+
+    def _count(self, method: str, path: str, told: Any = None, **options: Any) -> int:
+        """How many episodes the server has changed; 0 where it had done so already, and the answer was lost."""
+        answer = self._session.ask(method, path, told, **options)
+        return 0 if answer is None else as_told(dict[str, int], answer)["episodes"]
 
     def _publish(self, kind: str, uri: str, group: str) -> None:
         published_in([], group)
@@ -385,13 +340,6 @@ class TupliAPIClient(TupliStorage):
 
     def _unpublish(self, kind: str, uri: str, group: str) -> None:
         self._session.ask("DELETE", f"/v1/{kind}/{uri}/published", group=group)
-
-    @staticmethod
-    def _told(what: str, ask: Any) -> Any:
-        try:
-            return ask()
-        except TupliError as err:
-            raise StorageError(f"{what}: {err}") from err
 
 
 def _listing(filter: BaseFilter | None, model: Any) -> dict[str, Any]:
@@ -414,8 +362,3 @@ def _episode(uri: str) -> str:
 
 def _unknown(kind: str, uri: object) -> NotFoundError:
     return NotFoundError(f"there is no {kind} with id {str(uri)[:80]!r}; list_{kind}s() names them all")
-
-
-def _name(name: str) -> str:
-    """A name in a path."""
-    return quote(name, safe="")

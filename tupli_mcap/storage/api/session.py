@@ -1,78 +1,129 @@
-"""Requests to a server, signed in: tokens are kept for this user alone, and renewed when they have expired."""
+"""Requests to a server, signed in: tokens are renewed when they have expired, and what fails on the way is tried again
+where asking twice is as asking once."""
 
 from __future__ import annotations
 
-import contextlib
 import json
+import logging
 import os
+import re
 import time
 import weakref
 from collections.abc import Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import urlsplit
 
-from tupli_mcap import errors, files, jsonvalue, trust
-from tupli_mcap.errors import NotFoundError, StorageError, TupliError, missing_extra
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from tupli_mcap import errors, jsonvalue, trust
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError, missing_extra
 from tupli_mcap.remote import shown
-from tupli_mcap.storage.atomic import Lock
+from tupli_mcap.storage.api.tokens import TokenStore
+from tupli_mcap.storage.texts import first_defect
 
 if TYPE_CHECKING:
     import httpx
 
-__all__ = ["DEFAULT_URL", "Session", "UnreachableError"]
+__all__ = [
+    "DEFAULT_URL",
+    "TIMEOUT",
+    "ConflictError",
+    "Session",
+    "SignInError",
+    "UnreachableError",
+    "as_told",
+    "pages",
+]
 
 DEFAULT_URL: Final = "http://127.0.0.1:8080"
+TIMEOUT: Final = 60.0  # seconds without a byte
+_CONNECT_TIMEOUT: Final = 10.0
 _ATTEMPTS: Final = 4  # of a request that changes nothing when it is sent twice
-_TIMEOUT: Final = 60.0
 _SAFE: Final = ("GET", "HEAD", "PUT", "DELETE")
+_LATER: Final = (423, 429, 500, 502, 503, 504)
 _URL_VARIABLE: Final = "TUPLI_MCAP_URL"
 _TOKEN_VARIABLE: Final = "TUPLI_MCAP_TOKEN"
+_T = TypeVar("_T")
+_users: dict[tuple[str, str], str] = {}  # by server and token of the environment
 
 
 class UnreachableError(StorageError):
-    """The server does not answer."""
+    """The server does not answer, or not now."""
+
+
+class ConflictError(StorageError):
+    """Something else is there already."""
+
+
+class SignInError(StorageError):
+    """Nobody is signed in."""
 
 
 class Session:
-    """Requests to one server, from any thread.
+    """Requests to one server, from any thread and any fork of the process.
 
-    Tokens lie in `servers.json` in the directory of this user's configuration, by the server's address. A token in
-    the environment (TUPLI_MCAP_TOKEN) comes before them.
+    A token in the environment (TUPLI_MCAP_TOKEN) comes before those that are kept.
 
     Raises:
         StorageError: the address is none of a web server.
         MissingExtraError: httpx is not installed.
     """
 
-    def __init__(self, url: str | None = None, tokens: _TokenFile | None = None) -> None:
+    def __init__(self, url: str | None = None, tokens: TokenStore | None = None) -> None:
         try:
-            import httpx
+            import httpx  # noqa: F401
         except ImportError as err:
             raise missing_extra("a storage on a server needs httpx", "remote") from err
-        self._tokens = tokens or _TokenFile(trust.config_dir() / "servers.json")
-        self.url = _checked(url or os.environ.get(_URL_VARIABLE) or self._tokens.last() or DEFAULT_URL)
-        self._client = client = httpx.Client(
-            base_url=self.url, timeout=_TIMEOUT, headers={"Accept": "application/json"}
-        )
+        self.tokens = tokens or TokenStore(trust.config_dir() / "servers.json")
+        self.url = _checked(url or os.environ.get(_URL_VARIABLE) or self.tokens.last() or DEFAULT_URL)
+        self._closed = False
+        self._process = os.getpid()
+        self._client = self._connected()
+
+    def _connected(self) -> httpx.Client:
+        import httpx
+
+        _hide_tickets()
+        timeout = httpx.Timeout(TIMEOUT, connect=_CONNECT_TIMEOUT)
+        client = httpx.Client(base_url=self.url, timeout=timeout, headers={"Accept": "application/json"})
         weakref.finalize(self, client.close)
+        return client
+
+    @property
+    def client(self) -> httpx.Client:
+        """The connections of this process."""
+        if self._closed:
+            raise StorageError("the client is closed; open another one")
+        if self._process != os.getpid():  # a fork, in which those of its parent are not to be used
+            self._client, self._process = self._connected(), os.getpid()
+        return self._client
 
     def another(self) -> Session:
         """One of the same server and user, with connections of its own."""
-        return Session(self.url, self._tokens)
+        return Session(self.url, self.tokens)
+
+    @property
+    def known_user(self) -> str | None:
+        """Who is signed in, empty if nobody is; None while nobody knows whose the token in the environment is."""
+        token = os.environ.get(_TOKEN_VARIABLE)
+        return _users.get((self.url, token)) if token else self.tokens.username(self.url)
+
+    @property
+    def username(self) -> str:
+        """Who is signed in; empty if nobody is. Asks the server whose the token in the environment is."""
+        if self.known_user is None:
+            me = as_told(dict[str, Any], self.ask("GET", "/v1/me"))
+            _users[self.url, os.environ[_TOKEN_VARIABLE]] = str(me.get("username", ""))
+        return self.known_user or ""
 
     @property
     def identity(self) -> tuple[str, str, str]:
         """Equal for sessions of one server and user, whose tokens lie at one place."""
-        return self.url, self.username, str(self._tokens.path)
-
-    @property
-    def username(self) -> str:
-        """Who is signed in; empty if nobody is."""
-        return str(self._tokens.of(self.url).get("username", ""))
+        return self.url, self.username, str(self.tokens.path)
 
     def close(self) -> None:
         """Close the connections; asking anything afterwards is a StorageError."""
+        self._closed = True
         self._client.close()
 
     # --- signing in ---
@@ -80,32 +131,32 @@ class Session:
     def sign_in(self, username: str, password: str) -> None:
         """Gets tokens for a user, and keeps them."""
         pair = self.ask("POST", "/v1/tokens", {"username": username, "password": password}, anonymous=True)
-        self._tokens.put(self.url, {"username": username, **pair})
+        self.tokens.put(self.url, username, as_told(dict[str, Any], pair))
 
     def sign_out(self) -> None:
         """Ends the sign-in, here and on the server."""
-        refresh = self._tokens.of(self.url).get("refresh_token")
-        self._tokens.put(self.url, None)
+        refresh = self.tokens.tokens(self.url).get("refresh_token")
+        self.tokens.forget(self.url)
         if refresh:
             self.ask("POST", "/v1/tokens/end", {"refresh_token": refresh}, anonymous=True)
 
     def _renew(self, used: str) -> bool:
         """Exchanges the refresh token, unless another process has just done so; False if there is nothing to use."""
-        with self._tokens.alone():
-            known = self._tokens.of(self.url)
+        with self.tokens.alone():
+            known = self.tokens.tokens(self.url)
             if known.get("access_token") not in (None, used):
                 return True
             if "refresh_token" not in known:
                 return False
-            told = {"refresh_token": known["refresh_token"]}
+            refresh = {"refresh_token": known["refresh_token"]}
             try:
-                pair = self.ask("POST", "/v1/tokens/refresh", told, anonymous=True)
+                pair = self.ask("POST", "/v1/tokens/refresh", refresh, anonymous=True)
             except UnreachableError:
                 raise
             except TupliError:
-                self._tokens.put(self.url, None)
+                self.tokens.forget(self.url)
                 return False
-            self._tokens.put(self.url, {"username": known["username"], **pair})
+            self.tokens.put(self.url, self.tokens.username(self.url), as_told(dict[str, Any], pair))
             return True
 
     # --- asking ---
@@ -116,20 +167,28 @@ class Session:
         path: str,
         told: Any = None,
         *,
+        content: bytes | None = None,
+        headers: dict[str, str] | None = None,
         anonymous: bool = False,
         repeat: bool | None = None,
         **query: Any,
     ) -> Any:
-        """What the server answers to a JSON body, as a value; the errors that it tells are raised as they are named.
+        """What the server answers to a JSON body, or to `content`, as a value; its refusals are raised as errors.
 
         repeat: whether to ask again where the connection fails; by default, where the method says so.
         """
-        headers = {"Content-Type": "application/json"}
-        content = None if told is None else jsonvalue.dumps(told).encode()
+        if content is None and told is not None:
+            content = jsonvalue.dumps(told).encode()
+        headers = {"Content-Type": "application/json", **(headers or {})}
         response = self.send(
             method, path, content=content, headers=headers, params=query, anonymous=anonymous, repeat=repeat
         )
-        return jsonvalue.loads(response.content) if response.content else None
+        try:
+            return jsonvalue.loads(response.content) if response.content else None
+        except (ValueError, FormatError, RecursionError):
+            raise StorageError(
+                f"expected JSON from {shown(self.url)}, found something else; is it a tupli-mcap server?"
+            ) from None
 
     def send(
         self,
@@ -141,15 +200,13 @@ class Session:
         headers: dict[str, str] | None = None,
         **options: Any,
     ) -> httpx.Response:
-        """A request, again if the connection fails and it may be repeated; refusals are raised as errors."""
+        """A request, again if it fails on the way and may be repeated; refusals are raised as errors."""
         token = "" if anonymous else self._token()
         response = self._sent(method, path, token, repeat, headers or {}, options)
         if response.status_code == 401 and not anonymous and self._renew(token):
             response = self._sent(method, path, self._token(), repeat, headers or {}, options)
-        if response.status_code == 401 and not anonymous:
-            raise StorageError(f"{_error(response)}; sign in: tupli-mcap login USER --url {self.url}")
         if response.status_code >= 400:
-            raise _error(response)
+            raise self._error(response, anonymous)
         return response
 
     def _sent(
@@ -159,14 +216,16 @@ class Session:
 
         if token:
             headers = {**headers, "Authorization": f"Bearer {token}"}
-        if self._client.is_closed:
-            raise StorageError("the client is closed; open another one")
-        attempts = _ATTEMPTS if (method in _SAFE if repeat is None else repeat) else 1
-        for attempt in range(attempts):
+        last = (_ATTEMPTS if (method in _SAFE if repeat is None else repeat) else 1) - 1
+        for attempt in range(last + 1):
             try:
-                return self._client.request(method, path, headers=headers, **options)
+                response = self.client.request(method, path, headers=headers, **options)
+                if attempt and method == "DELETE" and response.status_code == 404:
+                    return httpx.Response(204)  # it was deleted, and the answer was lost
+                if attempt == last or response.status_code not in _LATER:
+                    return response
             except httpx.TransportError as err:
-                if attempt == attempts - 1:
+                if attempt == last:
                     raise UnreachableError(
                         f"{shown(self.url)} does not answer: {err}; is the server running, and the address right?"
                     ) from None
@@ -174,43 +233,57 @@ class Session:
         raise UnreachableError(f"{shown(self.url)} does not answer")
 
     def _token(self) -> str:
-        return os.environ.get(_TOKEN_VARIABLE) or str(self._tokens.of(self.url).get("access_token", ""))
+        return os.environ.get(_TOKEN_VARIABLE) or self.tokens.tokens(self.url).get("access_token", "")
 
-
-class _TokenFile:
-    """Tokens by server, readable by this user alone."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._lock = Lock(path.with_name(f"{path.name}.lock"))
-
-    def alone(self) -> contextlib.AbstractContextManager[object]:
-        """Keeps out the other processes and threads; reentrant in a thread."""
-        return self._lock
-
-    def of(self, url: str) -> dict[str, Any]:
-        """What is kept for a server."""
-        found = self._read().get(url)
-        return found if isinstance(found, dict) else {}
-
-    def last(self) -> str:
-        """The server that was signed in to last; empty if there is none."""
-        return next(reversed(self._read()), "")
-
-    def put(self, url: str, tokens: dict[str, Any] | None) -> None:
-        """Keeps the tokens of a server, or forgets them."""
-        with self._lock:
-            known = {name: kept for name, kept in self._read().items() if name != url}
-            if tokens is not None:
-                known[url] = tokens
-            files.write_bytes(self.path, json.dumps(known, indent=2).encode(), permissions=0o600)
-
-    def _read(self) -> dict[str, Any]:
+    def _error(self, response: httpx.Response, anonymous: bool) -> TupliError:
+        """The error that the server tells, of the class that a storage here would raise."""
+        status = response.status_code
         try:
-            found = json.loads(self.path.read_bytes())
-        except (OSError, ValueError):
-            return {}
-        return found if isinstance(found, dict) else {}
+            told = json.loads(response.content)
+            detail, name = str(told["detail"]), str(told.get("error", ""))
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            detail, name = f"it answers {status}", ""
+        detail = "".join(c if c.isprintable() else " " for c in detail[:2000])
+        message = f"{detail} (says {shown(self.url)})"
+        if status == 401 and not anonymous:
+            return SignInError(f"{message}; sign in: tupli-mcap login USER --url {shown(self.url)}")
+        if status in (410, 460, *_LATER) or "Upload-Offset" in response.headers:
+            return UnreachableError(f"{message}; try again later")
+        if status == 409:
+            return ConflictError(message)
+        kind = getattr(errors, name, StorageError) if name in errors.__all__ else StorageError
+        if not issubclass(kind, TupliError) or kind is TupliError:
+            kind = NotFoundError if status == 404 else StorageError
+        return kind(message)
+
+
+def as_told(kind: type[_T], value: Any) -> _T:
+    """What a server tells, as a model, or a list of them. StorageError if it is something else."""
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError as err:
+        raise StorageError(
+            f"expected {getattr(kind, '__name__', kind)} from the server, found something else: {first_defect(err)}"
+        ) from err
+
+
+class _NoTickets(logging.Filter):
+    """httpx logs addresses; that of a recording opens it for whoever reads the log."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if isinstance(record.args, tuple):
+            record.args = tuple(
+                re.sub("ticket=[^&]+", "ticket=…", str(arg)) if "ticket=" in str(arg) else arg
+                for arg in record.args
+            )
+        return True
+
+
+_NO_TICKETS: Final = _NoTickets()
+
+
+def _hide_tickets() -> None:
+    logging.getLogger("httpx").addFilter(_NO_TICKETS)  # added twice, it is there once
 
 
 def _checked(url: str) -> str:
@@ -222,28 +295,18 @@ def _checked(url: str) -> str:
     return url.rstrip("/")
 
 
-def _error(response: httpx.Response) -> TupliError:
-    """The error that a server tells, of the class that a storage here would raise."""
-    try:
-        told = json.loads(response.content)
-        detail, name = str(told["detail"]), str(told.get("error", ""))
-    except (ValueError, KeyError, TypeError, AttributeError):
-        detail, name = f"the server answers {response.status_code}", ""
-    if response.status_code in (410, 423, 429, 502, 503, 504):
-        return UnreachableError(f"the server is busy: {detail[:300]!r}")
-    kind = getattr(errors, name, StorageError) if name in errors.__all__ else StorageError
-    if not issubclass(kind, TupliError) or kind is TupliError:
-        kind = NotFoundError if response.status_code == 404 else StorageError
-    return kind("".join(c if c.isprintable() else " " for c in detail[:2000]))
-
-
-def pages(session: Session, path: str, told: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """All that is listed, a page at a time; `limit` and `offset` in `told` are of the whole."""
-    left = told.get("limit")
+def pages(session: Session, path: str, asked: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """All that is listed, a page at a time; `limit` and `offset` in `asked` are of the whole."""
+    left = asked.get("limit")
     while True:
-        page = session.ask("POST", path, {**told, "limit": left}, repeat=True)
-        yield from page["items"]
-        left = None if left is None else left - len(page["items"])
-        if page["next"] is None or left == 0:
+        page = as_told(_Page, session.ask("POST", path, {**asked, "limit": left}, repeat=True))
+        yield from page.items
+        left = None if left is None else left - len(page.items)
+        if page.next is None or left == 0:
             return
-        told = {**told, "cursor": page["next"], "offset": 0}
+        asked = {**asked, "cursor": page.next, "offset": 0}
+
+
+class _Page(BaseModel):
+    items: list[dict[str, Any]]
+    next: str | None

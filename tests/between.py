@@ -1,0 +1,152 @@
+"""A proxy between a client and a server on this machine, which counts bytes and breaks connections as it is told to."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+from collections import deque
+from collections.abc import Iterator
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+__all__ = ["Between", "Fault", "between"]
+
+
+class Fault(NamedTuple):
+    """What happens to a connection.
+
+    kind: "pass"; "refuse": it is closed at once; "reset": after so many bytes, in both directions counted together;
+        "stall": nothing is passed on after them; "5xx": the first request is answered 503; "flip": a bit of the byte of
+        that number is turned over on its way to the client, "flip up": to the server.
+    """
+
+    kind: str = "pass"
+    after: int = 0
+
+
+class Between:
+    """Accepts connections on `url`. `faults` are those of the next connections; `up`, `down`: bytes from and to clients
+    that have come through; `away`: nobody listens."""
+
+    def __init__(self, target: str) -> None:
+        parts = urlsplit(target)
+        self._target = (parts.hostname, parts.port)
+        self.faults: deque[Fault] = deque()
+        self.up = self.down = 0
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+        self._open: set[socket.socket] = set()
+        self._closed = threading.Event()
+        threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
+
+    def go_away(self) -> None:
+        """Refuses connections, and ends those that there are."""
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self.drop()
+
+    def come_back(self) -> None:
+        """Accepts connections again."""
+        self._listener = socket.create_server(("127.0.0.1", self.port))
+        threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
+
+    def drop(self) -> None:
+        """Ends all connections."""
+        for each in list(self._open):
+            _reset(each)
+
+    def close(self) -> None:
+        self._closed.set()
+        self.go_away()
+
+    def _accept(self, listener: socket.socket) -> None:
+        while True:
+            try:
+                client, _ = listener.accept()
+            except OSError:
+                return
+            fault = self.faults.popleft() if self.faults else Fault()
+            threading.Thread(target=self._serve, args=(client, fault), daemon=True).start()
+
+    def _serve(self, client: socket.socket, fault: Fault) -> None:
+        if fault.kind == "refuse":
+            _reset(client)
+            return
+        if fault.kind == "5xx":
+            with contextlib.suppress(OSError):
+                client.recv(1 << 16)
+                client.sendall(
+                    b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 4\r\nConnection: close\r\n\r\nbusy"
+                )
+                client.shutdown(socket.SHUT_WR)
+                while client.recv(1 << 16):
+                    pass
+            client.close()
+            return
+        try:
+            server = socket.create_connection(self._target)
+        except OSError:
+            _reset(client)
+            return
+        self._open |= {client, server}
+        passed = [0]
+        threads = [
+            threading.Thread(target=self._pass, args=(client, server, fault, passed, True), daemon=True),
+            threading.Thread(target=self._pass, args=(server, client, fault, passed, False), daemon=True),
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        for each in (client, server):
+            self._open.discard(each)
+            each.close()
+
+    def _pass(
+        self, source: socket.socket, goal: socket.socket, fault: Fault, passed: list[int], up: bool
+    ) -> None:
+        flips, own = fault.kind == ("flip up" if up else "flip"), 0
+        with contextlib.suppress(OSError):
+            while data := source.recv(1 << 16):
+                if fault.kind in ("reset", "stall") and passed[0] + len(data) > fault.after:
+                    goal.sendall(data[: max(0, fault.after - passed[0])])
+                    if fault.kind == "stall":
+                        self._closed.wait()
+                    _reset(source)
+                    break
+                if flips and own <= fault.after < own + len(data):
+                    at = fault.after - own
+                    data = data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+                own += len(data)
+                passed[0] += len(data)
+                goal.sendall(data)
+                if up:
+                    self.up += len(data)
+                else:
+                    self.down += len(data)
+        for each, how in ((goal, socket.SHUT_WR),):
+            with contextlib.suppress(OSError):
+                each.shutdown(how)
+        if fault.kind == "reset" and passed[0] >= fault.after:
+            _reset(goal)
+
+
+def _reset(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.shutdown(socket.SHUT_RDWR)
+    connection.close()
+
+
+@contextlib.contextmanager
+def between(target: str) -> Iterator[Between]:
+    """A proxy for as long as the block is entered."""
+    proxy = Between(target)
+    try:
+        yield proxy
+    finally:
+        proxy.close()

@@ -1,0 +1,211 @@
+"""Recording to a server: written here first and sent behind, whatever becomes of the network and of the process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from between import Between, between
+from serving import PASSWORD, serving
+
+from tupli_mcap import TupliEnvWrapper
+from tupli_mcap.errors import StorageError
+from tupli_mcap.schema import F
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.storage.api import TupliAPIClient
+
+
+@pytest.fixture
+def proxy(tmp_path: Path) -> Iterator[Between]:
+    with serving(Settings(tmp_path / "served")) as url, between(url) as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def admin(proxy: Between) -> Iterator[TupliAPIClient]:
+    with TupliAPIClient(proxy.url) as client:
+        client.login("admin", PASSWORD)
+        yield client
+
+
+@pytest.fixture
+def env(admin: TupliAPIClient) -> Iterator[TupliEnvWrapper]:
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), admin)
+    env.store(name="cart")
+    yield env
+    env.close()
+
+
+def roll(env: TupliEnvWrapper, episodes: int, first_seed: int = 0) -> None:
+    for seed in range(first_seed, first_seed + episodes):
+        env.reset(seed=seed)
+        env.action_space.seed(seed)
+        while not env.step(env.action_space.sample())[2]:
+            pass
+
+
+def wait_for(done: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 120
+    while not done():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def waiting(client: TupliAPIClient) -> int:
+    return len(client._outbox.waiting())
+
+
+def test_episodes_are_sent_once_while_they_are_recorded_and_once_with_the_whole(
+    proxy: Between, admin: TupliAPIClient, env: TupliEnvWrapper
+) -> None:
+    roll(env, 150)
+    before = proxy.up
+    assert admin.count_episodes() == 150
+    first = proxy.up - before
+    for i in range(10):
+        roll(env, 1, 150 + i)
+        assert admin.count_episodes() == 151 + i
+    assert proxy.up - before < 3 * first  # and not 11 times as much
+    listed = admin.list_episodes()
+    assert [header.episode for header in listed] == list(range(160))
+    assert len({header.recording for header in listed}) == 11
+    env.close()
+    whole = admin.list_episodes()
+    assert [header.id for header in whole] == [header.id for header in listed]
+    assert len({header.recording for header in whole}) == 1
+    with admin.open_recording(listed[-1].recording) as recording:  # by the name of a part that is no more
+        assert len(recording) == 160
+    assert waiting(admin) == 0
+
+
+def test_what_was_deleted_does_not_come_back_with_the_whole(
+    admin: TupliAPIClient, env: TupliEnvWrapper
+) -> None:
+    roll(env, 3)
+    assert admin.delete_episodes(F("episode") <= 2) == 3  # all that there are: nothing is left of them
+    roll(env, 2)
+    env.reset()
+    env.step(0)
+    admin.delete_episodes(F("episode") == 3)
+    env.close()
+    assert [header.episode for header in admin.list_episodes()] == [4, 5]
+
+
+def test_recording_neither_waits_for_a_server_that_is_away_nor_fails(
+    proxy: Between, admin: TupliAPIClient
+) -> None:
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), admin, max_bytes=1)  # each episode in a file of its own
+    env.store(name="cart")
+    proxy.go_away()
+    roll(env, 3)
+    with pytest.raises(StorageError, match="does not answer"):
+        admin.flush()
+    env.close()
+    assert waiting(admin) == 3
+    proxy.come_back()
+    wait_for(lambda: not waiting(admin))  # nobody asks
+    assert len(admin.list_episodes()) == 3
+
+
+def test_another_url_loses_nothing_and_is_quiet(
+    proxy: Between, admin: TupliAPIClient, env: TupliEnvWrapper
+) -> None:
+    url = admin.url
+    proxy.go_away()
+    roll(env, 2)
+    env.close()
+    admin.set_url("http://127.0.0.1:9")
+    assert TupliAPIClient().url == "http://127.0.0.1:9"
+    with pytest.raises(StorageError, match="http://127.0.0.1:9 does not answer"):
+        admin.list_benchmarks()
+    admin.set_url(url)
+    proxy.come_back()
+    assert admin.count_episodes() == 2
+
+
+RECORDS = """
+import os, sys
+import gymnasium as gym
+from tupli_mcap import TupliEnvWrapper
+from tupli_mcap.storage import TupliAPIClient
+
+client = TupliAPIClient(sys.argv[1])
+env = TupliEnvWrapper(gym.make("CartPole-v1"), client, chunk_size=3000 if "chunks" in sys.argv else 1 << 18)
+env.store(name="cart")
+for seed in range(30 if "chunks" in sys.argv else 3):
+    env.reset(seed=seed)
+    while not env.step(env.action_space.sample())[2]:
+        pass
+    if seed % 10 == 1 and "asks" in sys.argv:
+        print(client.count_episodes(), flush=True)
+env.reset(seed=3)
+env.step(0)
+print("recorded", flush=True)
+sys.stdin.readline()
+"""
+
+
+def records(url: str, *words: str) -> subprocess.Popen[str]:
+    """A process that has recorded three episodes and a step, and waits for a line."""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-c", RECORDS, url, *words], **pipes)
+    for line in process.stdout or ():
+        if line == "recorded\n":
+            return process
+    raise AssertionError(process.stderr and process.stderr.read())
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.communicate()
+
+
+@pytest.mark.parametrize("words", [(), ("asks",)], ids=str)
+def test_what_a_killed_process_has_recorded_is_finished_and_sent_by_the_next(
+    proxy: Between, admin: TupliAPIClient, words: tuple[str, ...]
+) -> None:
+    process = records(proxy.url, *words)
+    kill(process)
+    (left,) = admin._outbox.waiting()
+    assert left.state == "unfinished"
+    admin._outbox.send_left()  # as a client that is made next does
+    wait_for(lambda: not waiting(admin))
+    headers = admin.list_episodes()
+    assert [header.end for header in headers] == ["terminal"] * 3 + ["interrupted"]  # type: ignore[union-attr]
+    assert len({header.recording for header in headers}) == 1
+
+
+def test_a_program_that_ends_has_sent_what_it_recorded(proxy: Between, admin: TupliAPIClient) -> None:
+    process = records(proxy.url)
+    _, errors = process.communicate("\n", timeout=120)
+    assert (process.returncode, errors) == (0, "")
+    assert admin.count_episodes() >= 3
+
+
+def test_a_program_that_ends_while_the_server_is_away_says_what_waits(
+    proxy: Between, admin: TupliAPIClient
+) -> None:
+    process = records(proxy.url)
+    proxy.go_away()
+    _, errors = process.communicate("\n", timeout=120)
+    assert process.returncode == 0
+    assert "tupli-mcap push sends it" in errors
+    assert "Traceback" not in errors
+    proxy.come_back()
+    assert waiting(admin) == 1
+
+
+def test_damaged_recordings_are_saved_as_far_as_they_can_be(proxy: Between, admin: TupliAPIClient) -> None:
+    kill(records(proxy.url, "chunks", "asks"))
+    (left,) = admin._outbox.waiting()
+    Path(f"{left.path}.journal").unlink(missing_ok=True)
+    with pytest.warns(RuntimeWarning, match="was damaged: what could be saved"):
+        admin._outbox.flush(everything=True)
+    assert admin.count_episodes() >= 22  # which had been sent
+    assert waiting(admin) == 0
+    assert [path.name for path in (admin._outbox.directory / "damaged").rglob("*.mcap")] == [left.path.name]

@@ -1,0 +1,97 @@
+"""Users, groups, roles and tokens of a server, as PyTupli names them."""
+
+from __future__ import annotations
+
+import enum
+from typing import Final
+
+from pydantic import BaseModel, Field
+
+
+class Right(enum.StrEnum):
+    """What a role may allow."""
+
+    BENCHMARK_CREATE = "benchmark_create"
+    BENCHMARK_READ = "benchmark_read"
+    BENCHMARK_DELETE = "benchmark_delete"
+    ARTIFACT_CREATE = "artifact_create"
+    ARTIFACT_READ = "artifact_read"
+    ARTIFACT_DELETE = "artifact_delete"
+    EPISODE_CREATE = "episode_create"
+    EPISODE_READ = "episode_read"
+    EPISODE_DELETE = "episode_delete"
+    USER_CREATE = "user_create"
+    USER_READ = "user_read"
+    USER_UPDATE = "user_update"
+    USER_DELETE = "user_delete"
+    GROUP_CREATE = "group_create"
+    GROUP_READ = "group_read"
+    GROUP_UPDATE = "group_update"
+    GROUP_DELETE = "group_delete"
+    ROLE_MANAGEMENT = "role_management"
+
+
+RIGHT: Final = Right
+"""The name that it has in PyTupli."""
+
+
+class Membership(BaseModel):
+    """The roles that a user holds in a group."""
+
+    group: str
+    roles: list[str]
+
+
+class UserOut(BaseModel):
+    """A user, and in which groups."""
+
+    username: str
+    memberships: list[Membership] = Field(default_factory=list)
+
+
+class UserRole(BaseModel):
+    """A role and the rights that it gives."""
+
+    role: str
+    rights: list[Right]
+    description: str | None = None
+
+
+class Group(BaseModel):
+    """A group of users."""
+
+    name: str
+    description: str | None = None
+
+
+class GroupMembership(BaseModel):
+    """A user of a group; without roles, a `member`, or all of their roles."""
+
+    user: str
+    roles: list[str] | None = None
+
+
+class GroupMembershipQuery(BaseModel):
+    """Users who are to come into a group, or to leave it."""
+
+    group_name: str
+    members: list[GroupMembership]
+
+
+class GroupWithMembers(Group):
+    """A group and who is in it, as far as the caller may know; `roles` are those of each member."""
+
+    members: list[str] = Field(default_factory=list)
+    roles: dict[str, list[str]] = Field(default_factory=dict)
+
+
+class ApiToken(BaseModel):
+    """A token for a machine. scope: `read` or `write`. created_at, expires: ISO 8601 in UTC; expires is None for one
+    that never does. token: what it is, known once, when it is made."""
+
+    id: str
+    name: str
+    scope: str
+    created_at: str
+    expires: str | None
+    token: str = Field("", repr=False)

@@ -1,0 +1,264 @@
+"""Recordings that wait for a server: written here first, and sent behind by one thread, which tries again for as long
+as the server is away.
+
+1. They lie below the directory of this user's data, by server and user, until the server has acknowledged them.
+2. One that nobody writes to and that was not finished is what a killed process has left: it is finished first.
+3. Whoever sends one holds its lock, as a writer would: of several processes one sends it, the others wait for that.
+4. What is damaged is saved as far as it can be, and the original is put below `damaged/`.
+5. Who asks the server something while a recording goes on sends the episodes that have ended since, as a recording of
+   their own with its UUID. The server takes it for a part, and the finished recording for all of its parts. How many
+   episodes have gone is noted beside it, so that those that are deleted there do not come back with the whole.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import datetime
+import hashlib
+import json
+import os
+import secrets
+import threading
+import time
+import warnings
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import platformdirs
+
+from tupli_mcap import files
+from tupli_mcap.errors import TupliError
+from tupli_mcap.recording import Recording, journal_path, rewrite_recording
+from tupli_mcap.storage.api.session import ConflictError, Session, SignInError, UnreachableError
+from tupli_mcap.storage.api.upload import Tell, send_file
+from tupli_mcap.storage.api.waiting import BusyError, finished, kept, note, numbers_of, sent_before, state_of
+from tupli_mcap.storage.atomic import os_errors
+from tupli_mcap.storage.catalog.entries import rows_of
+from tupli_mcap.storage.sidecar import Sidecar
+
+__all__ = ["Outbox", "Waiting", "outbox_of"]
+
+_DATA_VARIABLE: Final = "TUPLI_MCAP_DATA_DIR"
+_MOST_PAUSE: Final = 60.0  # seconds between two attempts
+_POLL: Final = 0.05  # seconds until it is looked again whether another process has sent a file
+
+_outboxes: dict[tuple[int, tuple[str, ...]], Outbox] = {}
+_turn = threading.Lock()
+
+
+def _forget_turn() -> None:
+    global _turn
+    _turn = threading.Lock()  # another thread of the parent may have held it
+
+
+os.register_at_fork(after_in_child=_forget_turn)
+
+
+def outbox_of(session: Session) -> Outbox:
+    """The outbox of a session's server and user: one in a process, however many clients there are. What is left in it
+    is sent."""
+    with _turn:
+        key = (os.getpid(), session.identity)
+        if key not in _outboxes:
+            _outboxes[key] = Outbox(session.another())
+            _outboxes[key].send_left()
+        return _outboxes[key]
+
+
+class Waiting(NamedTuple):
+    """A recording that the server does not have yet; state: `recording`, `finished` or `unfinished`."""
+
+    path: Path
+    size: int
+    state: str
+
+
+class Outbox:
+    """The recordings that a user sends to a server. Usable from any thread."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._identity = session.identity
+        self.directory = _data_dir() / "outbox" / _digest(f"{session.url}\n{session.username}")
+        self._turn = threading.Condition()
+        self._behind: dict[Path, None] = {}  # what the thread has to send, in order
+        self._thread: threading.Thread | None = None
+        self._given: set[str] = set()  # stems of the names that this process records to
+        self._refused: dict[Path, TupliError] = {}  # of these, what the server does not take
+        self._alone: defaultdict[Path, threading.Lock] = defaultdict(threading.Lock)
+
+    def new_path(self, benchmark_id: str, name: str) -> Path:
+        """Where a recording may be written; nothing is there yet."""
+        directory = self.directory / benchmark_id
+        with os_errors("cannot make the directory", directory):
+            directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+        now = datetime.datetime.now(datetime.UTC)
+        named = f"{files.as_file_name(name)}-" if name else ""
+        path = directory / f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
+        with self._turn:
+            if not self._given:
+                atexit.register(self._send_at_exit, os.getpid())
+            self._given.add(path.stem)
+        return path
+
+    def waiting(self) -> list[Waiting]:
+        """What the server does not have yet."""
+        found = []
+        for path in self._paths():
+            with contextlib.suppress(FileNotFoundError):
+                found.append(Waiting(path, path.stat().st_size, state_of(path)))
+        return found
+
+    def _paths(self) -> list[Path]:
+        return sorted(self.directory.glob("*/*.mcap"))
+
+    def _is_ours(self, path: Path) -> bool:
+        """Whether this process was given the path, or that of the recording that goes on in it (`run_0001`)."""
+        return not self._given.isdisjoint((path.stem, path.stem.rpartition("_")[0]))
+
+    # --- sending ---
+
+    def send(self, path: Path) -> None:
+        """Sends a finished recording behind."""
+        with self._turn:
+            self._behind[path] = None
+            self._refused.pop(path, None)
+            if self._thread is None or not self._thread.is_alive():
+                self._thread = threading.Thread(target=self._run, name="tupli-mcap-sender", daemon=True)
+                self._thread.start()
+            self._turn.notify_all()
+
+    def send_left(self) -> None:
+        """Sends behind what processes have left that have ended."""
+        if self.directory.is_dir():
+            files.remove_left(files.left_below(self.directory))
+        for path in self._paths():
+            if not self._is_ours(path):
+                self.send(path)
+
+    def flush(self, *, everything: bool = False, tell: Tell = lambda _: None) -> None:
+        """Waits until all that this process has recorded is on the server: of what it records just now, the episodes
+        that have ended.
+
+        everything: also what other processes have left.
+
+        Raises:
+            UnreachableError: the server does not answer; the recordings stay here, and are sent when it does.
+            SignInError: nobody is signed in any more; likewise.
+            StorageError: the server refuses some of it, which stays here.
+        """
+        with self._turn:
+            refused = dict(self._refused)
+        for path in self._paths():
+            if path in refused or not (everything or self._is_ours(path)):
+                continue
+            try:
+                self._send_now(path, tell)
+            except (UnreachableError, SignInError):
+                raise
+            except TupliError as err:
+                refused[path] = err
+        with self._turn:
+            self._refused = {}
+        for path, why in refused.items():
+            raise type(why)(
+                f"{path} was not sent, and is kept: {why}; tupli-mcap push tries again, or delete it"
+            ) from why
+
+    def _run(self) -> None:
+        pause = 1.0
+        while True:
+            with self._turn:
+                self._turn.wait_for(lambda: self._behind)
+                path = next(iter(self._behind))
+            try:
+                self._send_now(path)
+            except (UnreachableError, SignInError):
+                time.sleep(pause)
+                pause = min(2 * pause, _MOST_PAUSE)
+                continue
+            except TupliError as err:
+                if self._is_ours(path):
+                    self._refused[path] = err
+                warnings.warn(f"{path} was not sent, and is kept: {err}", RuntimeWarning, stacklevel=2)
+            pause = 1.0
+            with self._turn:
+                self._behind.pop(path, None)
+
+    def _send_now(self, path: Path, tell: Tell = lambda _: None) -> None:
+        """Sends what there is of a recording, or waits while another thread or process does."""
+        if self._session.identity != self._identity:
+            raise SignInError(f"{path} is of {self._identity[1] or 'nobody'}, who is not signed in any more")
+        with self._alone[path]:
+            while path.exists():
+                state = state_of(path)
+                if state == "recording":
+                    self._send_ended(path)
+                    return
+                if state == "unfinished":
+                    path = finished(path)
+                with contextlib.suppress(BusyError), kept(path):
+                    self._send_whole(path, tell)
+                    return
+                time.sleep(_POLL)
+
+    def _send_whole(self, path: Path, tell: Tell) -> None:
+        before = sent_before(path)
+        with Recording(path) as recording:
+            if len(recording):
+                try:
+                    send_file(self._session, path, sent_before=before, tell=tell)
+                except (
+                    ConflictError
+                ):  # some of what was sent is not here any more, since the power failed, say
+                    if not before:
+                        raise
+                    self._send_part(path, recording, numbers_of(recording, before))
+        try:
+            for gone in (path, journal_path(path), note(path)):
+                gone.unlink(missing_ok=True)
+        except OSError as err:
+            warnings.warn(f"{path} was sent, and cannot be deleted here: {err}", RuntimeWarning, stacklevel=2)
+
+    def _send_ended(self, path: Path) -> None:
+        """Sends the episodes that have ended, up to the first that goes on, and were not sent yet."""
+        with Recording(path) as recording:
+            ended = {row.episode for row in rows_of(recording, Sidecar(), live=True)}
+            new = []
+            for number in numbers_of(recording, sent_before(path)):
+                if number not in ended:
+                    break
+                new.append(number)
+            self._send_part(path, recording, new)
+
+    def _send_part(self, path: Path, recording: Recording, numbers: Sequence[int]) -> None:
+        if not numbers:
+            return
+        with files.private_directory(path.parent, shown=path) as directory:
+            rewrite_recording(recording, directory / path.name, episodes=numbers)
+            send_file(self._session, directory / path.name)
+        files.write_bytes(note(path), json.dumps({"sent_before": numbers[-1] + 1}).encode())
+
+    def _send_at_exit(self, process: int) -> None:
+        """What a program has recorded is there when it has ended; what cannot be sent now is left for the next."""
+        if os.getpid() != process:
+            return
+        try:
+            self.flush()
+        except (TupliError, KeyboardInterrupt) as err:
+            why = "interrupted" if isinstance(err, KeyboardInterrupt) else err
+            left = f"what was recorded waits in {self.directory} ({why}); tupli-mcap push sends it"
+            warnings.warn(left, RuntimeWarning, stacklevel=2)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _data_dir() -> Path:
+    override = os.environ.get(_DATA_VARIABLE)
+    found = Path(override) if override else platformdirs.user_data_path("tupli-mcap", appauthor=False)
+    return found.absolute()

@@ -1,0 +1,172 @@
+"""Users, groups, roles and tokens of a server: methods of `TupliAPIClient`."""
+
+from __future__ import annotations
+
+import datetime
+from urllib.parse import quote
+
+from pydantic import BaseModel, Field
+
+from tupli_mcap.errors import StorageError, TupliError
+from tupli_mcap.schema import (
+    ApiToken,
+    Group,
+    GroupMembershipQuery,
+    GroupWithMembers,
+    Membership,
+    UserOut,
+    UserRole,
+)
+from tupli_mcap.storage.api.session import Session, SignInError, as_told
+
+__all__ = ["People"]
+
+
+class People:
+    """What a client says to a server of people. Every method may raise StorageError: the caller has not the right."""
+
+    _session: Session
+
+    # --- users ---
+
+    def signup(self, username: str, password: str) -> UserOut:
+        """Make a user: everybody may where the server is open to sign-ups, else who has the right to."""
+        wanted = {"username": username, "password": password}
+        try:
+            try:
+                return _user(as_told(_User, self._session.ask("POST", "/v1/users", wanted)))
+            except SignInError:  # a token that is not valid any more is worse than none
+                return _user(as_told(_User, self._session.ask("POST", "/v1/users", wanted, anonymous=True)))
+        except TupliError as err:
+            raise StorageError(f"Signup failed: {err}") from err
+
+    def whoami(self) -> UserOut:
+        """Who is signed in."""
+        return _user(as_told(_User, self._session.ask("GET", "/v1/me")))
+
+    def list_users(self) -> list[UserOut]:
+        """All users."""
+        return [_user(user) for user in as_told(list[_User], self._session.ask("GET", "/v1/users"))]
+
+    def change_password(self, username: str, new_password: str, *, old: str | None = None) -> None:
+        """Give a user another password; to change one's own, `old` is needed. All sign-ins with the old one end."""
+        wanted = {"password": new_password, "old": old}
+        self._session.ask("PUT", f"/v1/users/{_name(username)}/password", wanted)
+
+    def delete_user(self, username: str) -> None:
+        """Delete a user; what they made stays. Nothing happens if there is none."""
+        self._session.ask("DELETE", f"/v1/users/{_name(username)}")
+
+    # --- groups ---
+
+    def create_group(self, group: Group) -> Group:
+        """Make a group that you lead."""
+        return as_told(Group, self._session.ask("POST", "/v1/groups", group.model_dump()))
+
+    def list_groups(self) -> list[Group]:
+        """The groups that you may know of."""
+        return as_told(list[Group], self._session.ask("GET", "/v1/groups"))
+
+    def read_group(self, group_name: str) -> GroupWithMembers:
+        """A group and its members."""
+        return _group(as_told(_Group, self._session.ask("GET", f"/v1/groups/{_name(group_name)}")))
+
+    def delete_group(self, group_name: str) -> None:
+        """Delete a group; what is published in it is seen by its owners only."""
+        self._session.ask("DELETE", f"/v1/groups/{_name(group_name)}")
+
+    def add_group_members(self, group_membership_query: GroupMembershipQuery) -> GroupWithMembers:
+        """Give users roles in a group, beside those that they hold: all of them, or none."""
+        wanted = [member.model_dump(exclude_none=True) for member in group_membership_query.members]
+        path = f"/v1/groups/{_name(group_membership_query.group_name)}/members"
+        return _group(as_told(_Group, self._session.ask("PUT", path, wanted)))
+
+    def remove_group_members(self, group_membership_query: GroupMembershipQuery) -> GroupWithMembers:
+        """Take users out of a group, with all of their roles; who is not in it is passed over."""
+        name = group_membership_query.group_name
+        for member in group_membership_query.members:
+            self._session.ask("DELETE", f"/v1/groups/{_name(name)}/members/{_name(member.user)}")
+        return self.read_group(name)
+
+    # --- roles ---
+
+    def create_role(self, role: UserRole) -> UserRole:
+        """Make a role."""
+        return as_told(UserRole, self._session.ask("POST", "/v1/roles", role.model_dump(mode="json")))
+
+    def list_roles(self) -> list[UserRole]:
+        """All roles."""
+        return as_told(list[UserRole], self._session.ask("GET", "/v1/roles"))
+
+    def delete_role(self, role_name: str) -> None:
+        """Delete a role, wherever it was given; nothing happens if there is none."""
+        self._session.ask("DELETE", f"/v1/roles/{_name(role_name)}")
+
+    # --- tokens for machines ---
+
+    def create_token(self, name: str, scope: str = "read", days: int | None = 90) -> ApiToken:
+        """Make a token for a machine, which has it in TUPLI_MCAP_TOKEN. It may do what you may: read, or with the scope
+        `write` all of it, for so many days, or for ever.
+
+        Returns:
+            The token; this once with the text that it is.
+        """
+        wanted = {"name": name, "scope": scope, "days": days}
+        return _token(as_told(_Token, self._session.ask("POST", "/v1/api-tokens", wanted)))
+
+    def list_tokens(self) -> list[ApiToken]:
+        """Your tokens for machines."""
+        return [_token(token) for token in as_told(list[_Token], self._session.ask("GET", "/v1/api-tokens"))]
+
+    def delete_token(self, token_id: str) -> None:
+        """Revoke one of your tokens. NotFoundError if there is none with this id."""
+        self._session.ask("DELETE", f"/v1/api-tokens/{_name(token_id)}")
+
+
+def _name(name: str) -> str:
+    """A name in a path."""
+    return quote(str(name), safe="")
+
+
+class _User(BaseModel):
+    username: str
+    memberships: dict[str, list[str]]
+
+
+class _Member(BaseModel):
+    user: str
+    roles: list[str]
+
+
+class _Group(Group):
+    members: list[_Member]
+
+
+class _Token(BaseModel):
+    id: str
+    name: str
+    scope: str
+    created_at: float
+    expires: float | None
+    token: str = Field("", repr=False)
+
+
+def _user(answer: _User) -> UserOut:
+    held = [Membership(group=group, roles=roles) for group, roles in answer.memberships.items()]
+    return UserOut(username=answer.username, memberships=held)
+
+
+def _group(answer: _Group) -> GroupWithMembers:
+    roles = {member.user: member.roles for member in answer.members}
+    return GroupWithMembers(
+        name=answer.name, description=answer.description, members=list(roles), roles=roles
+    )
+
+
+def _token(answer: _Token) -> ApiToken:
+    times = {"created_at": _time(answer.created_at), "expires": answer.expires and _time(answer.expires)}
+    return ApiToken.model_validate({**answer.model_dump(), **times})
+
+
+def _time(seconds: float) -> str:
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat()

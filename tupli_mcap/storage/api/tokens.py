@@ -1,0 +1,151 @@
+"""Where a user's tokens are kept, by server: in the system's keyring where there is one, else in a file that this user
+alone can read.
+
+`servers.json` in the directory of this user's configuration names the servers and who is signed in there, the one that
+was used last at the end. It is written anew whenever tokens change, in the keyring too: what was read holds for as long
+as it is the same file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tupli_mcap import files
+from tupli_mcap.errors import StorageError
+from tupli_mcap.storage.atomic import Lock, os_errors
+
+if TYPE_CHECKING:
+    from keyring.backend import KeyringBackend
+
+__all__ = ["TokenStore"]
+
+_SERVICE: Final = "tupli-mcap"
+_TOKENS: Final = ("access_token", "refresh_token")
+_Servers = dict[str, dict[str, Any]]
+
+
+class TokenStore:
+    """Tokens by server. Usable from any thread and process.
+
+    Raises:
+        StorageError: the file cannot be written, or the keyring does not give what it keeps.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = Lock(path.with_name(f"{path.name}.lock"))
+        self._seen: tuple[int, int] | None = None
+        self._known: _Servers = {}
+
+    def alone(self) -> contextlib.AbstractContextManager[object]:
+        """Keeps out the other processes and threads; reentrant in a thread."""
+        return self._lock
+
+    def last(self) -> str:
+        """The server that was used last; empty if there is none."""
+        return next(reversed(self._servers()), "")
+
+    def username(self, url: str) -> str:
+        """Who is signed in; empty if nobody is."""
+        return str(self._servers().get(url, {}).get("username", ""))
+
+    def tokens(self, url: str) -> dict[str, str]:
+        """`access_token` and `refresh_token`; empty where nobody is signed in."""
+        found = self._servers().get(url, {})
+        if "keyring" in found and "access_token" not in found:
+            found |= _from_keyring(found["keyring"])
+        return {name: str(found[name]) for name in _TOKENS if name in found}
+
+    def put(self, url: str, username: str, tokens: dict[str, Any]) -> None:
+        """Keeps the tokens of a user of a server, which is the last one from now on."""
+        told, account = {name: str(tokens[name]) for name in _TOKENS}, f"{username} at {url}"
+        if _into_keyring(account, told):
+            told = {"keyring": account}
+        with self._lock:
+            self._write({**self._others(url), url: {"username": username, **told}})
+
+    def forget(self, url: str) -> None:
+        """Forgets who is signed in to a server."""
+        with self._lock:
+            account = self._servers().get(url, {}).get("keyring")
+            if account is not None:
+                _out_of_keyring(account)
+            self._write({**self._others(url), url: {}})
+
+    def use(self, url: str) -> None:
+        """Notes a server as the last one."""
+        with self._lock:
+            if self.last() != url:
+                self._write({**self._others(url), url: self._stored().get(url, {})})
+
+    def _others(self, url: str) -> _Servers:
+        return {name: kept for name, kept in self._stored().items() if name != url}
+
+    def _write(self, servers: _Servers) -> None:
+        with os_errors("cannot write", self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            files.write_bytes(self.path, json.dumps(servers, indent=2).encode(), permissions=0o600)
+
+    def _servers(self) -> _Servers:
+        """What the file says, and what the keyring has said since it was written."""
+        try:
+            status = self.path.stat()
+        except OSError:
+            return {}
+        seen = (status.st_ino, status.st_mtime_ns)
+        if seen != self._seen:
+            self._known, self._seen = self._stored(), seen
+        return self._known
+
+    def _stored(self) -> _Servers:
+        try:
+            found = json.loads(self.path.read_bytes())
+        except (OSError, ValueError):
+            return {}
+        known = found.items() if isinstance(found, dict) else ()
+        return {url: kept for url, kept in known if isinstance(kept, dict)}
+
+
+def _keyring() -> KeyringBackend | None:
+    """The system's keyring; None where there is none, or nothing that speaks to it."""
+    try:
+        import keyring
+    except ImportError:
+        return None
+    backend = keyring.get_keyring()
+    return (
+        backend if backend.priority >= 1 else None
+    )  # less are those that keep nothing, or without protection
+
+
+def _into_keyring(account: str, tokens: dict[str, str]) -> bool:
+    """Whether the keyring has taken them."""
+    backend = _keyring()
+    if backend is None:
+        return False
+    try:
+        backend.set_password(_SERVICE, account, json.dumps(tokens))
+    except Exception:  # noqa: BLE001 - each keyring raises errors of its own
+        return False
+    return True
+
+
+def _from_keyring(account: str) -> dict[str, str]:
+    backend = _keyring()
+    try:
+        found = None if backend is None else backend.get_password(_SERVICE, account)
+        return {} if found is None else dict(json.loads(found))
+    except Exception as err:  # noqa: BLE001 - each keyring raises errors of its own
+        raise StorageError(
+            f"the keyring does not give the tokens of {account} ({type(err).__name__}); unlock it, or sign in again"
+        ) from None
+
+
+def _out_of_keyring(account: str) -> None:
+    backend = _keyring()
+    if backend is not None:
+        with contextlib.suppress(Exception):  # it is gone already, or the keyring is locked
+            backend.delete_password(_SERVICE, account)

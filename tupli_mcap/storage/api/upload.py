@@ -1,0 +1,79 @@
+"""A recording on its way to a server, by the tus protocol: broken off, it goes on where it was; its SHA-256 is checked
+there; sent twice, it is stored once."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from tupli_mcap.storage.api.session import TIMEOUT, Session, UnreachableError
+from tupli_mcap.storage.atomic import os_errors
+
+__all__ = ["Tell", "send_file"]
+
+Tell = Callable[[int], None]
+"""Is told how many more bytes were sent or fetched; fewer than none, where some have to be sent again."""
+
+_FRUITLESS: Final = 4  # attempts one after another that bring nothing across
+_PIECE: Final = 1 << 20
+_CHECKED: Final = 20e6  # bytes a second that a slow server reads again to check them
+_TUS: Final = {"Tus-Resumable": "1.0.0"}
+
+
+def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell = lambda _: None) -> str:
+    """Sends a recording; returns what the server calls it.
+
+    sent_before: episodes with lower numbers were sent before, in parts; those that are not there any more stay deleted.
+
+    Raises:
+        UnreachableError: the server does not answer, or breaks off again and again.
+        StorageError: the server refuses it, or the file cannot be read.
+    """
+    with os_errors("cannot read", path), path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        size = file.tell()
+    told = {"sha256": digest} | ({"sent_before": str(sent_before)} if sent_before else {})
+    metadata = ",".join(f"{key} {base64.b64encode(text.encode()).decode()}" for key, text in told.items())
+    headers = {**_TUS, "Upload-Length": str(size), "Upload-Metadata": metadata}
+    fruitless, reached, shown = 0, 0, 0
+
+    def pieces(offset: int) -> Iterator[bytes]:
+        nonlocal shown
+        with path.open("rb") as file:
+            file.seek(offset)
+            while piece := file.read(_PIECE):
+                yield piece
+                shown += len(piece)
+                tell(len(piece))
+
+    while True:
+        begun = session.send("POST", "/v1/uploads", headers=headers, repeat=True).headers
+        offset = int(begun.get("Upload-Offset", size))
+        tell(offset - shown)
+        shown = offset
+        if "Recording" in begun:
+            return str(begun["Recording"])
+        fruitless, reached = (fruitless, reached) if offset <= reached else (0, offset)
+        try:
+            done = session.send(
+                "PATCH",
+                begun["Location"],
+                content=pieces(offset),
+                headers={
+                    **_TUS,
+                    "Upload-Offset": str(offset),
+                    "Content-Type": "application/offset+octet-stream",
+                    "Content-Length": str(size - offset),
+                },
+                timeout=TIMEOUT + size / _CHECKED,
+            )
+            return str(done.headers["Recording"])
+        except UnreachableError:
+            fruitless += 1
+            if fruitless == _FRUITLESS:
+                raise
+        time.sleep(0.2 * 2**fruitless)

@@ -1,0 +1,91 @@
+"""Recordings that wait for a server, as files: what state they are in, what killed processes have left of them, and the
+note of what was sent of one that goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.mcap.lock import is_locked, writers_kept_out
+from tupli_mcap.mcap.source import PathSource
+from tupli_mcap.mcap.summary import has_summary
+from tupli_mcap.recording import Recording, finish_recording, journal_path, recover_recording
+
+__all__ = ["BusyError", "finished", "kept", "note", "numbers_of", "sent_before", "state_of"]
+
+
+class BusyError(Exception):
+    """Another process has the recording."""
+
+
+@contextlib.contextmanager
+def kept(path: Path) -> Iterator[None]:
+    """Keeps a finished recording from writers and other senders; BusyError while there is one, or if it is gone."""
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(writers_kept_out(path))
+        except RecordingError as err:
+            if not path.exists() or is_locked(path):
+                raise BusyError from err
+            raise
+        yield
+
+
+def state_of(path: Path) -> str:
+    """`recording` while somebody writes to it, else `finished` or `unfinished`."""
+    with contextlib.suppress(RecordingError):
+        source = PathSource(path)
+        try:
+            if has_summary(source):
+                return "finished"
+        finally:
+            source.close()
+    return "recording" if is_locked(path) else "unfinished"
+
+
+def numbers_of(recording: Recording, first: int) -> list[int]:
+    """The numbers of the episodes from `first` on."""
+    return sorted(number for number in recording.index["episode"].tolist() if number >= first)
+
+
+def finished(path: Path) -> Path:
+    """Finishes what a killed process has left; returns the path of what can be sent of it.
+
+    Raises:
+        RecordingError, FormatError: nothing of it can be saved.
+    """
+    try:
+        finish_recording(path)
+        return path
+    except (RecordingError, FormatError) as err:
+        if is_locked(path):  # another process is at it
+            return path
+        report = recover_recording(path, overwrite=True)
+        if report.target is None or not report.saved:
+            raise RecordingError(f"{path}: nothing of it can be saved; delete it") from err
+    saved, damaged = Path(report.target), path.parents[1] / "damaged" / path.parent.name
+    damaged.mkdir(parents=True, exist_ok=True, mode=0o700)
+    moved = {note(path): note(saved)} | {each: damaged / each.name for each in (journal_path(path), path)}
+    for each, goal in moved.items():
+        with contextlib.suppress(FileNotFoundError):
+            each.replace(goal)
+    told = f"{path} was damaged: what could be saved of it is sent, the original is kept in {damaged}"
+    warnings.warn(told, RuntimeWarning, stacklevel=2)
+    return saved
+
+
+def note(path: Path) -> Path:
+    """Where it is noted how many episodes of a recording were sent."""
+    return path.with_name(f"{path.name}.sent")
+
+
+def sent_before(path: Path) -> int:
+    """Episodes of a recording with lower numbers were sent."""
+    try:
+        return int(json.loads(note(path).read_bytes())["sent_before"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
