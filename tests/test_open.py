@@ -13,7 +13,7 @@ import pytest
 from environments import Sampler, roll
 
 import tupli_mcap
-from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, TupliError
+from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeMetadataCallback
 
@@ -184,6 +184,29 @@ def test_a_wrong_key_says_what_is_meant(dataset: Dataset, wrong: str) -> None:
         dataset.filter(wrong)
     with pytest.raises(FilterError, match="did you mean"):
         dataset.sort(wrong.split()[0])
+
+
+def test_a_wrong_attribute_says_what_is_meant(runs: Path, dataset: Dataset) -> None:
+    episode = dataset[0]
+    for thing, wrong, meant in (
+        (dataset, "retruns", "returns"), (episode, "sates", "states"), (episode, "observation", "observations"),
+        (episode.recording, "episods", "episodes"), (episode.run, "nme", "name"), (dataset.read(), "action", "actions"),
+        (dataset.windows(2)[0], "reward", "rewards"), (TupliDataset(FileStorage(runs)), "laod", "load"),
+    ):  # fmt: skip
+        with pytest.raises(AttributeError, match=rf"no attribute '{wrong}' \(did you mean '{meant}'\?\)"):
+            getattr(thing, wrong)
+    with pytest.raises(AttributeError, match="'_sates'$"):
+        _ = episode._sates  # type: ignore[attr-defined]
+    with pytest.raises(FilterError, match="did you mean 'name'"):
+        dataset.split(0.5, by="run.nme")
+
+
+def test_an_error_within_a_property_is_not_taken_for_a_wrong_name(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Dataset, "lengths", property(lambda ds: ds.headers.nothing))
+    with pytest.raises(AttributeError, match="'list' object has no attribute 'nothing'"):
+        _ = dataset.lengths
 
 
 def test_keys(dataset: Dataset) -> None:

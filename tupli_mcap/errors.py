@@ -10,7 +10,7 @@ import difflib
 import errno
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 __all__ = [
     "FilterError",
@@ -102,6 +102,22 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     """` (did you mean 'return'?)` where one of the known names is like this one, else nothing."""
     close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.6)
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+class SaysWhatIsMeant:
+    """Objects whose attributes are known: a wrong name says which one is meant, in notebooks too."""
+
+    if not TYPE_CHECKING:  # where types are checked, a name that is not there is an error
+
+        def __getattr__(self, name: str) -> Any:
+            known = dir(type(self))
+            if name in known:  # a property whose own code went wrong
+                return object.__getattribute__(self, name)
+            meant = "" if name.startswith("_") else did_you_mean(name, [n for n in known if n[0] != "_"])
+            # with the object, too, Python would add a hint of its own
+            raise AttributeError(
+                f"{type(self).__name__!r} object has no attribute {name!r}{meant}", name=name
+            )
 
 
 def missing_extra(what: str, extra: str) -> MissingExtraError:

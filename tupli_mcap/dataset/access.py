@@ -27,6 +27,7 @@ from tupli_mcap.dataset.items import (
 )
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.dataset.items.windows import FIVE
+from tupli_mcap.errors import SaysWhatIsMeant
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate
 from tupli_mcap.schema.facts import path_in
@@ -35,7 +36,7 @@ from tupli_mcap.schema.predicate import MISSING, look_up
 __all__ = ["RandomAccess", "episode_values"]
 
 
-class RandomAccess:
+class RandomAccess(SaysWhatIsMeant):
     """What a dataset, or the columns saved of one, gives by number. Only what is asked for is read."""
 
     @property

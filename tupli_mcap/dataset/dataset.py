@@ -292,13 +292,11 @@ class Dataset(RandomAccess):
         if callable(key):
             values = [key(self._episode(header)) for header in self.headers]
         elif isinstance(key, str):
-            values = [self._value(header, key) for header in self.headers]
+            values = self._values(key)
         else:
             raise DatasetError(
                 f"expected a key to sort by, such as 'return', or a function, found {key!r:.80}"
             )
-        if values and isinstance(key, str) and all(value is None for value in values):
-            self._check_metadata(F(key) == True, self.headers)  # noqa: E712 - an expression
         places = [i for i, value in enumerate(values) if value is not None and value == value]
         try:
             ordered = sorted(places, key=lambda i: values[i], reverse=descending)
@@ -331,9 +329,10 @@ class Dataset(RandomAccess):
         """
         if not isinstance(fraction, int | float | np.number) or not 0 <= fraction <= 1:
             raise DatasetError(f"expected a fraction from 0 to 1, found {fraction!r:.80}")
+        values = None if by is None else self._values(by)
         parts: tuple[list[EpisodeHeader], list[EpisodeHeader]] = ([], [])
-        for header in self.headers:
-            name = header.id if by is None else repr(self._value(header, by))
+        for i, header in enumerate(self.headers):
+            name = header.id if values is None else repr(values[i])
             digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
             parts[int.from_bytes(digest[:8], "big") >= fraction * 2**64].append(header)
         return self._of(parts[0]), self._of(parts[1])
@@ -346,6 +345,13 @@ class Dataset(RandomAccess):
         own |= {"run." + key for run in runs for key in run if key != "metadata"}
         own |= {"run.metadata." + key for run in runs for key in run.get("metadata", {})}
         return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own)
+
+    def _values(self, key: str) -> list[Any]:
+        """The value that each episode has at a key, None where it has none; FilterError if no episode knows the key."""
+        values = [self._value(header, key) for header in self.headers]
+        if values and all(value is None for value in values):
+            self._check_metadata(F(key) == True, self.headers)  # noqa: E712 - an expression
+        return values
 
     def _value(self, header: EpisodeHeader, key: str) -> Any:
         if key == "run":  # of files without a run, each is one

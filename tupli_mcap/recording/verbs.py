@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tupli_mcap.errors import SaysWhatIsMeant
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["DatasetVerbs"]
 
 
-class DatasetVerbs:
+class DatasetVerbs(SaysWhatIsMeant):
     """The verbs of `Dataset`: arguments and errors are the same, and are told there."""
 
     @property

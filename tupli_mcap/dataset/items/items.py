@@ -15,6 +15,7 @@ from tupli_mcap.dataset.items.batches import Batches
 from tupli_mcap.dataset.items.draws import Sampler, Weights
 from tupli_mcap.dataset.items.order import Numbers, Order, Shuffle
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_numbers
+from tupli_mcap.errors import SaysWhatIsMeant
 from tupli_mcap.schema import BaseFilter, F
 
 __all__ = [
@@ -28,7 +29,7 @@ _MANY = 1 << 20  # items that are looked at together
 
 
 @dataclass(frozen=True)
-class Parts:
+class Parts(SaysWhatIsMeant):
     """Columns of one item or of a batch, and facts about them, by name; None where not asked for."""
 
     def asdict(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple, Self
 from urllib.parse import urlsplit
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, SaysWhatIsMeant
 from tupli_mcap.schema.times import iso_utc
 
 __all__ = ["MAX_RUN", "RUN_MEDIA_TYPE", "RUN_NAME", "RecordedRuns", "Run", "file_name"]
@@ -26,7 +26,7 @@ _TEXTS: Final = ("id", "name", "split", "environment", "started", "ended", "host
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(SaysWhatIsMeant):
     """A run, as its recording says it. What is not known is empty.
 
     id: 32 hex digits, the same in all files of the run. name: given by who recorded, else that of the file.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any
 
-from tupli_mcap.errors import RecordingError, did_you_mean
+from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, did_you_mean
 
 __all__ = ["FIELDS", "FIVE", "GymnasiumNames", "field_names"]
 
@@ -43,7 +43,7 @@ def field_names(
     return list(dict.fromkeys(names))
 
 
-class GymnasiumNames:
+class GymnasiumNames(SaysWhatIsMeant):
     """Columns of steps under Gymnasium's names."""
 
     states: Any
